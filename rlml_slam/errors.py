@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every error that a user can cause or meet: one root, one line that names what and where."""
+
+
+class RlmlError(Exception):
+    """Root of all expected errors; the command line prints it as one line and exits with 1."""
+
+
+class ParameterError(RlmlError):
+    """A parameter is unknown, of the wrong type or out of its bounds."""
+
+
+class InputError(RlmlError):
+    """A message or measurement is invalid (NaN, wrong frame, wrong shape, bad stamp)."""
+
+
+class BagError(RlmlError):
+    """A bag cannot be read or written, or lacks what is needed."""
+
+
+class FileFormatError(RlmlError):
+    """A text or data file (CARMEN, TUM, relations, g2o, world, YAML) is malformed."""
+
+
+class MapError(RlmlError):
+    """A map cannot be saved, loaded or used."""
+
+
+class SolverError(RlmlError):
+    """A graph is malformed, or its normal equations cannot be solved."""

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reflector map, occupancy grid and the map store."""

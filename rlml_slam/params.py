@@ -1,0 +1,378 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every parameter, declared once: default, unit, bounds and meaning.
+
+A group is a frozen dataclass of param() fields; Parameters holds one of each. The ROS
+declaration (``ros/declare.py``), ``config/*.yaml`` and the tables of the README are derived from
+here and tested against it. A wrong value raises ParameterError that names class, field, value and
+meaning; an unknown name is refused, never ignored.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from rlml_slam.errors import FileFormatError, ParameterError
+
+INF = math.inf
+
+
+def param(
+    default: Any,
+    meaning: str,
+    unit: str = '',
+    low: float = -INF,
+    high: float = INF,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """A dataclass field that carries its own documentation and bounds (inclusive)."""
+    return field(
+        default=default,
+        metadata={
+            'meaning': meaning, 'unit': unit, 'low': low, 'high': high, 'choices': choices
+        },
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Group:
+    """A set of parameters; construction checks every value."""
+
+    def __post_init__(self) -> None:
+        """Check each field against its declared type, bounds and choices."""
+        for f in dataclasses.fields(self):
+            object.__setattr__(
+                self, f.name, _checked(type(self).__name__, f, getattr(self, f.name))
+            )
+
+
+def _checked(group: str, f: dataclasses.Field[Any], value: Any) -> Any:
+    """The value in the type of the field's default, or a ParameterError."""
+    m = f.metadata
+
+    def refuse(why: str) -> ParameterError:
+        return ParameterError(f'{group}.{f.name} = {value!r} {why} ({m["meaning"]})')
+
+    if isinstance(f.default, bool):
+        if not isinstance(value, bool):
+            raise refuse('is not true or false')
+        return value
+    if isinstance(f.default, str):
+        if not isinstance(value, str):
+            raise refuse('is not a string')
+        if m['choices'] and value not in m['choices']:
+            raise refuse(f'is none of {", ".join(m["choices"])}')
+        return value
+    if isinstance(f.default, tuple):
+        if isinstance(value, str) or not isinstance(value, list | tuple):
+            raise refuse('is not a list')
+        if f.default and isinstance(f.default[0], str):
+            if not all(isinstance(v, str) for v in value):
+                raise refuse('is not a list of strings')
+            return tuple(value)
+        if not all(_is_number(v) and math.isfinite(v) for v in value):
+            raise refuse('is not a list of finite numbers')
+        return tuple(float(v) for v in value)
+    if not _is_number(value) or not math.isfinite(value):
+        raise refuse('is not a finite number')
+    if isinstance(f.default, int):
+        if int(value) != value:
+            raise refuse('is not a whole number')
+        value = int(value)
+    else:
+        value = float(value)
+    if not m['low'] <= value <= m['high']:
+        raise refuse(f'is outside [{m["low"]:g}, {m["high"]:g}]')
+    return value
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+@dataclass(frozen=True)
+class Node(Group):
+    """Frames, topics and files; the names are slam_toolbox's where the thing is the same."""
+
+    map_frame: str = param('map', 'frame of the map')
+    odom_frame: str = param('odom', 'frame of the raw odometry')
+    base_frame: str = param('base_link', 'frame of the robot; all estimates are of this frame')
+    local_frame: str = param('rlml_local', "the front end's continuous frame")
+    scan_topic: str = param('scan', 'LaserScan topic')
+    odom_topic: str = param('odom', 'Odometry topic')
+    imu_topic: str = param('imu', 'Imu topic')
+    reflectors_topic: str = param('reflectors', 'PointCloud2 topic of reflector detections')
+    reflector_poses_topic: str = param(
+        'reflector_poses', 'PoseArray topic of reflector detections'
+    )
+    use_odom: bool = param(True, 'use odometry; false runs on scans and reflectors alone')
+    use_imu: bool = param(True, 'use the yaw rate of the IMU where there is one')
+    use_scan: bool = param(True, 'match scans against the submap')
+    use_reflectors: bool = param(True, 'use reflector detections')
+    mode: str = param(
+        'mapping', 'mapping, or localization in a saved map', choices=('mapping', 'localization')
+    )
+    map_directory: str = param('maps', 'the only folder that maps are saved to and loaded from')
+    map_file_name: str = param('map', 'name of the saved map inside map_directory, no suffix')
+    map_start_pose: tuple[float, ...] = param(
+        (0.0, 0.0, 0.0), 'start pose in the map', 'm, m, rad'
+    )
+    laser_pose: tuple[float, ...] = param(
+        (0.0, 0.0, 0.0), 'pose of the laser in base_frame where no /tf_static tells', 'm, m, rad'
+    )
+    transform_publish_period: float = param(0.02, 'period of map to odom on /tf', 's', 0.001, 10.0)
+    transform_timeout: float = param(
+        0.2, 'longest wait of a scan for the odometry at its stamp', 's', 0.0, 10.0
+    )
+    map_update_interval: float = param(
+        2.0, 'period of map, graph and trajectory', 's', 0.05, 600.0
+    )
+    tf_buffer_duration: float = param(
+        30.0, 'memory of odometry and of waiting inputs', 's', 1.0, 600.0
+    )
+
+
+@dataclass(frozen=True)
+class MotionNoise(Group):
+    """Noise of odometry and IMU (eq. 6): sigma_v = a |v| + b, sigma_omega = c |omega| + d.
+
+    The figures hold for a control interval of ``interval``; other intervals are scaled so that
+    the accumulated covariance does not depend on the odometry's rate.
+    """
+
+    a: float = param(0.05, 'speed noise per speed', '', 0.0, 10.0)
+    b: float = param(0.01, 'speed noise floor', 'm/s', 0.0, 10.0)
+    c: float = param(0.05, 'turn rate noise per turn rate', '', 0.0, 10.0)
+    d: float = param(0.01, 'turn rate noise floor', 'rad/s', 0.0, 10.0)
+    lateral: float = param(0.02, 'sideways slip per speed', '', 0.0, 10.0)
+    imu_c: float = param(0.005, "the IMU's turn rate noise per turn rate", '', 0.0, 10.0)
+    imu_d: float = param(0.003, "the IMU's turn rate noise floor", 'rad/s', 0.0, 10.0)
+    interval: float = param(0.1, 'control interval that a, b, c, d are given for', 's', 1e-3, 10.0)
+    max_gap: float = param(0.5, 'longest interval bridged by interpolation', 's', 0.01, 60.0)
+    max_speed: float = param(
+        5.0, 'a faster odometry step is a jump and is not used', 'm/s', 0.01, 100.0
+    )
+    max_turn_rate: float = param(6.0, 'a faster odometry turn is a jump', 'rad/s', 0.01, 100.0)
+
+
+@dataclass(frozen=True)
+class Reflector(Group):
+    """Reflector detections and their association."""
+
+    sigma_range: float = param(
+        0.02, 'range noise of a detection that states none', 'm', 1e-4, 10.0
+    )
+    sigma_bearing: float = param(
+        0.003, 'bearing noise of a detection that states none', 'rad', 1e-5, 1.0
+    )
+    sigma_fallback: float = param(
+        0.025, 'noise per axis where range and bearing mean nothing', 'm', 1e-4, 10.0
+    )
+    gate: float = param(0.997, 'probability inside the association gate', '', 0.5, 0.999999)
+    new_gate: float = param(
+        0.99999,
+        'a detection inside this gate of a known reflector never starts a new one',
+        '',
+        0.5,
+        0.9999999,
+    )
+    min_separation: float = param(
+        0.25, 'reflectors closer than this cannot be told apart', 'm', 0.0, 10.0
+    )
+    min_sightings: int = param(
+        3, 'sightings before a candidate becomes a reflector of the map', '', 1, 100
+    )
+    candidate_timeout: float = param(
+        20.0, 'a candidate not seen again for this long is dropped', 's', 0.1, 1e4
+    )
+    robust_scale: float = param(
+        3.0, 'Cauchy scale of the reflector residual, in sigmas', '', 0.5, 100.0
+    )
+    max_range: float = param(40.0, 'detections farther away are not used', 'm', 0.5, 1000.0)
+
+
+@dataclass(frozen=True)
+class Submap(Group):
+    """Probability grids that scans are matched against."""
+
+    resolution: float = param(0.05, 'cell size', 'm', 0.01, 1.0)
+    max_laser_range: float = param(30.0, 'beams longer than this are not used', 'm', 0.5, 300.0)
+    p_hit: float = param(0.55, 'occupancy probability that one hit adds', '', 0.5, 0.99)
+    p_miss: float = param(0.49, 'occupancy probability that one miss leaves', '', 0.01, 0.5)
+    size: int = param(90, 'insertions that complete a submap', '', 2, 10000)
+    min_travel: float = param(0.1, 'travel between two insertions', 'm', 0.0, 10.0)
+    min_turn: float = param(0.08, 'turn between two insertions', 'rad', 0.0, 3.2)
+
+
+@dataclass(frozen=True)
+class ScanMatch(Group):
+    """Search and refinement of the scan term."""
+
+    voxel: float = param(
+        0.05, 'end points are thinned to one per cell of this size', 'm', 0.0, 1.0
+    )
+    max_points: int = param(400, 'most end points used by one match', '', 20, 10000)
+    sigma: float = param(
+        0.3, 'sigma_s of one end point (eq. 2), calibrated by NEES', '', 1e-3, 100.0
+    )
+    min_score: float = param(
+        0.45, 'mean hit probability below which a match is not used', '', 0.0, 1.0
+    )
+    search_window: float = param(0.1, 'half width of the search', 'm', 0.0, 10.0)
+    search_angle: float = param(0.35, 'half width of the search', 'rad', 0.0, 3.2)
+    max_iterations: int = param(20, 'Gauss-Newton iterations at most', '', 1, 200)
+    prior_scale: float = param(
+        3.0,
+        'odometry prior is truncated beyond this many sigmas when the scan disagrees',
+        '',
+        0.5,
+        100.0,
+    )
+
+
+@dataclass(frozen=True)
+class BackEnd(Group):
+    """Keyframes and the graph."""
+
+    minimum_travel_distance: float = param(0.3, 'travel between two keyframes', 'm', 0.0, 100.0)
+    minimum_travel_heading: float = param(0.25, 'turn between two keyframes', 'rad', 0.0, 3.2)
+    minimum_time: float = param(
+        10.0, 'a keyframe is taken after this long if the robot moved at all', 's', 0.0, 1e4
+    )
+    edge_covariance: str = param(
+        'relative', 'covariance of an edge: of the relative motion, or eq. 14 literally',
+        choices=('relative', 'sum'),
+    )  # fmt: skip
+    optimize_every: int = param(
+        5, 'keyframes between two optimisations without a closure', '', 1, 1000
+    )
+    odometry_robust_scale: float = param(
+        3.0, 'Cauchy scale of odometry edges, in sigmas', '', 0.5, 1e3
+    )
+    closure_robust_scale: float = param(
+        2.0, 'Cauchy scale of loop closures, in sigmas', '', 0.5, 1e3
+    )
+    resolution: float = param(0.05, 'cell size of the published map', 'm', 0.01, 1.0)
+
+
+@dataclass(frozen=True)
+class LoopClosure(Group):
+    """Candidates and their verification by scan match."""
+
+    enabled: bool = param(True, 'look for loop closures')
+    max_distance: float = param(8.0, 'candidates nearer than this are tried', 'm', 0.1, 100.0)
+    min_score: float = param(0.6, 'mean hit probability that a closure must reach', '', 0.1, 1.0)
+    every: int = param(5, 'try every n-th keyframe', '', 1, 1000)
+    search_window: float = param(3.0, 'half width of the search', 'm', 0.1, 100.0)
+    search_angle: float = param(0.5, 'half width of the search', 'rad', 0.01, 3.2)
+
+
+@dataclass(frozen=True)
+class Solver(Group):
+    """Sparse least squares."""
+
+    max_iterations: int = param(50, 'iterations at most', '', 1, 10000)
+    relative_tolerance: float = param(
+        1e-6, 'stop when the cost falls by less than this share', '', 0.0, 1.0
+    )
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """One of every group. Fields of ``node`` have plain ROS names, all others ``group.field``."""
+
+    node: Node = Node()
+    motion: MotionNoise = MotionNoise()
+    reflector: Reflector = Reflector()
+    submap: Submap = Submap()
+    scan_match: ScanMatch = ScanMatch()
+    back_end: BackEnd = BackEnd()
+    loop_closure: LoopClosure = LoopClosure()
+    solver: Solver = Solver()
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """One parameter as the outside world sees it; ``name`` is its ROS name."""
+
+    name: str
+    group: str
+    field: str
+    default: Any
+    unit: str
+    low: float
+    high: float
+    choices: tuple[str, ...]
+    meaning: str
+
+
+def declarations(of: type = Parameters) -> Iterator[Declaration]:
+    """Every parameter of the groups in ``of``, in order."""
+    for g in dataclasses.fields(of):
+        prefix = '' if g.name == 'node' else f'{g.name}.'
+        group: Any = type(g.default)
+        for f in dataclasses.fields(group):
+            yield Declaration(
+                prefix + f.name, g.name, f.name, f.default,
+                *(f.metadata[k] for k in ('unit', 'low', 'high', 'choices', 'meaning')),
+            )  # fmt: skip
+
+
+def from_mapping(values: Mapping[str, Any], of: type[Any] = Parameters) -> Any:
+    """Parameters with ``values`` (ROS names, flat) instead of the defaults.
+
+    Raises ParameterError for an unknown name or a value that its field refuses.
+    """
+    known = {d.name: d for d in declarations(of)}
+    groups: dict[str, dict[str, Any]] = {}
+    for name, value in values.items():
+        if name not in known:
+            raise ParameterError(f'unknown parameter {name!r}; known are {_nearest(name, known)}')
+        groups.setdefault(known[name].group, {})[known[name].field] = value
+    default = of()
+    return dataclasses.replace(
+        default,
+        **{g: dataclasses.replace(getattr(default, g), **v) for g, v in groups.items()},
+    )
+
+
+def _nearest(name: str, known: Mapping[str, Any]) -> str:
+    import difflib
+
+    near = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+    return ', '.join(near) if near else 'listed in the README'
+
+
+def flatten(tree: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
+    """Nested mappings as one with dotted names, as ROS does."""
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            flat.update(flatten(value, f'{prefix}{key}.'))
+        else:
+            flat[f'{prefix}{key}'] = value
+    return flat
+
+
+def read_yaml(path: str | Path) -> dict[str, Any]:
+    """The flat parameters of a ROS parameter file (``/**: ros__parameters: ...``)."""
+    try:
+        tree = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+    except OSError as e:
+        raise FileFormatError(f'{path}: cannot be read: {e.strerror}') from e
+    except (yaml.YAMLError, UnicodeDecodeError) as e:
+        raise FileFormatError(f'{path}: not YAML: {str(e).splitlines()[0]}') from e
+    if not isinstance(tree, Mapping):
+        raise FileFormatError(f'{path}: no parameters in it')
+    flat: dict[str, Any] = {}
+    for node, body in tree.items():
+        if not isinstance(body, Mapping) or not isinstance(body.get('ros__parameters'), Mapping):
+            raise FileFormatError(f'{path}: {node!r} has no ros__parameters')
+        flat.update(flatten(body['ros__parameters']))
+    return flat

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Between ROS and the core: parameters, messages, bags and TF."""

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frozen values between modules. SI units, radians; stamps are integer nanoseconds; no ROS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum, IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam.se2 import Array
+
+ANONYMOUS = -1
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """Wheel odometry: ``pose`` (3,) of base in the odom frame; only its increments are used."""
+
+    stamp: int
+    pose: Array
+
+
+@dataclass(frozen=True)
+class Imu:
+    """Yaw rate [rad/s] about the base z axis (counter-clockwise positive)."""
+
+    stamp: int
+    yaw_rate: float
+
+
+@dataclass(frozen=True)
+class Scan:
+    """One sweep of a 2D laser; the stamp is that of the first ray (REP-117 values are legal).
+
+    ``ranges`` (n,) [m], NaN/Inf/out of [range_min, range_max] where there is no return;
+    ``intensities`` (n,) or (0,). Ray k was measured at stamp + k * time_increment [s] at
+    angle_min + k * angle_increment [rad] in the frame ``frame_id``.
+    """
+
+    stamp: int
+    frame_id: str
+    angle_min: float
+    angle_increment: float
+    time_increment: float
+    range_min: float
+    range_max: float
+    ranges: NDArray[np.float32]
+    intensities: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Detections:
+    """Reflectors seen at one instant; an empty one means "looked and saw none".
+
+    ``points`` (n, 2) [m] and ``cov`` (n, 2, 2) [m^2] in ``frame_id``; ``ids`` (n,) int64,
+    ANONYMOUS where the reflector does not tell who it is; ``diameters`` (n,) [m], NaN = unknown.
+    """
+
+    stamp: int
+    frame_id: str
+    points: Array
+    cov: Array
+    ids: NDArray[np.int64]
+    diameters: Array
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Motion ``delta`` (3,) of base and its covariance ``cov`` (3, 3), both in the start frame.
+
+    ``known`` is False where no odometry covered the interval: delta is then an extrapolation and
+    cov is wide.
+    """
+
+    delta: Array
+    cov: Array
+    known: bool = True
+
+
+@dataclass(frozen=True)
+class Observation:
+    """All that was measured at one stamp, in the base frame at that stamp.
+
+    ``motion`` is the odometry/IMU motion since the previous observation. ``points`` (n, 2) are
+    the de-skewed end points of the valid beams, ``origin`` (2,) the laser's position; None where
+    there was no scan. ``scan`` is the raw sweep. ``odom_pose`` (3,) is the raw odometry at the
+    stamp, None without odometry.
+    """
+
+    stamp: int
+    motion: Motion
+    points: Array | None = None
+    origin: Array | None = None
+    detections: Detections | None = None
+    scan: Scan | None = None
+    odom_pose: Array | None = None
+
+
+class Status(IntEnum):
+    """What became of one reflector detection."""
+
+    USED = 0
+    GATED = 1
+    NEW = 2
+    GHOST = 3
+    AMBIGUOUS = 4
+
+
+class Level(IntEnum):
+    """Health of the estimate; the values are those of diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    DEGRADED = 1
+    LOST = 2
+
+
+@dataclass(frozen=True)
+class Health:
+    """Level with the reasons that a person can act on."""
+
+    level: Level = Level.OK
+    reasons: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The front end's answer to one observation.
+
+    ``T_local_base`` (3,) and ``cov_local`` (3, 3) live in the front end's continuous local frame
+    (never corrected backwards), ``T_map_base`` and ``cov_map`` in the map frame with the newest
+    correction of the back end. Covariances are of (x, y, theta) in the axes of their frame.
+    ``landmarks`` (n,) int64: the front end's key of each detection's reflector, -1 where it has
+    none; ``statuses`` (n,) of Status.
+    """
+
+    stamp: int
+    observation: Observation
+    T_local_base: Array
+    cov_local: Array
+    T_map_base: Array
+    cov_map: Array
+    landmarks: NDArray[np.int64]
+    statuses: NDArray[np.int64]
+    health: Health = field(default_factory=Health)
+    scan_score: float = float('nan')
+    chi2: float = 0.0
+    iterations: int = 0
+    wall_ms: float = 0.0
+
+
+class EdgeKind(Enum):
+    """Where a relative-pose edge of the graph comes from."""
+
+    ODOMETRY = 'odometry'
+    SCAN = 'scan'
+    CLOSURE = 'closure'
+
+
+@dataclass(frozen=True)
+class Reflectors:
+    """A map: ``keys`` (n,) int64, ``points`` (n, 2) and ``cov`` (n, 2, 2) in the map frame.
+
+    ``ids`` (n,) are the reflectors' own ids (ANONYMOUS where none), ``sightings`` (n,) how often
+    each was seen, ``diameters`` (n,) [m] or NaN.
+    """
+
+    keys: NDArray[np.int64]
+    points: Array
+    cov: Array
+    ids: NDArray[np.int64]
+    sightings: NDArray[np.int64]
+    diameters: Array
+
+    def __len__(self) -> int:
+        return len(self.keys)
