@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The motion model: odometry and IMU between two stamps become one relative pose and covariance.
+
+The midpoint model of eq. 7 is applied per interval between two samples, and the intervals of a
+scan are composed, so that curved motion and rates of any mix are right.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, bisect_right
+
+import numpy as np
+
+from rlml_slam import se2
+from rlml_slam.compiled import kernel
+from rlml_slam.params import MotionNoise
+from rlml_slam.se2 import Array
+from rlml_slam.types import Imu, Motion, Odometry
+
+SECOND = 1_000_000_000
+
+
+@kernel
+def integrate(v: Array, w: Array, dt: Array, var_v: Array, var_w: Array, var_lat: Array) -> Array:
+    """Compose control intervals (eq. 5, 7-9); all arguments ``(n,)``.
+
+    Returns ``(4, 3)``: the relative pose in row 0 (theta not wrapped), its covariance in rows 1-3.
+    The sideways variance ``var_lat`` is that of a velocity across the heading, which the notes'
+    (v, omega) cannot express and which keeps the covariance regular.
+    """
+    x = y = th = 0.0
+    P = np.zeros((3, 3))
+    for k in range(len(v)):
+        h = dt[k]
+        c, s = math.cos(th + 0.5 * w[k] * h), math.sin(th + 0.5 * w[k] * h)
+        d = v[k] * h
+        # G_x P G_x^T, eq. 8: only the heading column differs from the identity
+        gx, gy = -d * s, d * c
+        p02, p12, p22 = P[0, 2], P[1, 2], P[2, 2]
+        P[0, 0] += 2.0 * gx * p02 + gx * gx * p22
+        P[0, 1] += gx * p12 + gy * p02 + gx * gy * p22
+        P[1, 1] += 2.0 * gy * p12 + gy * gy * p22
+        P[0, 2] += gx * p22
+        P[1, 2] += gy * p22
+        # G_u Sigma_u G_u^T, eq. 9, with the sideways velocity as a third control
+        ux, uy = h * c, h * s
+        wx, wy = -0.5 * d * h * s, 0.5 * d * h * c
+        P[0, 0] += ux * ux * var_v[k] + wx * wx * var_w[k] + uy * uy * var_lat[k]
+        P[0, 1] += ux * uy * var_v[k] + wx * wy * var_w[k] - uy * ux * var_lat[k]
+        P[1, 1] += uy * uy * var_v[k] + wy * wy * var_w[k] + ux * ux * var_lat[k]
+        P[0, 2] += wx * h * var_w[k]
+        P[1, 2] += wy * h * var_w[k]
+        P[2, 2] += h * h * var_w[k]
+        x += d * c
+        y += d * s
+        th += w[k] * h
+    out = np.empty((4, 3))
+    out[0, 0], out[0, 1], out[0, 2] = x, y, th
+    out[1, 0], out[1, 1], out[1, 2] = P[0, 0], P[0, 1], P[0, 2]
+    out[2, 0], out[2, 1], out[2, 2] = P[0, 1], P[1, 1], P[1, 2]
+    out[3, 0], out[3, 1], out[3, 2] = P[0, 2], P[1, 2], P[2, 2]
+    return out
+
+
+def compose_motion(first: Motion, second: Motion) -> Motion:
+    """Two motions, one after the other; their errors are independent."""
+    J_a, J_b = se2.compose_jacobians(first.delta, second.delta)
+    cov = J_a @ first.cov @ J_a.T + J_b @ second.cov @ J_b.T
+    return Motion(se2.compose(first.delta, second.delta), cov, first.known and second.known)
+
+
+STILL = Motion(np.zeros(3), np.zeros((3, 3)))
+
+
+class MotionBuffer:
+    """Odometry and IMU of the last ``memory`` seconds, and the motion between any two stamps."""
+
+    def __init__(self, noise: MotionNoise, memory: float) -> None:
+        self._noise = noise
+        self._memory = int(memory * SECOND)
+        self._stamps: list[int] = []
+        self._poses: list[Array] = []
+        # velocities of the interval that ends at the sample of the same index
+        self._v: list[float] = [0.0]
+        self._w: list[float] = [0.0]
+        self._imu_stamps: list[int] = []
+        self._rates: list[float] = []
+        self._bias = 0.0
+        self._bias_var = 0.05**2
+        self.jumps = 0
+
+    @property
+    def newest(self) -> int | None:
+        """Stamp of the newest odometry, None before the first."""
+        return self._stamps[-1] if self._stamps else None
+
+    @property
+    def gyro_bias(self) -> tuple[float, float]:
+        """The IMU's bias [rad/s] and its standard deviation."""
+        return self._bias, math.sqrt(self._bias_var)
+
+    def add_odometry(self, sample: Odometry) -> None:
+        """Append a sample; its stamp must be later than the newest one's."""
+        if self._stamps:
+            dt = (sample.stamp - self._stamps[-1]) / SECOND
+            step = se2.log(se2.between(self._poses[-1], sample.pose))
+            v, w = float(step[0]) / dt, float(step[2]) / dt
+            n = self._noise
+            if abs(v) > n.max_speed or abs(w) > n.max_turn_rate:
+                self.jumps += 1
+                v = w = math.nan
+            self._v.append(v)
+            self._w.append(w)
+        self._stamps.append(sample.stamp)
+        self._poses.append(np.array(sample.pose, dtype=np.float64))
+        self._forget(self._stamps, sample.stamp, self._poses, self._v, self._w)
+
+    def add_imu(self, sample: Imu) -> None:
+        """Append a sample; its stamp must be later than the newest one's."""
+        self._imu_stamps.append(sample.stamp)
+        self._rates.append(sample.yaw_rate)
+        self._observe_bias(sample)
+        self._forget(self._imu_stamps, sample.stamp, self._rates)
+
+    def _forget(self, stamps: list[int], now: int, *columns: list) -> None:  # type: ignore[type-arg]
+        k = bisect_left(stamps, now - self._memory)
+        if k > 256:  # in batches: deleting from the front of a list moves all of it
+            for column in (stamps, *columns):
+                del column[:k]
+
+    def _observe_bias(self, sample: Imu) -> None:
+        """Scalar Kalman filter: the IMU minus the wheels' turn rate measures the bias.
+
+        The wheels are exact at standstill and as good as the motion model says when moving.
+        """
+        if len(self._w) < 2 or sample.stamp - self._stamps[-1] > SECOND // 5:
+            return
+        v, w = self._v[-1], self._w[-1]
+        if math.isnan(w):
+            return
+        n = self._noise
+        still = abs(v) < 1e-4 and abs(w) < 1e-4
+        var = n.imu_d**2 + (0.0 if still else (n.c * abs(w) + n.d) ** 2 * 4.0 + 0.02**2)
+        self._bias_var += (2e-5) ** 2  # random walk per sample
+        error = sample.yaw_rate - w - self._bias
+        if error * error > 16.0 * (var + self._bias_var):
+            return  # wheels slip, or the robot is being turned: not a measurement of the bias
+        gain = self._bias_var / (self._bias_var + var)
+        self._bias += gain * error
+        self._bias_var *= 1.0 - gain
+
+    def covers(self, stamp: int) -> bool:
+        """Whether odometry before and after the stamp is there."""
+        return bool(self._stamps) and self._stamps[0] <= stamp <= self._stamps[-1]
+
+    def pose_at(self, stamp: int) -> Array | None:
+        """Raw odometry pose (3,) at the stamp, None outside of what is known."""
+        if not self.covers(stamp):
+            return None
+        k = bisect_left(self._stamps, stamp)
+        if self._stamps[k] == stamp:
+            return self._poses[k]
+        t0, t1 = self._stamps[k - 1], self._stamps[k]
+        return se2.interpolate(self._poses[k - 1], self._poses[k], (stamp - t0) / (t1 - t0))
+
+    def motion(self, start: int, end: int) -> Motion:
+        """Relative motion of base from stamp ``start`` to ``end`` (eq. 5-9).
+
+        Parts without odometry, across a gap or a jump, count as standing still with the noise of
+        an unknown speed, and make the result ``known=False``.
+        """
+        if end <= start:
+            return STILL
+        cuts = [start]
+        cuts += self._stamps[bisect_right(self._stamps, start) : bisect_left(self._stamps, end)]
+        i0 = bisect_right(self._imu_stamps, start)
+        i1 = bisect_left(self._imu_stamps, end)
+        if i1 > i0:
+            cuts = sorted({*cuts, *self._imu_stamps[i0:i1]})
+        cuts.append(end)
+        n = self._noise
+        rows = np.empty((6, len(cuts) - 1))
+        known = True
+        for k in range(len(cuts) - 1):
+            dt = (cuts[k + 1] - cuts[k]) / SECOND
+            v, w, sigma_v, sigma_w, sure = self._control((cuts[k] + cuts[k + 1]) // 2)
+            known = known and sure
+            # the figures hold for n.interval: a shorter interval has the same accumulated noise
+            scale = n.interval / dt
+            lateral = n.lateral * abs(v) if sure else n.max_speed / 5.0
+            rows[:, k] = v, w, dt, sigma_v**2 * scale, sigma_w**2 * scale, lateral**2 * scale
+        out = integrate(*rows)
+        out[0, 2] = se2.wrap(out[0, 2])
+        return Motion(out[0], out[1:], known)
+
+    def _control(self, stamp: int) -> tuple[float, float, float, float, bool]:
+        """Speed, turn rate, their sigmas (eq. 6) at a stamp; False where odometry is missing."""
+        n = self._noise
+        k = bisect_left(self._stamps, stamp)
+        sure = 0 < k < len(self._stamps)
+        if sure:
+            sure = self._stamps[k] - self._stamps[k - 1] <= n.max_gap * SECOND
+            v, w = self._v[k], self._w[k]
+        if not sure or math.isnan(v):
+            v, w, sigma_v, sigma_w = 0.0, 0.0, n.max_speed / 5.0, n.max_turn_rate / 5.0
+            sure = False
+        else:
+            sigma_v, sigma_w = n.a * abs(v) + n.b, n.c * abs(w) + n.d
+        rate = self._rate(stamp)
+        if rate is not None:
+            w = rate - self._bias
+            sigma_w = math.hypot(n.imu_c * abs(w) + n.imu_d, math.sqrt(self._bias_var))
+        return v, w, sigma_v, sigma_w, sure
+
+    def _rate(self, stamp: int) -> float | None:
+        """The IMU's yaw rate, linear between its samples; None outside or across a gap."""
+        k = bisect_left(self._imu_stamps, stamp)
+        if not 0 < k < len(self._imu_stamps):
+            return None
+        t0, t1 = self._imu_stamps[k - 1], self._imu_stamps[k]
+        if t1 - t0 > self._noise.max_gap * SECOND:
+            return None
+        f = (stamp - t0) / (t1 - t0)
+        return self._rates[k - 1] * (1.0 - f) + self._rates[k] * f
+
+
+def warm_up() -> None:
+    """Compile the kernel."""
+    integrate(*np.ones((6, 1)))

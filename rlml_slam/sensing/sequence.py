@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Inputs in any order become observations in the order of their stamps.
+
+A scan waits for the odometry that covers its last ray, and for the detections of the same stamp
+where those have come so far; nothing waits longer than ``transform_timeout``. All of it is decided
+by stamps and order of arrival alone, never by a clock, so a replay repeats it exactly.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+
+from rlml_slam import se2
+from rlml_slam.errors import InputError
+from rlml_slam.motion import SECOND, STILL, MotionBuffer
+from rlml_slam.params import Parameters
+from rlml_slam.se2 import Array
+from rlml_slam.sensing.deskew import project, sweep_time
+from rlml_slam.types import Detections, Imu, Observation, Odometry, Scan
+
+PAIRING = 2_000_000  # [ns] stamps of one instant: drivers round to milliseconds
+PERSISTENT = 10  # inputs in a row: fewer with a strange stamp are faults, more are a new clock
+Waiting: TypeAlias = tuple[int, str, Scan | Detections]
+
+
+@dataclass
+class Inputs:
+    """What became of the inputs, by stream: used, late, duplicate, future, invalid, waited_out."""
+
+    counts: dict[str, Counter[str]] = field(default_factory=dict)
+    last_error: str = ''
+
+    def count(self, stream: str, what: str, error: str = '') -> None:
+        """One more input of ``stream`` that was ``what``."""
+        self.counts.setdefault(stream, Counter())[what] += 1
+        if error:
+            self.last_error = error
+
+    def totals(self) -> dict[str, dict[str, int]]:
+        """Plain dictionaries, sorted, for reports."""
+        return {k: dict(sorted(v.items())) for k, v in sorted(self.counts.items())}
+
+
+class Sequencer:
+    """Collects the inputs of one robot; each ``add_…`` returns the observations that became ready.
+
+    An invalid input is counted in ``inputs`` and left out; it costs nothing that was already known.
+    Only one thing raises InputError: a stream whose stamps stay behind by more than the buffer's
+    memory, as a looped bag's do; the caller then starts anew.
+    """
+
+    def __init__(self, params: Parameters) -> None:
+        self._p = params
+        self._node = params.node
+        self.inputs = Inputs()
+        self.buffer = MotionBuffer(params.motion, self._node.tf_buffer_duration)
+        self._timeout = int(self._node.transform_timeout * SECOND)
+        self._sensor_poses: dict[str, Array] = {self._node.base_frame: np.zeros(3)}
+        self._default_frame: dict[str, str] = {}
+        self._waiting: list[Waiting] = []
+        self._newest: dict[str, int] = {}
+        self._newest_any = -(2**62)
+        self._first_any: int | None = None
+        self._strange: Counter[str] = Counter()
+        self._last: int | None = None
+        self._paired = -(2**62)  # stamp of the last observation that had scan and detections
+
+    def set_sensor_pose(self, frame_id: str, T_base_sensor: Array) -> None:
+        """Where a sensor sits; without it the parameter ``laser_pose`` is used."""
+        self._sensor_poses[frame_id] = np.asarray(T_base_sensor, dtype=np.float64)
+
+    def add_odometry(self, sample: Odometry) -> list[Observation]:
+        """One wheel odometry sample."""
+        if not self._node.use_odom:
+            return []
+        valid = np.shape(sample.pose) == (3,) and bool(np.all(np.isfinite(sample.pose)))
+        if self._accept('odom', sample.stamp, valid, 'pose is not finite'):
+            self.buffer.add_odometry(sample)
+            self.inputs.count('odom', 'used')
+        return self._release()
+
+    def add_imu(self, sample: Imu) -> list[Observation]:
+        """One IMU sample."""
+        if not self._node.use_imu:
+            return []
+        if self._accept('imu', sample.stamp, np.isfinite(sample.yaw_rate), 'rate is not finite'):
+            self.buffer.add_imu(sample)
+            self.inputs.count('imu', 'used')
+        return self._release()
+
+    def add_scan(self, scan: Scan) -> list[Observation]:
+        """One sweep; used for its stamp alone where ``use_scan`` is false."""
+        n = len(scan.ranges)
+        geometry = (scan.angle_min, scan.angle_increment, scan.time_increment, scan.range_max)
+        if n == 0:
+            self.inputs.count('scan', 'invalid', f'scan at {scan.stamp} ns is empty')
+        elif not np.all(np.isfinite(geometry)) or scan.angle_increment == 0.0:
+            self.inputs.count('scan', 'invalid', f'scan at {scan.stamp} ns has no valid geometry')
+        elif self._known_frame('scan', scan.frame_id) and self._accept('scan', scan.stamp):
+            self._wait(scan.stamp, 'scan', scan)
+        return self._release()
+
+    def add_detections(self, detections: Detections) -> list[Observation]:
+        """The reflectors of one instant."""
+        if not self._node.use_reflectors:
+            return []
+        d = detections
+        finite = np.isfinite(d.points).all() and np.isfinite(d.cov).all()
+        if self._known_frame('reflectors', d.frame_id) and self._accept(
+            'reflectors', d.stamp, bool(finite), 'a point or covariance is not finite'
+        ):
+            self._wait(d.stamp, 'reflectors', d)
+        return self._release()
+
+    def flush(self) -> list[Observation]:
+        """Everything that still waits, at the end of the data."""
+        return self._release(lambda _stamp, _end: True)
+
+    def _known_frame(self, stream: str, frame_id: str) -> bool:
+        """Whether the sensor's pose is known; the first unknown frame gets ``laser_pose``."""
+        if frame_id in self._sensor_poses:
+            return True
+        if self._default_frame.setdefault(stream, frame_id) == frame_id:
+            return True
+        error = f'{stream} in frame {frame_id!r}, whose pose in {self._node.base_frame} is unknown'
+        self.inputs.count(stream, 'invalid', error)
+        return False
+
+    def _sensor_pose(self, frame_id: str) -> Array:
+        return self._sensor_poses.get(frame_id, np.array(self._node.laser_pose))
+
+    def _accept(self, stream: str, stamp: int, valid: bool = True, why: str = '') -> bool:
+        """Count and refuse what is invalid, duplicate, or older than what is already used."""
+        if not valid or stamp <= 0:
+            error = f'{stream} at {stamp} ns: {why or "stamp is not positive"}'
+            self.inputs.count(stream, 'invalid', error)
+            return False
+        newest = self._newest.get(stream)
+        if newest is not None and stamp == newest:
+            self.inputs.count(stream, 'duplicate')
+            return False
+        measured = stream in ('scan', 'reflectors')
+        limit = self._last if measured else newest
+        if limit is not None and stamp <= limit:
+            self.inputs.count(stream, 'late', f'{stream} at {stamp} ns is late')
+            self._jumped(stream, self._newest_any - stamp, 'back')
+            return False
+        if self._first_any is not None and self._jumped(stream, stamp - self._newest_any, 'ahead'):
+            self.inputs.count(stream, 'future', f'{stream} at {stamp} ns is far in the future')
+            return False
+        self._strange[stream] = 0
+        self._newest[stream] = stamp if newest is None else max(newest, stamp)
+        self._newest_any = max(self._newest_any, stamp)
+        if self._first_any is None:
+            self._first_any = stamp
+        return True
+
+    def _jumped(self, stream: str, by: int, where: str) -> bool:
+        """Whether a stamp is too far off to be believed; a clock that stays back raises."""
+        if by <= self._node.tf_buffer_duration * SECOND:
+            return False
+        self._strange[stream] += 1
+        if self._strange[stream] < PERSISTENT:
+            return True
+        if where == 'back':
+            raise InputError(f'the clock of {stream} jumped back by {by / SECOND:.1f} s')
+        return False
+
+    def _wait(self, stamp: int, stream: str, item: Scan | Detections) -> None:
+        self._waiting.append((stamp, stream, item))
+        self._waiting.sort(key=lambda w: (w[0], w[1]))
+
+    def _release(self, ready: Callable[[int, int], bool] | None = None) -> list[Observation]:
+        out = []
+        while self._waiting:
+            stamp = self._waiting[0][0]
+            group = [w for w in self._waiting if w[0] - stamp <= PAIRING]
+            end = max(self._end(w[2]) for w in group)
+            if ready is None and not self._is_ready(stamp, end, group):
+                break
+            del self._waiting[: len(group)]
+            out.append(self._observe(stamp, group))
+        return out
+
+    @staticmethod
+    def _end(item: Scan | Detections) -> int:
+        sweep = sweep_time(item) if isinstance(item, Scan) else 0.0
+        return item.stamp + int(sweep * SECOND)
+
+    def _is_ready(self, stamp: int, end: int, group: list[Waiting]) -> bool:
+        waited = self._newest_any - end
+        if waited > self._timeout:
+            self.inputs.count(group[0][1], 'waited_out')
+            return True
+        if self._node.use_odom:
+            newest = self.buffer.newest
+            if newest is None:
+                # without any odometry for a second, there is none to wait for
+                if self._first_any is not None and self._newest_any - self._first_any < SECOND:
+                    return False
+            elif newest < end:
+                return False
+        if len(group) == 1 and stamp - self._paired < SECOND:
+            other = 'reflectors' if group[0][1] == 'scan' else 'scan'
+            # the streams come in pairs: the other half is on its way, unless it was left out
+            if self._newest.get(other, 0) <= stamp and waited <= self._timeout // 2:
+                return False
+        return True
+
+    def _observe(self, stamp: int, group: list[Waiting]) -> Observation:
+        scan: Scan | None = None
+        points = origin = detections = None
+        for _, stream, item in group:
+            self.inputs.count(stream, 'used')
+            if isinstance(item, Scan):
+                if self._node.use_scan:
+                    scan = item
+            else:
+                detections = self._in_base(item)
+        if scan is not None:
+            T = self._sensor_pose(scan.frame_id)
+            duration = int(sweep_time(scan) * SECOND)
+            delta = self.buffer.motion(scan.stamp, scan.stamp + duration).delta
+            points = project(scan, T, delta, self._p.submap.max_laser_range)
+            origin = T[:2].copy()
+        if len(group) == 2:
+            self._paired = stamp
+        motion = STILL if self._last is None else self.buffer.motion(self._last, stamp)
+        self._last = stamp
+        return Observation(
+            stamp, motion, points, origin, detections, scan, self.buffer.pose_at(stamp)
+        )
+
+    def _in_base(self, d: Detections) -> Detections:
+        """Detections moved from their sensor's frame to the base frame, far ones left out."""
+        T = self._sensor_pose(d.frame_id)
+        R = se2.rotation(T[2])
+        near = np.hypot(d.points[:, 0], d.points[:, 1]) <= self._p.reflector.max_range
+        if not near.all():
+            self.inputs.count('reflectors', 'points_too_far')
+        return Detections(
+            d.stamp,
+            self._node.base_frame,
+            se2.transform(T, d.points[near]),
+            R @ d.cov[near] @ R.T,
+            d.ids[near],
+            d.diameters[near],
+        )
