@@ -1,0 +1,320 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The scan term (equations 1, 2 of the RLML front end): e_k = 1 - M(X + p_k), and its solution.
+
+M is the submap's occupancy probability, interpolated by a uniform cubic B-spline: twice
+continuously differentiable, without overshoot, and a slight blur that widens the basin. Unknown
+cells count as UNKNOWN. Poses are of the base in the submap frame; derivatives are with respect to
+the raw coordinates (x, y, theta).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam import params
+from rlml_slam.compiled import kernel
+from rlml_slam.matching import search, thinning
+from rlml_slam.matching.submap import P_MIN, STEP, Submap
+from rlml_slam.se2 import Array, wrap
+
+UNKNOWN = 0.1  # M of an unknown cell; like free space, so that a wall is a ridge from both sides
+INLIER = 0.5  # M from which an end point counts as explained
+ROBUST = 0.6  # e at which the Geman-McClure weight has fallen to a quarter
+
+
+@dataclass(frozen=True)
+class ScanTerm:
+    """The scan term at one pose: cost = sum rho(e_k), unit variance (divide by sigma_s^2).
+
+    ``gradient`` (3,) = J^T W e and ``hessian`` (3, 3) = J^T W J (Gauss-Newton), so the step is
+    -H^-1 g; ``cost`` is half the weighted sum of squares. ``score`` is the mean of M over all end
+    points (0..1), ``inliers`` the number of end points with M > INLIER, ``count`` all of them.
+    """
+
+    cost: float
+    gradient: Array
+    hessian: Array
+    score: float
+    inliers: int
+    count: int
+
+
+@dataclass(frozen=True)
+class ScanMatchResult:
+    """Pose (3,) of base in the submap frame, and how far to trust it.
+
+    ``information`` (3, 3) is that of the scan alone (H / sigma_s^2), ``prior_weight`` the share
+    of the prior that was left after truncation (1 = scan and prior agree).
+    """
+
+    pose: Array
+    information: Array
+    score: float
+    iterations: int
+    converged: bool
+    prior_weight: float
+
+
+@kernel
+def spline(t: float) -> tuple[float, float, float, float]:
+    """Weights of the four cells around a point, t in [0, 1) from the second to the third."""
+    s = 1.0 - t
+    return (
+        s * s * s / 6.0,
+        (3.0 * t * t * (t - 2.0) + 4.0) / 6.0,
+        (3.0 * s * s * (s - 2.0) + 4.0) / 6.0,
+        t * t * t / 6.0,
+    )
+
+
+@kernel
+def spline_slope(t: float) -> tuple[float, float, float, float]:
+    """Derivative of spline() with respect to t."""
+    s = 1.0 - t
+    return -0.5 * s * s, 0.5 * t * (3.0 * t - 4.0), -0.5 * s * (3.0 * s - 4.0), 0.5 * t * t
+
+
+@kernel
+def sample(values: NDArray[np.uint16], column: float, row: float) -> tuple[float, float, float]:
+    """M and its slope (dM/dcolumn, dM/drow) [1/cell] at a place in cells from values[0, 0]."""
+    u, v = column - 0.5, row - 0.5  # a cell's value is that of its centre
+    j, i = int(np.floor(u)), int(np.floor(v))
+    if j < 1 or i < 1 or j + 2 >= values.shape[1] or i + 2 >= values.shape[0]:
+        return UNKNOWN, 0.0, 0.0
+    tu, tv = u - j, v - i
+    a0, a1, a2, a3 = spline(tu)
+    d0, d1, d2, d3 = spline_slope(tu)
+    b = spline(tv)
+    c = spline_slope(tv)
+    m = m_u = m_v = 0.0
+    for r in range(4):
+        p0 = cell(values[i - 1 + r, j - 1])
+        p1 = cell(values[i - 1 + r, j])
+        p2 = cell(values[i - 1 + r, j + 1])
+        p3 = cell(values[i - 1 + r, j + 2])
+        along = a0 * p0 + a1 * p1 + a2 * p2 + a3 * p3
+        slope = d0 * p0 + d1 * p1 + d2 * p2 + d3 * p3
+        m += b[r] * along
+        m_u += b[r] * slope
+        m_v += c[r] * along
+    return m, m_u, m_v
+
+
+@kernel
+def cell(value: int) -> float:
+    """Probability of one cell."""
+    return P_MIN + STEP * (value - 1) if value > 0 else UNKNOWN
+
+
+@kernel
+def accumulate(
+    values: NDArray[np.uint16],
+    corner_j: float,
+    corner_i: float,
+    scale: float,
+    points: Array,
+    pose: Array,
+    out: Array,
+) -> None:
+    """Scan term into ``out`` (12,): cost, g (3), H upper triangle (6), sum of M, inliers."""
+    out[:] = 0.0
+    x, y = pose[0], pose[1]
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    k2 = ROBUST * ROBUST
+    for k in range(len(points)):
+        px, py = points[k, 0], points[k, 1]
+        rx, ry = c * px - s * py, s * px + c * py
+        m, m_u, m_v = sample(values, (x + rx) * scale - corner_j, (y + ry) * scale - corner_i)
+        e = 1.0 - m
+        # Geman-McClure: rho = e^2 / (1 + e^2/k^2), weight = (1 + e^2/k^2)^-2
+        q = 1.0 / (1.0 + e * e / k2)
+        w = q * q
+        jx, jy = -m_u * scale, -m_v * scale
+        jt = -ry * jx + rx * jy
+        out[0] += 0.5 * e * e * q
+        out[1] += w * jx * e
+        out[2] += w * jy * e
+        out[3] += w * jt * e
+        out[4] += w * jx * jx
+        out[5] += w * jx * jy
+        out[6] += w * jx * jt
+        out[7] += w * jy * jy
+        out[8] += w * jy * jt
+        out[9] += w * jt * jt
+        out[10] += m
+        out[11] += m > INLIER
+
+
+def linearize(submap: Submap, points: Array, pose: Array) -> ScanTerm:
+    """The scan term of ``points`` (n, 2), base frame, at ``pose`` (3,) of base in the submap."""
+    points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
+    out = np.empty(12)
+    j, i = submap.corner
+    accumulate(
+        submap.values, float(j), float(i), 1.0 / submap.resolution, points,
+        np.ascontiguousarray(pose, dtype=np.float64), out,
+    )  # fmt: skip
+    n = len(points)
+    return ScanTerm(
+        float(out[0]), out[1:4].copy(), symmetric(out[4:10]),
+        float(out[10]) / n if n else 0.0, int(out[11]), n,
+    )  # fmt: skip
+
+
+def symmetric(upper: Array) -> Array:
+    """Matrix (3, 3) of its upper triangle, row by row (6,)."""
+    a, b, c, d, e, f = upper
+    return np.array([[a, b, c], [b, d, e], [c, e, f]])
+
+
+@kernel
+def refine(
+    values: NDArray[np.uint16],
+    corner_j: float,
+    corner_i: float,
+    scale: float,
+    points: Array,
+    start: Array,
+    prior: Array,
+    information: Array,
+    prior_scale: float,
+    sigma: float,
+    max_iterations: int,
+    out: Array,
+) -> tuple[float, float, float, float, int, bool]:
+    """LM on scan term / sigma^2 + truncated prior; (x, y, theta, weight, iterations, converged).
+
+    ``out`` (12,) holds the scan term at the result.
+    """
+    w = 1.0 / (sigma * sigma)
+    pose = start.copy()
+    trial = np.empty(3)
+    term = np.empty(12)
+    A = np.empty((3, 3))
+    b = np.empty(3)
+    d = np.empty(3)
+    accumulate(values, corner_j, corner_i, scale, points, pose, out)
+    cost, weight = prior_cost(pose, prior, information, prior_scale, d, b)
+    cost += w * out[0]
+    damping = 1e-4
+    iterations = 0
+    converged = False
+    while iterations < max_iterations and not converged:
+        iterations += 1
+        n = 4
+        for r in range(3):
+            b[r] = w * out[1 + r]
+            for q in range(3):
+                A[r, q] = weight * information[r, q]
+                b[r] += weight * information[r, q] * d[q]
+        for r in range(3):
+            for q in range(r, 3):
+                A[r, q] += w * out[n]
+                A[q, r] = A[r, q]
+                n += 1
+            A[r, r] = A[r, r] * (1.0 + damping) + 1e-9
+        step = solve3(A, b)
+        for r in range(3):
+            trial[r] = pose[r] - step[r]
+        accumulate(values, corner_j, corner_i, scale, points, trial, term)
+        trial_cost, trial_weight = prior_cost(trial, prior, information, prior_scale, d, b)
+        trial_cost += w * term[0]
+        small = abs(step[0]) < 1e-4 and abs(step[1]) < 1e-4 and abs(step[2]) < 1e-5
+        if trial_cost <= cost:
+            converged = small
+            pose[:] = trial
+            out[:] = term
+            cost, weight = trial_cost, trial_weight
+            damping = max(damping * 0.1, 1e-7)
+        else:
+            converged = small
+            prior_cost(pose, prior, information, prior_scale, d, b)
+            damping = max(damping * 10.0, 1e-3)
+            if damping > 1e8:
+                break
+    return pose[0], pose[1], pose[2], weight, iterations, converged
+
+
+@kernel
+def prior_cost(
+    pose: Array, prior: Array, information: Array, prior_scale: float, d: Array, work: Array
+) -> tuple[float, float]:
+    """Cost and weight of the prior at pose; ``d`` (3,) becomes pose - prior.
+
+    Geman-McClure in the Mahalanobis distance: the prior is a Gaussian near its mean and has no
+    say far from it, so that odometry that is plainly wrong loses against the scan.
+    """
+    for r in range(3):
+        d[r] = pose[r] - prior[r]
+    d[2] = np.pi - np.mod(np.pi - d[2], 2.0 * np.pi)
+    d2 = 0.0
+    for r in range(3):
+        for q in range(3):
+            d2 += d[r] * information[r, q] * d[q]
+    k = 1.0 / (1.0 + d2 / (prior_scale * prior_scale))
+    return 0.5 * d2 * k, k * k
+
+
+@kernel
+def solve3(A: Array, b: Array) -> tuple[float, float, float]:
+    """Solution of the symmetric positive definite A x = b (3 x 3) by Cholesky."""
+    l00 = np.sqrt(A[0, 0])
+    l10, l20 = A[1, 0] / l00, A[2, 0] / l00
+    l11 = np.sqrt(max(A[1, 1] - l10 * l10, 1e-12))
+    l21 = (A[2, 1] - l20 * l10) / l11
+    l22 = np.sqrt(max(A[2, 2] - l20 * l20 - l21 * l21, 1e-12))
+    y0 = b[0] / l00
+    y1 = (b[1] - l10 * y0) / l11
+    y2 = (b[2] - l20 * y0 - l21 * y1) / l22
+    x2 = y2 / l22
+    x1 = (y1 - l21 * x2) / l11
+    x0 = (y0 - l10 * x1 - l20 * x2) / l00
+    return x0, x1, x2
+
+
+def match(
+    submap: Submap,
+    points: Array,
+    prior_pose: Array,
+    prior_information: Array,
+    parameters: params.ScanMatch | None = None,
+    searched: bool = True,
+) -> ScanMatchResult:
+    """Pose of base in the submap from ``points`` (n, 2), base frame, and an odometry prior.
+
+    ``prior_pose`` (3,), ``prior_information`` (3, 3) in raw coordinates of the submap frame.
+    Points are thinned here. With ``searched`` a correlative search in the window of the
+    parameters gives the start, else the prior does. With no points, or no submap, the prior is
+    returned with no information and score 0.
+    """
+    p = parameters or params.ScanMatch()
+    prior_pose = np.ascontiguousarray(prior_pose, dtype=np.float64)
+    information = np.ascontiguousarray(prior_information, dtype=np.float64)
+    points = thinning.thin(points, p.voxel, p.max_points)
+    if not len(points) or not submap.values.size:
+        return ScanMatchResult(prior_pose.copy(), np.zeros((3, 3)), 0.0, 0, False, 1.0)
+    start = prior_pose
+    if searched:
+        start = search.window(submap, points, prior_pose, p.search_window, p.search_angle).pose
+    out = np.empty(12)
+    j, i = submap.corner
+    x, y, theta, weight, iterations, converged = refine(
+        submap.values, float(j), float(i), 1.0 / submap.resolution, points, start, prior_pose,
+        information, p.prior_scale, p.sigma, p.max_iterations, out,
+    )  # fmt: skip
+    return ScanMatchResult(
+        np.array([x, y, float(wrap(theta))]), symmetric(out[4:10]) / p.sigma**2,
+        float(out[10]) / len(points), iterations, converged, weight,
+    )  # fmt: skip
+
+
+def warm_up() -> None:
+    """Compile the kernels with the signatures that are used at run time."""
+    submap = Submap()
+    points = np.array([[1.0, 0.5], [-0.5, 1.0], [0.3, -0.8]])
+    submap.insert(points, np.zeros(2))
+    linearize(submap, points, np.zeros(3))
+    match(submap, points, np.zeros(3), np.eye(3))

@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Probability grids built from scans by ray carving; scans are matched against them.
+
+A cell holds a uint16: 0 where nothing is known, else 1..LEVELS, linear in the occupancy
+probability P_MIN..P_MAX. A hit (miss) multiplies the odds by those of p_hit (p_miss), which is
+one table look-up per cell. The lattice is fixed: cell (i, j) covers x in
+[j, j + 1) * resolution and y in [i, i + 1) * resolution of the submap frame, so a grid that grows
+changes none of its cells.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam import params
+from rlml_slam.compiled import kernel
+from rlml_slam.errors import InputError
+from rlml_slam.se2 import Array
+
+P_MIN, P_MAX = 0.1, 0.9
+LEVELS = 32767
+STEP = (P_MAX - P_MIN) / (LEVELS - 1)
+MARGIN = 64  # cells of slack when a grid grows, and of free border that kernels may read
+BORDER = 4
+TOUCHED = np.uint16(0x8000)
+EMPTY = np.zeros(0, dtype=np.int64)
+
+
+def value_of(p: float | Array) -> NDArray[np.uint16]:
+    """Cell value of a probability (clamped)."""
+    p = np.clip(p, P_MIN, P_MAX)
+    return np.asarray(1 + np.rint((p - P_MIN) / STEP), dtype=np.uint16)
+
+
+def probability_of(values: NDArray[np.uint16]) -> NDArray[np.float32]:
+    """Occupancy probability of cell values, NaN where nothing is known."""
+    p = P_MIN + (values.astype(np.float32) - 1) * STEP
+    return np.where(values == 0, np.float32(np.nan), p).astype(np.float32)
+
+
+def update_table(p_update: float) -> NDArray[np.uint16]:
+    """New value (LEVELS + 1,) of every value after one observation of probability p_update."""
+    p = P_MIN + np.arange(LEVELS) * STEP
+    odds = p / (1.0 - p) * (p_update / (1.0 - p_update))
+    return np.concatenate([value_of(np.array([p_update])), value_of(odds / (1.0 + odds))])
+
+
+class Submap:
+    """A probability grid in its own frame that grows on demand.
+
+    ``values`` (rows = y, columns = x) uint16, ``corner`` the lattice indices (column, row) of
+    values[0, 0], ``insertions`` the number of scans in it. ``version`` changes with every
+    insertion, so that products (search pyramids) know when they are stale.
+    """
+
+    def __init__(self, parameters: params.Submap | None = None) -> None:
+        self.parameters = parameters or params.Submap()
+        self.resolution = self.parameters.resolution
+        self.values = np.zeros((0, 0), dtype=np.uint16)
+        self.corner = (0, 0)
+        self.insertions = 0
+        self._hit = update_table(self.parameters.p_hit)
+        self._miss = update_table(self.parameters.p_miss)
+        self._list = np.zeros(4096, dtype=np.int64)
+
+    @property
+    def version(self) -> int:
+        """Number that changes whenever a cell may have changed."""
+        return self.insertions
+
+    @property
+    def bounds(self) -> Array:
+        """Extent (x_min, y_min, x_max, y_max) [m] of the allocated grid in the submap frame."""
+        (j, i), (rows, columns) = self.corner, self.values.shape
+        return np.array([j, i, j + columns, i + rows], dtype=np.float64) * self.resolution
+
+    def probability(self) -> NDArray[np.float32]:
+        """Occupancy probability (rows, columns), NaN where nothing is known."""
+        return probability_of(self.values)
+
+    def insert(self, points: Array, origin: Array) -> None:
+        """Add one scan: ``points`` (n, 2) end points and ``origin`` (2,) sensor, submap frame.
+
+        The cells between the sensor and an end point miss, the end point's cell is hit; within
+        one insertion a cell counts once, and hits win. Raises InputError for a non-finite value.
+        """
+        points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
+        origin = np.ascontiguousarray(origin, dtype=np.float64).reshape(2)
+        x_min, y_min, x_max, y_max = extent(points, origin)
+        if not (math.isfinite(x_max - x_min) and math.isfinite(y_max - y_min)):
+            raise InputError('scan for a submap has an end point or origin that is not finite')
+        self._cover(x_min, y_min, x_max, y_max)
+        j, i = self.corner
+        while True:
+            used = carve(
+                self.values, points, origin, float(j), float(i), 1.0 / self.resolution,
+                self._hit, self._miss, self._list,
+            )  # fmt: skip
+            if used >= 0:
+                break
+            self._list = np.zeros(2 * len(self._list), dtype=np.int64)
+        self.insertions += 1
+
+    def _cover(self, x_min: float, y_min: float, x_max: float, y_max: float) -> None:
+        """Grow the grid until the box and a border around it are inside."""
+        scale = 1.0 / self.resolution
+        j_min, j_max = math.floor(x_min * scale) - BORDER, math.floor(x_max * scale) + BORDER + 1
+        i_min, i_max = math.floor(y_min * scale) - BORDER, math.floor(y_max * scale) + BORDER + 1
+        (j, i), (rows, columns) = self.corner, self.values.shape
+        if self.values.size:
+            if j <= j_min and i <= i_min and j_max <= j + columns and i_max <= i + rows:
+                return
+            new_j, new_i = min(j, j_min), min(i, i_min)
+            end_j, end_i = max(j + columns, j_max), max(i + rows, i_max)
+            new_j -= MARGIN * (new_j < j)
+            new_i -= MARGIN * (new_i < i)
+            end_j += MARGIN * (end_j > j + columns)
+            end_i += MARGIN * (end_i > i + rows)
+        else:
+            j, i = j_min, i_min
+            new_j, new_i, end_j, end_i = j_min, i_min, j_max, i_max
+        grown = np.zeros((end_i - new_i, end_j - new_j), dtype=np.uint16)
+        grown[i - new_i : i - new_i + rows, j - new_j : j - new_j + columns] = self.values
+        self.values, self.corner = grown, (new_j, new_i)
+
+
+@kernel
+def extent(points: Array, origin: Array) -> tuple[float, float, float, float]:
+    """Box (x_min, y_min, x_max, y_max) of the end points and the origin; NaN if any is NaN."""
+    x_min = x_max = origin[0]
+    y_min = y_max = origin[1]
+    total = 0.0
+    for k in range(len(points)):
+        x, y = points[k, 0], points[k, 1]
+        total += x + y
+        x_min, x_max = min(x_min, x), max(x_max, x)
+        y_min, y_max = min(y_min, y), max(y_max, y)
+    if not np.isfinite(total + origin[0] + origin[1]):
+        return np.nan, np.nan, np.nan, np.nan
+    return x_min, y_min, x_max, y_max
+
+
+@kernel
+def carve(
+    values: NDArray[np.uint16],
+    points: Array,
+    origin: Array,
+    corner_j: float,
+    corner_i: float,
+    scale: float,
+    hit: NDArray[np.uint16],
+    miss: NDArray[np.uint16],
+    touched: NDArray[np.int64],
+) -> int:
+    """Apply one scan to ``values``; number of cells touched, or -1 if ``touched`` is too short.
+
+    Every touched cell is marked with the top bit and listed, and unmarked at the end; where the
+    list is too short, the scan is taken back by nobody: the size is checked first.
+    """
+    columns = values.shape[1]
+    flat = values.reshape(-1)
+    x0, y0 = origin[0] * scale - corner_j, origin[1] * scale - corner_i
+    # upper bound on touched cells: each ray crosses |di| + |dj| + 1 cells
+    bound = 0
+    for k in range(len(points)):
+        x1, y1 = points[k, 0] * scale - corner_j, points[k, 1] * scale - corner_i
+        bound += int(abs(x1 - x0)) + int(abs(y1 - y0)) + 4
+    if min(bound, flat.size) > touched.size:
+        return -1
+    n = 0
+    for k in range(len(points)):
+        x1, y1 = points[k, 0] * scale - corner_j, points[k, 1] * scale - corner_i
+        cell = int(np.floor(y1)) * columns + int(np.floor(x1))
+        v = flat[cell]
+        if v < TOUCHED:
+            flat[cell] = hit[v] | TOUCHED
+            touched[n] = cell
+            n += 1
+    for k in range(len(points)):
+        x1, y1 = points[k, 0] * scale - corner_j, points[k, 1] * scale - corner_i
+        n = carve_ray(flat, columns, x0, y0, x1, y1, miss, touched, n)
+    for m in range(n):
+        flat[touched[m]] ^= TOUCHED
+    return n
+
+
+@kernel
+def carve_ray(
+    flat: NDArray[np.uint16],
+    columns: int,
+    x0: float,
+    y0: float,
+    x1: float,
+    y1: float,
+    miss: NDArray[np.uint16],
+    touched: NDArray[np.int64],
+    n: int,
+) -> int:
+    """Miss every cell from (x0, y0) to (x1, y1) [cells], the last one excluded (Amanatides)."""
+    j, i = int(np.floor(x0)), int(np.floor(y0))
+    dx, dy = x1 - x0, y1 - y0
+    left = abs(int(np.floor(x1)) - j) + abs(int(np.floor(y1)) - i)
+    step_j = 1 if dx > 0 else -1
+    step_i = columns if dy > 0 else -columns
+    per_j = 1.0 / abs(dx) if dx != 0 else np.inf
+    per_i = 1.0 / abs(dy) if dy != 0 else np.inf
+    next_j = ((j + 1 - x0) if dx > 0 else (x0 - j)) * per_j if dx != 0 else np.inf
+    next_i = ((i + 1 - y0) if dy > 0 else (y0 - i)) * per_i if dy != 0 else np.inf
+    cell = i * columns + j
+    for _ in range(left):
+        v = flat[cell]
+        if v < TOUCHED:
+            flat[cell] = miss[v] | TOUCHED
+            touched[n] = cell
+            n += 1
+        if next_j < next_i:
+            cell += step_j
+            next_j += per_j
+        else:
+            cell += step_i
+            next_i += per_i
+    return n
+
+
+def warm_up() -> None:
+    """Compile the kernels with the signatures that are used at run time."""
+    Submap().insert(np.array([[1.0, 0.5], [-0.5, 1.0]]), np.zeros(2))
