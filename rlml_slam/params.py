@@ -221,6 +221,10 @@ class ScanMatch(Group):
     sigma: float = param(
         0.3, 'sigma_s of one end point (eq. 2), calibrated by NEES', '', 1e-3, 100.0
     )
+    min_points: int = param(20, 'scans with fewer end points are not used', '', 3, 10000)
+    floor2: tuple[float, ...] = param(
+        (2.5e-5, 2.5e-5, 4e-6), 'variance of a match that more beams do not lower', 'm², m², rad²'
+    )
     min_score: float = param(
         0.45, 'mean hit probability below which a match is not used', '', 0.0, 1.0
     )
@@ -234,6 +238,18 @@ class ScanMatch(Group):
         0.5,
         100.0,
     )
+
+
+@dataclass(frozen=True)
+class HealthLimits(Group):
+    """When the estimate counts as DEGRADED or LOST."""
+
+    patience: float = param(1.0, 'an input may fail for this long', 's', 0.0, 60.0)
+    weak_sigma: float = param(
+        0.15, 'a scan that holds a direction worse leaves it open', 'm', 1e-3, 10.0
+    )
+    sigma_degraded: float = param(0.5, 'DEGRADED beyond this position sigma', 'm', 1e-3, 100.0)
+    sigma_lost: float = param(2.0, 'LOST beyond this position sigma', 'm', 1e-3, 1000.0)
 
 
 @dataclass(frozen=True)
@@ -281,6 +297,15 @@ class Solver(Group):
     relative_tolerance: float = param(
         1e-6, 'stop when the cost falls by less than this share', '', 0.0, 1.0
     )
+    method: str = param(
+        'dog_leg', 'how a step is chosen',
+        choices=('gauss_newton', 'levenberg_marquardt', 'dog_leg'),
+    )  # fmt: skip
+    initialization: str = param(
+        'auto', 'start of a solve: the estimate at hand, or one computed from the edges; auto '
+        'computes one only where the estimate fits badly',
+        choices=('none', 'auto', 'odometry', 'spanning_tree', 'chordal'),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -292,9 +317,130 @@ class Parameters:
     reflector: Reflector = Reflector()
     submap: Submap = Submap()
     scan_match: ScanMatch = ScanMatch()
+    health: HealthLimits = HealthLimits()
     back_end: BackEnd = BackEnd()
     loop_closure: LoopClosure = LoopClosure()
     solver: Solver = Solver()
+
+
+@dataclass(frozen=True)
+class Simulator(Group):
+    """The synthetic world, the robot in it and how it runs; a seed fixes all of it."""
+
+    world: str = param('hall', 'name of a world of the package, or path of a world file')
+    seed: int = param(0, 'seed of all noise', '', 0, 2**31 - 1)
+    rate: float = param(1.0, 'simulated seconds per second', '', 0.01, 1000.0)
+    drive: str = param(
+        'route', "follow the world's route, or the cmd_vel topic", choices=('route', 'cmd_vel')
+    )
+    repeat: bool = param(False, 'drive the route again and again')
+    duration: float = param(0.0, 'stop after this long; 0 is when the route is done', 's', 0, 1e6)
+    exit_at_end: bool = param(True, 'the node ends, with exit code 0, when the drive is done')
+    still_time: float = param(1.0, 'stands still before and after the route', 's', 0.0, 600.0)
+    speed: float = param(1.0, 'highest speed', 'm/s', 0.01, 10.0)
+    acceleration: float = param(0.8, 'highest acceleration', 'm/s^2', 0.01, 20.0)
+    turn_rate: float = param(1.0, 'highest turn rate', 'rad/s', 0.01, 10.0)
+    turn_acceleration: float = param(3.0, 'highest turn acceleration', 'rad/s^2', 0.01, 50.0)
+    lookahead: float = param(0.7, 'distance of the point on the route steered at', 'm', 0.1, 10.0)
+    command_timeout: float = param(0.5, 'stops when cmd_vel is older than this', 's', 0.01, 60.0)
+    truth_rate: float = param(50.0, 'rate of the ground truth', 'Hz', 0.1, 1000.0)
+    laser_pose: tuple[float, ...] = param(
+        (0.2, 0.0, 0.0), 'pose of the laser in base_frame', 'm, m, rad'
+    )
+    map_frame: str = param('map', 'frame of the ground truth: the base at start')
+    odom_frame: str = param('odom', 'frame of the odometry')
+    base_frame: str = param('base_link', 'frame of the robot')
+    laser_frame: str = param('laser', 'frame of scans and reflector detections')
+
+
+@dataclass(frozen=True)
+class Wheels(Group):
+    """Wheel odometry of the simulator; a to d, lateral and interval as in MotionNoise."""
+
+    rate: float = param(50.0, 'rate of odometry', 'Hz', 1.0, 1000.0)
+    a: float = param(0.05, 'speed noise per speed', '', 0.0, 10.0)
+    b: float = param(0.01, 'speed noise floor of a moving robot', 'm/s', 0.0, 10.0)
+    c: float = param(0.05, 'turn rate noise per turn rate', '', 0.0, 10.0)
+    d: float = param(0.01, 'turn rate noise floor of a moving robot', 'rad/s', 0.0, 10.0)
+    lateral: float = param(
+        0.02, 'true sideways motion per speed, which the wheels do not see', '', 0.0, 10.0
+    )
+    interval: float = param(0.1, 'control interval that the noise is given for', 's', 1e-3, 10.0)
+    speed_scale: float = param(1.0, 'reported per true speed', '', 0.1, 10.0)
+    turn_scale: float = param(1.0, 'reported per true turn rate', '', 0.1, 10.0)
+    slip_rate: float = param(0.0, 'slip bursts per second of motion', '1/s', 0.0, 100.0)
+    slip_duration: float = param(0.5, 'length of a burst', 's', 0.01, 60.0)
+    slip_speed: float = param(0.5, 'speed overstated by up to this share', '', 0.0, 10.0)
+    slip_turn: float = param(0.3, 'sigma of the false turn rate of a burst', 'rad/s', 0.0, 10.0)
+
+
+@dataclass(frozen=True)
+class Gyro(Group):
+    """IMU of the simulator; c, d and interval as imu_c, imu_d and interval in MotionNoise."""
+
+    rate: float = param(100.0, 'rate of the IMU', 'Hz', 1.0, 2000.0)
+    c: float = param(0.005, 'turn rate noise per turn rate', '', 0.0, 10.0)
+    d: float = param(0.003, 'turn rate noise floor', 'rad/s', 0.0, 10.0)
+    interval: float = param(0.1, 'control interval that the noise is given for', 's', 1e-3, 10.0)
+    bias: float = param(0.005, 'bias at start', 'rad/s', -1.0, 1.0)
+    bias_walk: float = param(5e-5, 'random walk of the bias', 'rad/s/sqrt(s)', 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Laser(Group):
+    """Laser of the simulator. Intensities are 1000 for a white wall met head on at 1 m."""
+
+    rate: float = param(10.0, 'scans per second', 'Hz', 0.5, 100.0)
+    beams: int = param(1440, 'beams per scan', '', 2, 20000)
+    field_of_view: float = param(2 * math.pi, 'angle swept', 'rad', 0.1, 2 * math.pi)
+    range_min: float = param(0.1, 'nearer is reported as -Inf', 'm', 0.0, 10.0)
+    range_max: float = param(30.0, 'farther is reported as +Inf', 'm', 1.0, 500.0)
+    ray_times: bool = param(True, 'each ray is cast at its own time; false: all at the stamp')
+    range_sigma: float = param(0.01, 'range noise', 'm', 0.0, 1.0)
+    divergence: float = param(0.003, 'full angle of a beam', 'rad', 0.0, 0.1)
+    dropped: float = param(0.002, 'share of beams lost, reported as NaN', '', 0.0, 1.0)
+    retro_gain: float = param(30.0, 'brightness of a reflector per white wall', '', 1.0, 1e4)
+    gain_range: float = param(10.0, 'range where the received power has halved', 'm', 0.1, 1e3)
+    intensity_noise: float = param(0.03, 'intensity noise per intensity', '', 0.0, 1.0)
+    min_intensity: float = param(1.0, 'a weaker echo is no return', '', 0.0, 1e6)
+
+
+@dataclass(frozen=True)
+class Markers(Group):
+    """Reflector detections of the simulator, one message per scan."""
+
+    enabled: bool = param(True, 'detect reflectors')
+    sigma_range: float = param(0.02, 'range noise', 'm', 0.0, 10.0)
+    sigma_bearing: float = param(0.003, 'bearing noise', 'rad', 0.0, 1.0)
+    max_range: float = param(25.0, 'farther reflectors are not detected', 'm', 0.5, 500.0)
+    max_incidence: float = param(
+        1.0, 'flat reflectors are not detected at a wider angle to their normal', 'rad', 0.1, 1.57
+    )
+    ids: bool = param(False, 'detections tell which reflector they are of')
+    missing: float = param(0.02, 'share of detections that fail to appear', '', 0.0, 1.0)
+    ghosts: float = param(0.01, 'mean number of false detections per scan', '', 0.0, 100.0)
+
+
+@dataclass(frozen=True)
+class Transport(Group):
+    """Faults of the simulator between sensor and robot, for every message on its own."""
+
+    jitter: float = param(0.0, 'sigma of the error of a stamp', 's', 0.0, 1.0)
+    late: float = param(0.0, 'share of messages that are late', '', 0.0, 1.0)
+    late_delay: float = param(0.3, 'longest delay of a late message', 's', 0.0, 60.0)
+    dropped: float = param(0.0, 'share of messages that never arrive', '', 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class SimulatorParameters:
+    """All of the simulator. Fields of ``node`` have plain ROS names, others ``group.field``."""
+
+    node: Simulator = Simulator()
+    wheels: Wheels = Wheels()
+    gyro: Gyro = Gyro()
+    laser: Laser = Laser()
+    markers: Markers = Markers()
+    transport: Transport = Transport()
 
 
 @dataclass(frozen=True)
