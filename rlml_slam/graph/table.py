@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Growing columns: appending costs amortised O(1), reading is a view on the buffer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rlml_slam.errors import SolverError
+from rlml_slam.se2 import Array
+
+
+class FactorKind(IntEnum):
+    """What a factor stands for; the first three are types.EdgeKind."""
+
+    ODOMETRY = 0
+    SCAN = 1
+    CLOSURE = 2
+    REFLECTOR = 3
+    POSE_PRIOR = 4
+    LANDMARK_PRIOR = 5
+
+
+class Column:
+    """A growing array ``(n, *shape)``; ``view`` is writable and valid until the next append."""
+
+    def __init__(self, shape: tuple[int, ...], dtype: Any = np.float64) -> None:
+        self._buffer = np.zeros((16, *shape), dtype=dtype)
+        self._size = 0
+
+    def __len__(self) -> int:
+        return self._size
+
+    @property
+    def view(self) -> NDArray[Any]:
+        """The rows so far."""
+        return self._buffer[: self._size]
+
+    def append(self, rows: NDArray[Any]) -> None:
+        """Add ``rows`` (k, *shape); doubles the buffer when it is full."""
+        size = self._size + len(rows)
+        if size > len(self._buffer):
+            grown = np.zeros((max(size, 2 * len(self._buffer)), *self._buffer.shape[1:]),
+                             dtype=self._buffer.dtype)  # fmt: skip
+            grown[: self._size] = self.view
+            self._buffer = grown
+        self._buffer[self._size : size] = rows
+        self._size = size
+
+
+class FactorTable:
+    """Factors of one form: nodes (n, a), measured (n, d), information (n, d, d), kinds, enabled.
+
+    ``node_names`` says what the indices point at, for messages ('pose', 'landmark').
+    """
+
+    def __init__(self, node_names: tuple[str, ...], dimension: int) -> None:
+        self.node_names = node_names
+        self.dimension = dimension
+        self._nodes = Column((len(node_names),), np.int64)
+        self._measured = Column((dimension,))
+        self._information = Column((dimension, dimension))
+        self._kinds = Column((), np.int64)
+        self._enabled = Column((), np.bool_)
+
+    def __len__(self) -> int:
+        return len(self._nodes)
+
+    @property
+    def nodes(self) -> NDArray[np.int64]:
+        """Indices of the poses and landmarks of each factor; read only."""
+        view = self._nodes.view
+        view.flags.writeable = False
+        return view
+
+    @property
+    def measured(self) -> Array:
+        """Measured values, read only."""
+        view = self._measured.view
+        view.flags.writeable = False
+        return view
+
+    @property
+    def information(self) -> Array:
+        """Information matrices, read only."""
+        view = self._information.view
+        view.flags.writeable = False
+        return view
+
+    @property
+    def kinds(self) -> NDArray[np.int64]:
+        """FactorKind of each factor, read only."""
+        view = self._kinds.view
+        view.flags.writeable = False
+        return view
+
+    @property
+    def enabled(self) -> NDArray[np.bool_]:
+        """Whether each factor takes part; writable."""
+        return self._enabled.view
+
+    def describe(self, index: int) -> str:
+        """Like 'factor 17 (closure, pose 3 to pose 9)', for messages."""
+        return self._describe(index, self.nodes[index], int(self.kinds[index]))
+
+    def _describe(self, index: int, nodes: NDArray[np.int64], code: int) -> str:
+        kind = FactorKind(code).name.lower().replace('_', ' ')
+        ends = ' to '.join(f'{n} {i}' for n, i in zip(self.node_names, nodes, strict=True))
+        return f'factor {index} ({kind}, {ends})'
+
+    def append(
+        self,
+        kinds: FactorKind | Sequence[FactorKind],
+        nodes: ArrayLike,
+        measured: ArrayLike,
+        information: ArrayLike,
+        sizes: tuple[int, ...],
+    ) -> NDArray[np.int64]:
+        """Add factors (k, a), (k, d), (k, d, d) and return their indices.
+
+        ``sizes`` are the numbers of existing nodes per column. Raises SolverError, naming the
+        factor, on an unknown node, a value that is not finite or an information matrix that is
+        not symmetric positive definite; then nothing is added.
+        """
+        d = self.dimension
+        nodes = np.asarray(nodes, dtype=np.int64).reshape(-1, len(self.node_names))
+        k = len(nodes)
+        codes = np.broadcast_to(np.asarray(kinds, dtype=np.int64), (k,))
+        try:
+            measured = np.asarray(measured, dtype=np.float64).reshape(k, d)
+            information = np.asarray(information, dtype=np.float64).reshape(k, d, d)
+        except ValueError as error:
+            raise SolverError(f'{k} factors between {self.node_names}: {error}') from None
+        self._validate(codes, nodes, measured, information, sizes)
+        first = len(self)
+        self._nodes.append(nodes)
+        self._measured.append(measured)
+        self._information.append(0.5 * (information + np.swapaxes(information, 1, 2)))
+        self._kinds.append(codes)
+        self._enabled.append(np.ones(k, dtype=np.bool_))
+        return np.arange(first, first + k)
+
+    def _validate(
+        self,
+        codes: NDArray[np.int64],
+        nodes: NDArray[np.int64],
+        measured: Array,
+        information: Array,
+        sizes: tuple[int, ...],
+    ) -> None:
+        unknown = np.asarray((nodes < 0) | (nodes >= np.asarray(sizes)))
+        nonfinite = ~np.isfinite(measured).all(-1)
+        same = np.zeros(len(nodes), dtype=np.bool_)
+        if self.node_names == ('pose', 'pose'):
+            same = nodes[:, 0] == nodes[:, 1]
+        bad = unknown.any(-1) | nonfinite | ~is_positive_definite(information) | same
+        if not bad.any():
+            return
+        i = int(np.argmax(bad))
+        where = self._describe(len(self) + i, nodes[i], int(codes[i]))
+        if unknown[i].any():
+            raise SolverError(f'{where}: unknown node; there are {sizes} of {self.node_names}')
+        if same[i]:
+            raise SolverError(f'{where}: both ends are the same node')
+        if nonfinite[i]:
+            raise SolverError(f'{where}: measured value {measured[i].tolist()} is not finite')
+        raise SolverError(
+            f'{where}: information {information[i].tolist()} is not symmetric positive definite'
+        )
+
+
+def is_positive_definite(matrices: Array) -> NDArray[np.bool_]:
+    """Per matrix ``(k, d, d)``, d <= 3: finite, symmetric to 1e-6 and all leading minors > 0."""
+    d = matrices.shape[-1]
+    with np.errstate(invalid='ignore', over='ignore'):
+        scale = np.abs(matrices).max((1, 2), initial=0.0)
+        good: NDArray[np.bool_] = np.isfinite(scale) & (scale > 0.0)
+        asymmetry = np.abs(matrices - np.swapaxes(matrices, 1, 2)).max((1, 2), initial=0.0)
+        good &= asymmetry <= 1e-6 * scale
+        # scaled to a unit diagonal: units of metres and radians may lie far apart
+        diagonal = np.einsum('kii->ki', matrices)
+        good &= (diagonal > 0.0).all(-1)
+        root = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+        c = matrices / (root[:, :, None] * root[:, None, :])
+        if d >= 2:
+            good &= 1.0 - c[:, 0, 1] ** 2 > 1e-12
+        if d == 3:
+            a, b, e = c[:, 0, 1], c[:, 0, 2], c[:, 1, 2]
+            good &= 1.0 + 2.0 * a * b * e - a * a - b * b - e * e > 1e-12
+    return good
