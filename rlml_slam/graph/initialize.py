@@ -28,12 +28,16 @@ def initialize(graph: Graph, method: str) -> None:
     elif method == 'chordal':
         chordal(graph)
     else:
-        before, poses, points = graph.chi2(), graph.poses.copy(), graph.landmarks.copy()
         dof = 3 * len(graph.edges) + 2 * len(graph.sightings)
-        if before > 2.0 * dof:
-            chordal(graph)
-            if not graph.chi2() < before:
-                graph.poses[:], graph.landmarks[:] = poses, points
+        best = graph.chi2(), graph.poses.copy(), graph.landmarks.copy()
+        if best[0] <= 2.0 * dof:
+            return
+        for candidate in (spanning_tree, chordal):
+            candidate(graph)
+            value = graph.chi2()
+            if value < best[0]:
+                best = value, graph.poses.copy(), graph.landmarks.copy()
+        graph.poses[:], graph.landmarks[:] = best[1:]
 
 
 def _roots(graph: Graph) -> NDArray[np.int64]:

@@ -61,7 +61,9 @@ def optimize(graph: Graph, parameters: params.Solver | None = None) -> Solution:
         _apply(graph, columns, step)
         new = normal_equations(graph, columns)
         if new.cost <= now.cost * (1.0 + 1e-12) and np.isfinite(new.cost):
-            converged = now.cost - new.cost <= parameters.relative_tolerance * now.cost
+            converged = damping == 0.0 and (
+                now.cost - new.cost <= parameters.relative_tolerance * now.cost
+            )
             now, damping = new, 0.0 if damping < 1e-6 else damping / 10.0
         else:
             graph.poses[:], graph.landmarks[:] = before

@@ -152,17 +152,17 @@ class FactorTable:
         information: Array,
         sizes: tuple[int, ...],
     ) -> None:
-        unknown = np.asarray((nodes < 0) | (nodes >= np.asarray(sizes)))
-        nonfinite = ~np.isfinite(measured).all(-1)
+        known = np.greater_equal(nodes, 0) & np.less(nodes, np.asarray(sizes))
+        nonfinite = np.logical_not(np.isfinite(measured).all(-1, keepdims=True))[:, 0]
         same = np.zeros(len(nodes), dtype=np.bool_)
         if self.node_names == ('pose', 'pose'):
             same = nodes[:, 0] == nodes[:, 1]
-        bad = unknown.any(-1) | nonfinite | ~is_positive_definite(information) | same
+        bad = ~known.all(-1) | nonfinite | ~is_positive_definite(information) | same
         if not bad.any():
             return
         i = int(np.argmax(bad))
         where = self._describe(len(self) + i, nodes[i], int(codes[i]))
-        if unknown[i].any():
+        if not known[i].all():
             raise SolverError(f'{where}: unknown node; there are {sizes} of {self.node_names}')
         if same[i]:
             raise SolverError(f'{where}: both ends are the same node')
