@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bags written by the project read back, and damaged ones cost only what is damaged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rlml_slam.errors import BagError
+from rlml_slam.params import Node
+from rlml_slam.ros import build, convert
+from rlml_slam.ros.bag import BagReader, BagWriter, Topic, choose_topics
+from rlml_slam.ros.messages import make_bag
+from rlml_slam.types import Imu
+
+SHARED = Path(__file__).resolve().parents[3] / 'shared' / 'data'
+SECOND = 1_000_000_000
+STORAGES = ['mcap', 'sqlite3']
+
+
+def write(path, storage='mcap', n=20):
+    with BagWriter(path, storage) as bag:
+        bag.add_topic('/tf_static', 'tf2_msgs/msg/TFMessage', latched=True)
+        T = build.transform(make_bag, SECOND, ('base_link', 'laser'), np.array([0.2, 0.0, 0.1]))
+        bag.write('/tf_static', build.tf_message(make_bag, [T]), SECOND)
+        for k in range(n):
+            stamp = SECOND + k * 10_000_000
+            pose = np.array([0.1 * k, 0.0, 0.0])
+            odom = build.odometry(make_bag, stamp, ('odom', 'base_link'), pose, np.eye(3))
+            bag.write('/odom', odom, stamp)
+            bag.write('/imu', build.imu(make_bag, Imu(stamp, 0.1 * k), 'imu'), stamp + 1)
+    return path
+
+
+def storage_file(folder) -> Path:
+    (file,) = (f for f in folder.iterdir() if f.suffix in ('.mcap', '.db3'))
+    return file
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_what_was_written_is_read(tmp_path, storage):
+    with BagReader(write(tmp_path / 'bag', storage)) as bag:
+        assert bag.topics['/odom'] == Topic('/odom', 'nav_msgs/msg/Odometry', 20)
+        assert bag.start == SECOND
+        messages = list(bag.messages())
+    assert len(messages) == 41
+    assert [t for t, _, _ in messages] == sorted(t for t, _, _ in messages)
+    odom = [convert.odometry(m) for _, topic, m in messages if topic == '/odom']
+    np.testing.assert_allclose([o.pose[0] for o in odom], 0.1 * np.arange(20))
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_single_file_is_a_bag_too(tmp_path, storage):
+    with BagReader(storage_file(write(tmp_path / 'bag', storage))) as bag:
+        assert len(list(bag.messages(['/imu']))) == 20
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_same_messages_give_the_same_bytes(tmp_path, storage):
+    a, b = (write(tmp_path / folder / 'bag', storage) for folder in 'ab')
+    for name in sorted(f.name for f in a.iterdir()):
+        assert (a / name).read_bytes() == (b / name).read_bytes()
+
+
+def test_failed_writing_leaves_nothing_behind(tmp_path):
+    with pytest.raises(AttributeError), BagWriter(tmp_path / 'bag') as bag:
+        bag.write('/imu', 'no message', SECOND)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_existing_bag_is_not_overwritten(tmp_path):
+    write(tmp_path / 'bag')
+    with pytest.raises(BagError, match='exists already'):
+        BagWriter(tmp_path / 'bag')
+
+
+@pytest.mark.parametrize(
+    ('name', 'content'),
+    [
+        ('a.mcap', b'no bag'),
+        ('a.db3', b'no bag'),
+        ('a.bag', b'no bag'),
+        ('a.txt', b''),
+        ('b', None),
+    ],
+)
+def test_what_is_no_bag_is_named_in_one_line(tmp_path, name, content):
+    path = tmp_path / name
+    if content is None:
+        path.mkdir()
+    else:
+        path.write_bytes(content)
+    with pytest.raises(BagError, match=name) as error:
+        BagReader(path)
+    assert '\n' not in str(error.value)
+
+
+def test_missing_bag_is_named(tmp_path):
+    with pytest.raises(BagError, match='absent: no such bag'):
+        BagReader(tmp_path / 'absent')
+
+
+def topics(*names_and_types):
+    return {n: Topic(n, t, 1) for n, t in names_and_types}
+
+
+SCAN, ODOM = 'sensor_msgs/msg/LaserScan', 'nav_msgs/msg/Odometry'
+
+
+def test_topic_is_chosen_by_name_then_namespace_then_type():
+    both = topics(('/scan', SCAN), ('/rear/laser', SCAN))
+    assert choose_topics(both, Node())['scan'] == '/scan'
+    assert choose_topics(both, Node(scan_topic='laser'))['scan'] == '/rear/laser'
+    only = topics(('/base_scan', SCAN), ('/wheels', ODOM))
+    assert choose_topics(only, Node()) == {'scan': '/base_scan', 'odom': '/wheels'}
+
+
+def test_switched_off_streams_are_not_chosen():
+    only = topics(('/base_scan', SCAN), ('/wheels', ODOM))
+    assert choose_topics(only, Node(use_odom=False)) == {'scan': '/base_scan'}
+
+
+def test_several_fitting_topics_are_listed():
+    with pytest.raises(BagError, match=r'several topics fit scan: /a, /b; .* scan_topic'):
+        choose_topics(topics(('/a', SCAN), ('/b', SCAN)), Node())
+
+
+def test_bag_without_anything_to_measure_is_refused_with_its_topics():
+    with pytest.raises(BagError, match=r'no scan and no reflectors .* /wheels \(nav_msgs'):
+        choose_topics(topics(('/wheels', ODOM)), Node())
+
+
+def test_any_cloud_is_not_taken_for_reflectors():
+    clouds = topics(('/points', 'sensor_msgs/msg/PointCloud2'), ('/scan', SCAN))
+    assert choose_topics(clouds, Node()) == {'scan': '/scan'}
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason='the recordings of ../shared are not here')
+@pytest.mark.parametrize(
+    ('name', 'topic', 'count'),
+    [
+        ('ros-bags-misc/turtlebot3_sim.bag', '/scan', 457),
+        ('ros-bags-misc/jackal_odom_imu.bag', '/imu/data', 3061),
+        ('ros-bags-misc/nav2_turtlebot_amcl.mcap', '/odom', 2639),
+        ('reflector-r2000/r2000_locate0.bag', '/scan', 38),
+    ],
+)
+def test_recorded_bags_are_read(name, topic, count):
+    read = {'scan': convert.scan, 'data': convert.imu, 'odom': convert.odometry}
+    with BagReader(SHARED / name) as bag:
+        values = [read[topic.split('/')[-1]](m) for _, _, m in bag.messages([topic])]
+    assert len(values) == count
+    assert not bag.skipped
