@@ -107,7 +107,9 @@ class MotionBuffer:
             step = se2.log(se2.between(self._poses[-1], sample.pose))
             v, w = float(step[0]) / dt, float(step[2]) / dt
             n = self._noise
-            if abs(v) > n.max_speed or abs(w) > n.max_turn_rate:
+            # stamps of one burst are too close to divide by: a jump is judged over an interval
+            shrink = dt / max(dt, n.interval)
+            if abs(v) * shrink > n.max_speed or abs(w) * shrink > n.max_turn_rate:
                 self.jumps += 1
                 v = w = math.nan
             self._v.append(v)
@@ -150,6 +152,25 @@ class MotionBuffer:
         self._bias += gain * error
         self._bias_var *= 1.0 - gain
 
+    def extrapolate(self, start: int, end: int) -> Motion:
+        """Motion from ``start`` to ``end`` where odometry ends in between: the last speed goes on.
+
+        Its covariance is that of an unknown speed change over the part without odometry.
+        """
+        newest = self.newest
+        if newest is None:
+            return self.motion(start, end)
+        covered = self.motion(start, min(max(newest, start), end))
+        dt = (end - max(newest, start)) / SECOND
+        v, w = self._v[-1], self._w[-1]
+        lasted = len(self._stamps) > 1 and self._stamps[-1] - self._stamps[-2] >= SECOND // 100
+        if math.isnan(v) or not lasted or dt > 2.0 * self._noise.interval:
+            v = w = 0.0
+        n = self._noise
+        spread = np.array([n.max_speed / 5.0, n.max_speed / 20.0, n.max_turn_rate / 5.0]) * dt
+        rest = Motion(se2.exp(np.array([v * dt, 0.0, w * dt])), np.diag(spread**2), known=False)
+        return compose_motion(covered, rest)
+
     def covers(self, stamp: int) -> bool:
         """Whether odometry before and after the stamp is there."""
         return bool(self._stamps) and self._stamps[0] <= stamp <= self._stamps[-1]
@@ -186,8 +207,10 @@ class MotionBuffer:
             dt = (cuts[k + 1] - cuts[k]) / SECOND
             v, w, sigma_v, sigma_w, sure = self._control((cuts[k] + cuts[k + 1]) // 2)
             known = known and sure
-            # the figures hold for n.interval: a shorter interval has the same accumulated noise
-            scale = n.interval / dt
+            # the figures hold for n.interval: a shorter one has the same accumulated noise; where
+            # the motion is too fast for its interval, the stamps are wrong, not the noise larger
+            lasted = max(dt, abs(v) * dt / n.max_speed, abs(w) * dt / n.max_turn_rate)
+            scale = n.interval / lasted
             lateral = n.lateral * abs(v) if sure else n.max_speed / 5.0
             rows[:, k] = v, w, dt, sigma_v**2 * scale, sigma_w**2 * scale, lateral**2 * scale
         out = integrate(*rows)
@@ -200,13 +223,16 @@ class MotionBuffer:
         k = bisect_left(self._stamps, stamp)
         sure = 0 < k < len(self._stamps)
         if sure:
-            sure = self._stamps[k] - self._stamps[k - 1] <= n.max_gap * SECOND
+            gap = (self._stamps[k] - self._stamps[k - 1]) / SECOND
+            sure = gap <= n.max_gap
             v, w = self._v[k], self._w[k]
         if not sure or math.isnan(v):
             v, w, sigma_v, sigma_w = 0.0, 0.0, n.max_speed / 5.0, n.max_turn_rate / 5.0
             sure = False
         else:
-            sigma_v, sigma_w = n.a * abs(v) + n.b, n.c * abs(w) + n.d
+            # when inside a long interval the motion happened is a guess
+            guess = n.guess if gap > 2.0 * n.interval else 0.0
+            sigma_v, sigma_w = (n.a + guess) * abs(v) + n.b, (n.c + guess) * abs(w) + n.d
         rate = self._rate(stamp)
         if rate is not None:
             w = rate - self._bias

@@ -154,7 +154,14 @@ class MotionNoise(Group):
     imu_c: float = param(0.005, "the IMU's turn rate noise per turn rate", '', 0.0, 10.0)
     imu_d: float = param(0.003, "the IMU's turn rate noise floor", 'rad/s', 0.0, 10.0)
     interval: float = param(0.1, 'control interval that a, b, c, d are given for', 's', 1e-3, 10.0)
-    max_gap: float = param(0.5, 'longest interval bridged by interpolation', 's', 0.01, 60.0)
+    guess: float = param(
+        0.2,
+        'noise per speed and turn rate added inside an interval over two times `interval`',
+        '',
+        0.0,
+        10.0,
+    )
+    max_gap: float = param(3.5, 'longest interval bridged by interpolation', 's', 0.01, 60.0)
     max_speed: float = param(
         5.0, 'a faster odometry step is a jump and is not used', 'm/s', 0.01, 100.0
     )
@@ -265,6 +272,16 @@ class BackEnd(Group):
         'relative', 'covariance of an edge: of the relative motion, or eq. 14 literally',
         choices=('relative', 'sum'),
     )  # fmt: skip
+    edge_floor2: tuple[float, ...] = param(
+        (1e-6, 1e-6, 1e-7), 'variance added to every odometry edge', 'm², m², rad²'
+    )
+    submap_size: int = param(40, 'keyframes that complete a submap', '', 2, 1000)
+    match_sigma: tuple[float, ...] = param(
+        (0.05, 0.05, 0.02),
+        "prior of a keyframe's place in its submap, from the front end",
+        'm, m, rad',
+    )
+    scan_robust_scale: float = param(3.0, 'Cauchy scale of scan edges, in sigmas', '', 0.5, 1e3)
     optimize_every: int = param(
         5, 'keyframes between two optimisations without a closure', '', 1, 1000
     )
@@ -285,6 +302,8 @@ class LoopClosure(Group):
     max_distance: float = param(8.0, 'candidates nearer than this are tried', 'm', 0.1, 100.0)
     min_score: float = param(0.6, 'mean hit probability that a closure must reach', '', 0.1, 1.0)
     every: int = param(5, 'try every n-th keyframe', '', 1, 1000)
+    candidates: int = param(3, 'submaps tried per keyframe, nearest first', '', 1, 100)
+    max_second: float = param(0.95, 'score of the second place relative to the best', '', 0.1, 1.0)
     search_window: float = param(3.0, 'half width of the search', 'm', 0.1, 100.0)
     search_angle: float = param(0.5, 'half width of the search', 'rad', 0.01, 3.2)
 

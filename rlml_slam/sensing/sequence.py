@@ -21,7 +21,7 @@ from rlml_slam.motion import SECOND, STILL, MotionBuffer
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.deskew import project, sweep_time
-from rlml_slam.types import Detections, Imu, Observation, Odometry, Scan
+from rlml_slam.types import Detections, Imu, Motion, Observation, Odometry, Scan
 
 PAIRING = 2_000_000  # [ns] stamps of one instant: drivers round to milliseconds
 PERSISTENT = 10  # inputs in a row: fewer with a strange stamp are faults, more are a new clock
@@ -49,7 +49,7 @@ class Inputs:
 class Sequencer:
     """Collects the inputs of one robot; each ``add_…`` returns the observations that became ready.
 
-    An invalid input is counted in ``inputs`` and left out; it costs nothing that was already known.
+    An invalid input is counted in ``inputs`` and left out; it costs nothing that was known before.
     Only one thing raises InputError: a stream whose stamps stay behind by more than the buffer's
     memory, as a looped bag's do; the caller then starts anew.
     """
@@ -66,6 +66,8 @@ class Sequencer:
         self._newest: dict[str, int] = {}
         self._newest_any = -(2**62)
         self._first_any: int | None = None
+        # where odometry ended before the last observation: (stamp, motion assumed since)
+        self._extrapolated: tuple[int, Array] | None = None
         self._strange: Counter[str] = Counter()
         self._last: int | None = None
         self._paired = -(2**62)  # stamp of the last observation that had scan and detections
@@ -230,11 +232,23 @@ class Sequencer:
             origin = T[:2].copy()
         if len(group) == 2:
             self._paired = stamp
-        motion = STILL if self._last is None else self.buffer.motion(self._last, stamp)
+        motion = STILL if self._last is None else self._motion(self._last, stamp)
         self._last = stamp
         return Observation(
             stamp, motion, points, origin, detections, scan, self.buffer.pose_at(stamp)
         )
+
+    def _motion(self, last: int, stamp: int) -> Motion:
+        """Motion since the last observation; what was extrapolated is made good afterwards."""
+        newest = self.buffer.newest
+        start, used = self._extrapolated or (last, np.zeros(3))
+        if newest is not None and newest < stamp:
+            motion = self.buffer.extrapolate(start, stamp)
+            self._extrapolated = (start, motion.delta)
+        else:
+            motion = self.buffer.motion(start, stamp)
+            self._extrapolated = None
+        return Motion(se2.between(used, motion.delta), motion.cov, motion.known)
 
     def _in_base(self, d: Detections) -> Detections:
         """Detections moved from their sensor's frame to the base frame, far ones left out."""

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The RLML back end: keyframes and reflectors in one graph, loop closures, the map (eq. 12-14)."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from rlml_slam import se2
+from rlml_slam.graph.factors import relative_information
+from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.marginals import Marginals
+from rlml_slam.graph.robust import Loss, Losses, LossKind
+from rlml_slam.graph.solver import optimize
+from rlml_slam.maps.occupancy import OccupancyGrid, render
+from rlml_slam.params import Parameters
+from rlml_slam.rlml.keyframes import Interval, Keyframe
+from rlml_slam.rlml.loop_closure import Closure, ScanGraph
+from rlml_slam.rlml.reflector_graph import ReflectorGraph
+from rlml_slam.se2 import Array
+from rlml_slam.types import EdgeKind, Frame, Reflectors
+
+
+@dataclass(frozen=True)
+class Update:
+    """What one keyframe did; ``T_map_local`` (3,) corrects the front end where ``optimized``."""
+
+    keyframe: int
+    T_map_local: Array
+    optimized: bool
+    closures: tuple[Closure, ...]
+    wall_ms: float
+
+
+class BackEnd:
+    """The graph over all keyframes; ``add`` each frame, read the map at any time."""
+
+    def __init__(self, params: Parameters) -> None:
+        self._p = params
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        p = self._p
+        self.graph = Graph(
+            Losses(
+                odometry=Loss(LossKind.CAUCHY, p.back_end.odometry_robust_scale),
+                closure=Loss(LossKind.GEMAN_MCCLURE, p.back_end.closure_robust_scale),
+                scan=Loss(LossKind.CAUCHY, p.back_end.scan_robust_scale),
+                reflector=Loss(LossKind.CAUCHY, p.reflector.robust_scale),
+            )
+        )
+        self.keyframes: list[Keyframe] = []
+        self.scans = ScanGraph(p, self.graph)
+        self.reflector_graph = ReflectorGraph(p.reflector, self.graph)
+        self.T_map_local = np.zeros(3)
+        self._interval: Interval | None = None
+        self._since_optimized = 0
+        self._stamps: list[int] = []
+        self._local: list[Array] = []
+        self._key_of: list[int] = []
+
+    def add(self, frame: Frame) -> Update | None:
+        """Take one frame of the front end; an Update where it became a keyframe."""
+        began = time.perf_counter()
+        if self._interval is not None:
+            self._interval.add_motion(frame)
+        update = None
+        if self._is_key(frame):
+            update = self._add_keyframe(frame, began)
+        assert self._interval is not None
+        self._interval.add_detections(frame)
+        self._stamps.append(frame.stamp)
+        self._local.append(frame.T_local_base)
+        self._key_of.append(len(self.keyframes) - 1)
+        return update
+
+    def _is_key(self, frame: Frame) -> bool:
+        if not self.keyframes:
+            return True
+        p, last = self._p.back_end, self.keyframes[-1]
+        step = se2.between(last.T_local, frame.T_local_base)
+        distance, turn = math.hypot(step[0], step[1]), abs(step[2])
+        if distance >= p.minimum_travel_distance or turn >= p.minimum_travel_heading:
+            return True
+        moved = distance > 0.02 or turn > 0.02
+        return moved and (frame.stamp - last.stamp) * 1e-9 >= p.minimum_time
+
+    def _add_keyframe(self, frame: Frame, began: float) -> Update:
+        key = self._node(frame)
+        closures: tuple[Closure, ...] = ()
+        if key.points is not None:
+            closures = self.scans.add(key)
+        self._since_optimized += 1
+        due = self._since_optimized >= self._p.back_end.optimize_every
+        changed = due and (self.scans.changed or self.reflector_graph.changed)
+        if changed:
+            self.optimize()
+        return Update(
+            key.index,
+            self.T_map_local,
+            changed,
+            closures,
+            (time.perf_counter() - began) * 1e3,
+        )
+
+    def _node(self, frame: Frame) -> Keyframe:
+        """A new pose, tied to the last one by the relative motion (e^P of eq. 12)."""
+        o, interval = frame.observation, self._interval
+        if interval is None:
+            # the first keyframe is the gauge
+            index = self.graph.add_pose(frame.T_local_base, fixed=True)
+            since, scanned = o.motion, False
+        else:
+            self.reflector_graph.add(len(self.keyframes) - 1, interval.sightings)
+            since, scanned = interval.motion, interval.scanned
+            last = self.keyframes[-1]
+            # with scans the front end's motion is the better mean; without, it holds the
+            # reflectors already, which have their own factors
+            delta = se2.between(last.T_local, frame.T_local_base) if scanned else since.delta
+            pose = se2.compose(self.T_map_local, frame.T_local_base)
+            index = self.graph.add_pose(pose)
+            cov = since.cov + np.diag(np.array(self._p.back_end.edge_floor2))
+            if self._p.back_end.edge_covariance == 'sum':
+                # eq. 14 to the letter, in the axes of the frame it is used in
+                R = np.eye(3)
+                R[:2, :2] = se2.rotation(last.T_local[2]).T
+                cov = R @ (last.cov_local + frame.cov_local) @ R.T + 1e-9 * np.eye(3)
+            self.graph.add_edge(
+                EdgeKind.ODOMETRY, index - 1, index, delta, relative_information(delta, cov)
+            )
+        key = Keyframe(
+            index, frame.stamp, frame.T_local_base, frame.cov_local, o.points, o.origin, since,
+            scanned,
+        )  # fmt: skip
+        self.keyframes.append(key)
+        self._interval = Interval(frame.T_local_base)
+        return key
+
+    def optimize(self) -> None:
+        """Solve eq. 13, merge reflectors that turned out to be one, correct the local frame."""
+        if len(self.keyframes) < 2:
+            return
+        optimize(self.graph, self._p.solver)
+        if self.reflector_graph.merge():
+            optimize(self.graph, self._p.solver)
+        self._since_optimized = 0
+        self.scans.changed = self.reflector_graph.changed = False
+        last = self.keyframes[-1]
+        self.T_map_local = se2.compose(self.graph.poses[last.index], se2.inverse(last.T_local))
+
+    def finish(self) -> None:
+        """Use what is still collected, look for the last closures and optimise."""
+        if self._interval is not None and self.keyframes:
+            self.reflector_graph.add(len(self.keyframes) - 1, self._interval.sightings)
+            self._interval = Interval(self.keyframes[-1].T_local)
+            self.scans.finish()
+            self.optimize()
+
+    # --- products ------------------------------------------------------------------------------
+
+    def trajectory(self) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Array]:
+        """Stamps (n,) and poses (n, 3) in the map frame of every frame so far.
+
+        Between two keyframes the front end's path is kept, and the rest of the correction is
+        spread over it evenly by index.
+        """
+        stamps = np.array(self._stamps, dtype=np.int64)
+        if not self.keyframes:
+            return stamps, np.zeros((0, 3))
+        local, key_of = np.array(self._local), np.array(self._key_of)
+        keys = np.array([k.T_local for k in self.keyframes])
+        poses = self.graph.poses[[k.index for k in self.keyframes]]
+        out = se2.compose(poses[key_of], se2.between(keys[key_of], local))
+        first = np.searchsorted(key_of, np.arange(len(keys)))
+        for k in range(len(keys) - 1):
+            a, b = first[k], first[k + 1]
+            missing = se2.log(
+                se2.between(se2.compose(poses[k], se2.between(keys[k], keys[k + 1])), poses[k + 1])
+            )
+            share = np.arange(b - a) / (b - a)
+            out[a:b] = se2.compose(out[a:b], se2.exp(missing * share[:, None]))
+        return stamps, out
+
+    def marginals(self) -> Marginals:
+        """Covariances at the current estimate."""
+        return Marginals(self.graph)
+
+    def reflectors(self) -> Reflectors:
+        """The reflector map with marginal covariances, map frame."""
+        return self.reflector_graph.reflectors()
+
+    def occupancy_grid(self) -> OccupancyGrid | None:
+        """The map rendered from the keyframes' scans, None without any scan."""
+        keys = [k for k in self.keyframes if k.points is not None and len(k.points)]
+        if not keys:
+            return None
+        return render(
+            self.graph.poses[[k.index for k in keys]],
+            [k.points for k in keys if k.points is not None],
+            [k.origin for k in keys if k.origin is not None],
+            self._p.back_end.resolution,
+        )

@@ -1,0 +1,316 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The RLML front end: the MAP pose of every scan over odometry, reflectors and submap (eq. 1-11).
+
+The state is the joint Gaussian of pose, submap anchors and reflectors (:mod:`joint_state`); with
+the latter two known exactly, the update below is eq. 3 and its covariance eq. 11 to the letter.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam import se2
+from rlml_slam.matching import association, thinning
+from rlml_slam.matching.scan_match import match
+from rlml_slam.params import Parameters
+from rlml_slam.rlml.health import Evidence, HealthMonitor
+from rlml_slam.rlml.information import calibrated
+from rlml_slam.rlml.joint_state import JointState
+from rlml_slam.rlml.submaps import Submaps
+from rlml_slam.rlml.tracks import Tracks
+from rlml_slam.se2 import Array
+from rlml_slam.types import Detections, Frame, Health, Motion, Observation, Reflectors, Status
+
+REFLECTOR_ITERATIONS = 4
+CONVERGED = np.array([1e-5, 1e-5, 1e-6])
+
+
+class FrontEnd:
+    """Localises every observation in the local frame, which starts at ``map_start_pose``.
+
+    ``process`` is the system: same object for the live node, the replay and the tests. All state
+    is here; results are frozen values.
+    """
+
+    def __init__(self, params: Parameters) -> None:
+        self._p = params
+        self._associator = association.Associator(params.reflector)
+        self.reset(np.array(params.node.map_start_pose), np.zeros((3, 3)))
+
+    def reset(self, pose: Array, cov: Array) -> None:
+        """Forget everything and start at a pose (3,) of the map with covariance (3, 3)."""
+        self.state = JointState(pose, cov)
+        self.tracks = Tracks()
+        self.submaps = Submaps(self._p.submap)
+        self.health = HealthMonitor(self._p.health)
+        self._T_map_local = np.zeros(3)
+        self._velocity = np.zeros(3)
+        self._velocity_known = False
+        self._has_odometry = False
+        self._last_stamp: int | None = None
+
+    def use_map(self, reflectors: Reflectors) -> None:
+        """Localise against given reflectors (map frame); they are never dropped."""
+        for k in range(len(reflectors)):
+            self.state.fix_landmark(reflectors.points[k], reflectors.cov[k])
+            self.tracks.append(
+                0, int(reflectors.ids[k]), float(reflectors.diameters[k]), surveyed=True
+            )
+
+    def correct(self, T_map_local: Array) -> None:
+        """Take over the back end's newest correction of the local frame."""
+        self._T_map_local = np.array(T_map_local, dtype=np.float64)
+
+    def process(self, observation: Observation) -> Frame:
+        """The pose at the observation's stamp; never raises for what was measured."""
+        began = time.perf_counter()
+        before = self.state.pose
+        self.state.predict(self._motion(observation))
+        matched = _Matched.none(observation.detections)
+        self._use_reflectors(observation, matched)
+        evidence = self._use_scan(observation)
+        self._use_reflectors(observation, matched)
+        self._map_reflectors(observation, matched)
+        self._map_scan(observation)
+        self._remember_velocity(before, observation.stamp)
+        health = self._judge(observation, matched, evidence)
+        return self._frame(observation, matched, evidence, health, began)
+
+    # --- prior -----------------------------------------------------------------------------
+
+    def _motion(self, observation: Observation) -> Motion:
+        """The measured motion; of a robot without any odometry, constant velocity, wide."""
+        motion = observation.motion
+        self._has_odometry |= observation.odom_pose is not None
+        if self._has_odometry or self._last_stamp is None or not self._velocity_known:
+            return motion
+        dt = (observation.stamp - self._last_stamp) * 1e-9
+        if dt > self._p.motion.max_gap:
+            return motion
+        # white acceleration: sigma = a dt^2 / 2 for each axis, floored for the first steps
+        sigma = np.array([1.0, 0.5, 2.0]) * dt * dt * 2.0 + np.array([0.02, 0.02, 0.02])
+        return Motion(se2.exp(self._velocity * dt), np.diag(sigma**2), known=False)
+
+    def _remember_velocity(self, before: Array, stamp: int) -> None:
+        if self._last_stamp is not None and stamp > self._last_stamp:
+            dt = (stamp - self._last_stamp) * 1e-9
+            self._velocity = se2.log(se2.between(before, self.state.x[:3])) / dt
+            self._velocity_known = True
+        self._last_stamp = stamp
+
+    # --- reflector term ----------------------------------------------------------------------
+
+    def _use_reflectors(self, observation: Observation, matched: _Matched) -> None:
+        """Associate what is not yet associated and update with it (e_R of eq. 2)."""
+        detections = observation.detections
+        if detections is None or not matched.open.any():
+            return
+        rows = np.flatnonzero(matched.open)
+        result = self._associator.associate(
+            _subset(detections, rows),
+            association.Believed(
+                self.state.pose,
+                self.state.landmarks(),
+                self.tracks.ids,
+                self.state.pose_and_landmarks_cov(),
+            ),
+        )
+        taken = np.isin(result.match, matched.index[matched.index >= 0]) & (result.match >= 0)
+        used = (result.match >= 0) & ~taken
+        matched.status[rows] = np.where(taken, Status.AMBIGUOUS, result.status)
+        if not used.any():
+            return
+        k, index = rows[used], result.match[used]
+        matched.index[k] = index
+        matched.distance2[k] = result.distance2[used]
+        self._update_reflectors(detections.points[k], detections.cov[k], index, matched, k)
+        self.tracks.see(index, observation.stamp, detections.ids[k])
+
+    def _update_reflectors(
+        self,
+        z: Array,
+        R: Array,
+        index: NDArray[np.int64],
+        matched: _Matched,
+        rows: NDArray[np.int64],
+    ) -> None:
+        """Iterated update: Gauss-Newton on the prior and the reflector terms of eq. 3."""
+        q = len(index)
+        columns = self.state.active(index)
+        x0 = self.state.x[columns]
+        P = self.state.P[np.ix_(columns, columns)]
+        # Huber on the innovation: beyond the scale a detection pulls no harder than at it
+        excess = matched.distance2[rows] / self._p.reflector.robust_scale**2
+        noise = np.zeros((2 * q, 2 * q))
+        k = np.arange(q)
+        noise.reshape(q, 2, q, 2)[k, :, k, :] = R * np.maximum(excess, 1.0)[:, None, None]
+        x = x0.copy()
+        for _ in range(REFLECTOR_ITERATIONS):
+            expected, J, Rt = association.predict(x[:3], x[6:].reshape(-1, 2))
+            blocks = np.zeros((q, 2, len(columns)))
+            blocks[:, :, :3] = J
+            blocks[k, :, 6 + 2 * k] = Rt[:, 0]
+            blocks[k, :, 7 + 2 * k] = Rt[:, 1]
+            H = blocks.reshape(2 * q, -1)
+            v = (z - expected).ravel() + H @ (x - x0)
+            PH = P @ H.T
+            new = x0 + PH @ np.linalg.solve(H @ PH + noise, v)
+            done = bool(np.all(np.abs(new - x)[:3] < CONVERGED))
+            x = new
+            if done:
+                break
+        self.state.apply(columns, H, noise, v)
+
+    def _map_reflectors(self, observation: Observation, matched: _Matched) -> None:
+        """New reflectors enter as candidates, candidates not seen again leave."""
+        p, detections = self._p.reflector, observation.detections
+        if detections is not None and self._p.node.mode == 'mapping':
+            for k in np.flatnonzero(matched.status == Status.NEW):
+                matched.index[k] = self.state.add_landmark(detections.points[k], detections.cov[k])
+                self.tracks.append(
+                    observation.stamp, int(detections.ids[k]), float(detections.diameters[k])
+                )
+        seen = matched.index >= 0
+        matched.keys[seen] = self.tracks.keys[matched.index[seen]]
+        drop = self.tracks.stale(observation.stamp, p.min_sightings, p.candidate_timeout)
+        if drop.any():
+            self.state.remove_landmarks(~drop)
+            self.tracks.keep(~drop)
+
+    # --- scan term ---------------------------------------------------------------------------
+
+    def _use_scan(self, observation: Observation) -> Evidence:
+        """Match against the submap and update with the scan term (e_s of eq. 2)."""
+        p = self._p.scan_match
+        submap = self.submaps.target
+        if observation.points is None:
+            return Evidence(scan=False)
+        if submap is None or len(observation.points) < p.min_points:
+            return Evidence(scan=submap is None, beams=len(observation.points))
+        points = thinning.thin(observation.points, p.voxel, p.max_points)
+        anchor = self.state.anchor(0)
+        J_a, J_x = se2.between_jacobians(anchor, self.state.x[:3])
+        J = np.hstack([J_x, J_a])
+        cov = J @ self.state.P[:6, :6] @ J.T
+        prior = se2.between(anchor, self.state.x[:3])
+        floor = np.zeros((3, 3))
+        floor[[0, 1, 2], [0, 1, 2]] = p.floor2
+        found = match(submap, points, prior, np.linalg.inv(cov + floor), p)
+        if found.score < p.min_score:
+            return Evidence(scan=True, beams=len(points), score=found.score)
+        if found.prior_weight < 0.9:
+            # the scan disagrees with the odometry and wins: the prior is as wide as it was wrong
+            scale = min(1.0 / max(found.prior_weight, 1e-6), 1e6) - 1.0
+            back = np.linalg.inv(J_x)
+            self.state.widen(back @ (scale * (cov + floor)) @ back.T)
+        # the quadratic of the scan at the match, as three independent measurements of it
+        information = calibrated(found.information, p.floor2)
+        values, axes = np.linalg.eigh(information)
+        keep = values > 1e-6
+        root = (axes[:, keep] * np.sqrt(values[keep])).T
+        at_match = se2.between_jacobians(anchor, se2.compose(anchor, found.pose))
+        H = root @ np.hstack([at_match[1], at_match[0]])
+        offset = found.pose - prior
+        offset[2] = se2.wrap(offset[2])
+        # the prior pulled the match off the scan's own optimum by H^-1 g; take that back
+        v = root @ offset
+        self.state.apply(np.arange(6), H, np.eye(len(v)), v)
+        return Evidence(
+            scan=True,
+            used=True,
+            beams=len(points),
+            score=found.score,
+            information=information,
+            heading=float(anchor[2]),
+            prior_weight=found.prior_weight,
+            iterations=found.iterations,
+        )
+
+    def _map_scan(self, observation: Observation) -> None:
+        """Insert the scan into the submaps; a submap that is begun clones the pose."""
+        if observation.points is None or observation.origin is None:
+            return
+        if len(observation.points) < self._p.scan_match.min_points:
+            return
+        self.submaps.insert(self.state, observation.points, observation.origin)
+
+    # --- result --------------------------------------------------------------------------------
+
+    def _judge(self, observation: Observation, matched: _Matched, evidence: Evidence) -> Health:
+        return self.health.judge(
+            observation.stamp,
+            evidence,
+            odometry=observation.motion.known,
+            detections=None if observation.detections is None else len(observation.detections),
+            used=int((matched.status == Status.USED).sum()),
+            cov=self.state.P[:3, :3],
+        )
+
+    def _frame(
+        self,
+        observation: Observation,
+        matched: _Matched,
+        evidence: Evidence,
+        health: Health,
+        began: float,
+    ) -> Frame:
+        R = np.eye(3)
+        R[:2, :2] = se2.rotation(self._T_map_local[2])
+        cov = self.state.pose_cov
+        used = matched.status == Status.USED
+        return Frame(
+            stamp=observation.stamp,
+            observation=observation,
+            T_local_base=self.state.pose,
+            cov_local=cov,
+            T_map_base=se2.compose(self._T_map_local, self.state.x[:3]),
+            cov_map=R @ cov @ R.T,
+            landmarks=matched.keys,
+            statuses=matched.status,
+            health=health,
+            scan_score=evidence.score,
+            chi2=float(np.nansum(matched.distance2[used])),
+            iterations=evidence.iterations,
+            wall_ms=(time.perf_counter() - began) * 1e3,
+        )
+
+    def reflectors(self) -> Reflectors:
+        """The confirmed reflectors in the map frame."""
+        keep = self.tracks.confirmed(self._p.reflector.min_sightings)
+        R = se2.rotation(self._T_map_local[2])
+        return Reflectors(
+            self.tracks.keys[keep],
+            se2.transform(self._T_map_local, self.state.landmarks()[keep]),
+            R @ self.state.landmark_covs()[keep] @ R.T,
+            self.tracks.ids[keep],
+            self.tracks.sightings[keep],
+            self.tracks.diameters[keep],
+        )
+
+
+class _Matched:
+    """What became of each detection (k) so far in one step."""
+
+    def __init__(self, k: int) -> None:
+        self.index = np.full(k, -1, dtype=np.int64)
+        self.keys = np.full(k, -1, dtype=np.int64)
+        self.status = np.full(k, Status.NEW, dtype=np.int64)
+        self.distance2 = np.full(k, np.nan)
+
+    @classmethod
+    def none(cls, detections: Detections | None) -> _Matched:
+        return cls(0 if detections is None else len(detections))
+
+    @property
+    def open(self) -> NDArray[np.bool_]:
+        """Detections without a reflector."""
+        return self.index < 0
+
+
+def _subset(d: Detections, rows: NDArray[np.int64]) -> Detections:
+    return Detections(
+        d.stamp, d.frame_id, d.points[rows], d.cov[rows], d.ids[rows], d.diameters[rows]
+    )

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""OK, DEGRADED or LOST, with the reasons: what a vehicle controller has to know."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from rlml_slam.params import HealthLimits
+from rlml_slam.se2 import Array
+from rlml_slam.types import Health, Level
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the scan said in one step.
+
+    ``information`` (3, 3) is in the axes of the submap, which is turned by ``heading`` [rad].
+    """
+
+    scan: bool = False
+    used: bool = False
+    beams: int = 0
+    score: float = float('nan')
+    information: Array | None = None
+    heading: float = 0.0
+    prior_weight: float = 1.0
+    iterations: int = 0
+
+
+class HealthMonitor:
+    """Remembers since when each input has been failing."""
+
+    def __init__(self, limits: HealthLimits) -> None:
+        self._limits = limits
+        self._held_by_reflectors = -(2**62)
+        self._held_by_scan = -(2**62)
+        self._odometry_seen = -(2**62)
+        self._reflectors_matched = -(2**62)
+        self._scan_fits = -(2**62)
+        self._first: int | None = None
+
+    def judge(
+        self,
+        stamp: int,
+        evidence: Evidence,
+        odometry: bool,
+        detections: int | None,
+        used: int,
+        cov: Array,
+    ) -> Health:
+        """Health at ``stamp`` [ns]; ``detections`` is None where none were looked for."""
+        if self._first is None:
+            self._first = stamp
+            return Health()
+        reasons: list[str] = []
+        lost = False
+        patience = int(self._limits.patience * 1e9)
+
+        def failing(since: int) -> bool:
+            return stamp - max(since, self._first or stamp) > patience
+
+        if odometry:
+            self._odometry_seen = stamp
+        if failing(self._odometry_seen):
+            reasons.append('no odometry')
+        if used >= 2:
+            self._held_by_reflectors = stamp
+        if used > 0 or not detections:
+            self._reflectors_matched = stamp
+        unmatched = failing(self._reflectors_matched)
+        if unmatched:
+            reasons.append(f'none of {detections} detected reflectors matches the map')
+        if evidence.used or not evidence.scan:
+            self._scan_fits = stamp
+        misfit = failing(self._scan_fits)
+        if misfit:
+            reasons.append(f'scan fits the submap by {evidence.score:.2f} only')
+        weak = self._weak_direction(evidence)
+        if evidence.used and weak is None:
+            self._held_by_scan = stamp
+        held = max(self._held_by_scan, self._held_by_reflectors)
+        if failing(held):
+            if weak is not None:
+                reasons.append(f'nothing holds the position along {weak:.0f} deg of the map')
+            elif not misfit:
+                reasons.append('position is held by odometry alone')
+        sigma = math.sqrt(float(np.linalg.eigvalsh(cov[:2, :2])[-1]))
+        if sigma > self._limits.sigma_degraded:
+            reasons.append(f'position uncertain by {sigma:.2f} m (1 sigma)')
+        if sigma > self._limits.sigma_lost or (misfit and (unmatched or not used)):
+            lost = True
+        if lost:
+            return Health(Level.LOST, tuple(reasons))
+        return Health(Level.DEGRADED if reasons else Level.OK, tuple(reasons))
+
+    def _weak_direction(self, evidence: Evidence) -> float | None:
+        """Direction [deg, 0..180) in which the scan leaves the position open, if there is one."""
+        if evidence.information is None:
+            return None
+        info = evidence.information
+        # marginal of the position: the heading is estimated along with it
+        marginal = info[:2, :2] - np.outer(info[:2, 2], info[:2, 2]) / max(info[2, 2], 1e-12)
+        values, axes = np.linalg.eigh(marginal)
+        if values[0] >= self._limits.weak_sigma**-2:
+            return None
+        return math.degrees(math.atan2(axes[1, 0], axes[0, 0]) + evidence.heading) % 180.0

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The newest pose, the anchors of two submaps and the reflectors: one mean, one covariance.
+
+Eq. 5 and 11 of the notes hold the reflectors and the submap fixed, which makes the covariance
+shrink without end while the same few errors of the map are measured again and again. Here they
+stay correlated with the pose: a submap's anchor is a copy of the pose at which it was begun
+(stochastic cloning), so the scan term measures the pose relative to that copy, and a reflector's
+first sighting ties it to the pose of that moment.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam import se2
+from rlml_slam.se2 import Array
+from rlml_slam.types import Motion
+
+POSE = 0
+ANCHORS = (3, 6)
+LANDMARKS = 9
+
+
+class JointState:
+    """Mean ``x`` (9 + 2m,) = pose, anchor 0, anchor 1, reflectors; and covariance ``P``."""
+
+    def __init__(self, pose: Array, cov: Array) -> None:
+        self.x = np.zeros(LANDMARKS)
+        self.P = np.zeros((LANDMARKS, LANDMARKS))
+        self.x[:3] = pose
+        self.P[:3, :3] = cov
+
+    @property
+    def num_landmarks(self) -> int:
+        """Number m of reflectors in the state."""
+        return (len(self.x) - LANDMARKS) // 2
+
+    @property
+    def pose(self) -> Array:
+        """Pose (3,) in the local frame."""
+        return self.x[:3].copy()
+
+    @property
+    def pose_cov(self) -> Array:
+        """Covariance (3, 3) of the pose."""
+        return self.P[:3, :3].copy()
+
+    def landmarks(self) -> Array:
+        """Positions (m, 2) in the local frame."""
+        return self.x[LANDMARKS:].reshape(-1, 2)
+
+    def landmark_covs(self) -> Array:
+        """Marginal covariances (m, 2, 2)."""
+        m = self.num_landmarks
+        k = np.arange(m)
+        P: Array = self.P[LANDMARKS:, LANDMARKS:].reshape(m, 2, m, 2)[k, :, k, :]
+        return P
+
+    def pose_and_landmarks_cov(self) -> Array:
+        """Joint covariance (3 + 2m, 3 + 2m) without the anchors."""
+        keep = np.r_[0:3, LANDMARKS : len(self.x)]
+        P: Array = self.P[np.ix_(keep, keep)]
+        return P
+
+    def predict(self, motion: Motion) -> None:
+        """Move the pose by a relative motion with its covariance (eq. 5)."""
+        J_a, J_b = se2.compose_jacobians(self.x[:3], motion.delta)
+        self.x[:3] = se2.compose(self.x[:3], motion.delta)
+        P = self.P
+        P[:3, :] = J_a @ P[:3, :]
+        P[:, :3] = P[:, :3] @ J_a.T
+        P[:3, :3] += J_b @ motion.cov @ J_b.T
+
+    def widen(self, cov: Array) -> None:
+        """Add independent uncertainty (3, 3) to the pose."""
+        self.P[:3, :3] += cov
+
+    def clone_pose(self, slot: int) -> None:
+        """Make anchor ``slot`` a copy of the pose, with all its correlations."""
+        a = ANCHORS[slot]
+        self.x[a : a + 3] = self.x[:3]
+        self.P[a : a + 3, :] = self.P[:3, :]
+        self.P[:, a : a + 3] = self.P[:, :3]
+
+    def move_anchor(self, source: int, target: int) -> None:
+        """Let slot ``target`` take over the anchor in slot ``source``."""
+        s, t = ANCHORS[source], ANCHORS[target]
+        self.x[t : t + 3] = self.x[s : s + 3]
+        self.P[t : t + 3, :] = self.P[s : s + 3, :]
+        self.P[:, t : t + 3] = self.P[:, s : s + 3]
+
+    def anchor(self, slot: int) -> Array:
+        """Pose (3,) of an anchor."""
+        a = ANCHORS[slot]
+        return self.x[a : a + 3].copy()
+
+    def add_landmark(self, z: Array, R: Array) -> int:
+        """Append the reflector seen at z (2,) with covariance R (2, 2) in base; its index."""
+        n = len(self.x)
+        rot = se2.rotation(self.x[2])
+        G = np.empty((2, 3))
+        G[:, :2] = np.eye(2)
+        G[0, 2] = -rot[1, 0] * z[0] - rot[0, 0] * z[1]
+        G[1, 2] = rot[0, 0] * z[0] - rot[1, 0] * z[1]
+        x = np.empty(n + 2)
+        x[:n] = self.x
+        x[n:] = self.x[:2] + rot @ z
+        P = np.empty((n + 2, n + 2))
+        P[:n, :n] = self.P
+        P[n:, :n] = G @ self.P[:3, :]
+        P[:n, n:] = P[n:, :n].T
+        P[n:, n:] = G @ self.P[:3, :3] @ G.T + rot @ R @ rot.T
+        self.x, self.P = x, P
+        return (n - LANDMARKS) // 2
+
+    def fix_landmark(self, point: Array, cov: Array) -> int:
+        """Append a reflector of a given map, independent of the rest; its index."""
+        n = len(self.x)
+        P = np.zeros((n + 2, n + 2))
+        P[:n, :n] = self.P
+        P[n:, n:] = cov
+        self.x, self.P = np.concatenate([self.x, point]), P
+        return (n - LANDMARKS) // 2
+
+    def remove_landmarks(self, keep: NDArray[np.bool_]) -> None:
+        """Marginalise out the reflectors where ``keep`` (m,) is false."""
+        rows = np.concatenate([np.ones(LANDMARKS, dtype=np.bool_), np.repeat(keep, 2)])
+        self.x = self.x[rows]
+        self.P = self.P[np.ix_(rows, rows)]
+
+    def active(self, landmarks: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Columns of pose, anchor 0 and the given reflectors: all that a measurement can touch."""
+        first = np.array([0, 1, 2, 3, 4, 5], dtype=np.int64)
+        base = LANDMARKS + 2 * landmarks
+        return np.concatenate([first, np.stack([base, base + 1], axis=-1).ravel()])
+
+    def apply(self, columns: NDArray[np.int64], H: Array, R: Array, v: Array) -> None:
+        """Kalman update of everything: v = H dx[columns] + noise of covariance R."""
+        PH = self.P[:, columns] @ H.T
+        S = H @ PH[columns] + R
+        K = np.linalg.solve(S, PH.T).T
+        self.x += K @ v
+        self.x[2] = se2.wrap(self.x[2])
+        # Joseph form costs n^3; P - K S K^T, made symmetric, keeps it positive here because R > 0
+        self.P -= K @ PH.T
+        self.P = 0.5 * (self.P + self.P.T)

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes, and what is collected between two of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rlml_slam import se2
+from rlml_slam.motion import STILL, compose_motion
+from rlml_slam.se2 import Array
+from rlml_slam.types import Frame, Motion
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A pose of the graph; ``points`` (n, 2) and ``origin`` (2,) are its scan in base, or None."""
+
+    index: int
+    stamp: int
+    T_local: Array
+    cov_local: Array
+    points: Array | None
+    origin: Array | None
+    since: Motion
+    scanned: bool
+
+
+@dataclass
+class Sighting:
+    """All detections of one reflector near one keyframe, fused in information form."""
+
+    information: Array = field(default_factory=lambda: np.zeros((2, 2)))
+    weighted: Array = field(default_factory=lambda: np.zeros(2))
+    count: int = 0
+
+    def add(self, z: Array, cov: Array) -> None:
+        """Fuse z (2,) with covariance (2, 2), in the keyframe's frame."""
+        W = np.linalg.inv(cov)
+        self.information += W
+        self.weighted += W @ z
+        self.count += 1
+
+    @property
+    def z(self) -> Array:
+        """The fused position (2,)."""
+        z: Array = np.linalg.solve(self.information, self.weighted)
+        return z
+
+
+class Interval:
+    """What happened since the last keyframe: motion, and reflectors seen from its frame."""
+
+    def __init__(self, T_local: Array) -> None:
+        self._T_local = T_local
+        self.motion = STILL
+        self.scanned = False
+        self.sightings: dict[int, Sighting] = {}
+
+    def add_motion(self, frame: Frame) -> None:
+        """Compose the odometry motion of one more frame."""
+        self.motion = compose_motion(self.motion, frame.observation.motion)
+        self.scanned |= np.isfinite(frame.scan_score)
+
+    def add_detections(self, frame: Frame) -> None:
+        """Move the frame's associated detections to the keyframe and fuse them.
+
+        The place between keyframe and frame is the front end's; its error is at most that of
+        the odometry, which is what is added to the detection's.
+        """
+        d = frame.observation.detections
+        if d is None:
+            return
+        T = se2.between(self._T_local, frame.T_local_base)
+        z = se2.transform(T, d.points)
+        R = se2.rotation(T[2])
+        for k in np.flatnonzero(frame.landmarks >= 0):
+            J = np.array([[1.0, 0.0, -(z[k, 1] - T[1])], [0.0, 1.0, z[k, 0] - T[0]]])
+            cov = R @ d.cov[k] @ R.T + J @ self.motion.cov @ J.T
+            self.sightings.setdefault(int(frame.landmarks[k]), Sighting()).add(z[k], cov)

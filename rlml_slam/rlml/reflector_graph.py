@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The graph's reflectors: born after enough sightings, merged where two turn out to be one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.marginals import Marginals
+from rlml_slam.matching.association import gate
+from rlml_slam.params import Reflector
+from rlml_slam.rlml.keyframes import Sighting
+from rlml_slam.se2 import Array, transform
+from rlml_slam.types import ANONYMOUS, Reflectors
+
+MERGE_DISTANCE = 1.5  # [m] pairs farther apart are not looked at
+
+
+@dataclass
+class _Landmark:
+    """One reflector of the graph; ``sightings`` are (pose, z, information, factor)."""
+
+    key: int
+    index: int = -1
+    id: int = ANONYMOUS
+    count: int = 0
+    sightings: list[tuple[int, Array, Array, int]] = field(default_factory=list)
+
+
+class ReflectorGraph:
+    """Sightings (e^R of eq. 12) and landmarks; keys are the front end's."""
+
+    def __init__(self, params: Reflector, graph: Graph) -> None:
+        self._p = params
+        self._graph = graph
+        self._landmarks: dict[int, _Landmark] = {}
+        self._alias: dict[int, int] = {}
+        self.changed = False
+        self.ids: dict[int, int] = {}
+
+    def resolve(self, key: int) -> int:
+        """The key under which a merged reflector goes on."""
+        while key in self._alias:
+            key = self._alias[key]
+        return key
+
+    def add(self, pose: int, sightings: dict[int, Sighting]) -> None:
+        """The reflectors seen near keyframe ``pose``."""
+        for key, s in sightings.items():
+            landmark = self._landmarks.setdefault(self.resolve(key), _Landmark(self.resolve(key)))
+            landmark.count += s.count
+            landmark.sightings.append((pose, s.z, s.information, -1))
+            if landmark.index >= 0:
+                self._link(landmark, len(landmark.sightings) - 1)
+            elif landmark.count >= self._p.min_sightings:
+                point = transform(self._graph.poses[pose], s.z[None])[0]
+                landmark.index = self._graph.add_landmark(point)
+                for k in range(len(landmark.sightings)):
+                    self._link(landmark, k)
+
+    def _link(self, landmark: _Landmark, k: int) -> None:
+        pose, z, information, _ = landmark.sightings[k]
+        factor = self._graph.add_sighting(pose, landmark.index, z, information)
+        landmark.sightings[k] = (pose, z, information, factor)
+        self.changed = True
+
+    def _alive(self) -> list[_Landmark]:
+        return [m for m in self._landmarks.values() if m.index >= 0]
+
+    def merge(self) -> bool:
+        """Make one of each pair that is close, statistically equal and never seen together."""
+        alive = self._alive()
+        if len(alive) < 2:
+            return False
+        points = self._graph.landmarks[[m.index for m in alive]]
+        gap = np.linalg.norm(points[:, None] - points[None], axis=-1)
+        pairs = [(i, j) for i, j in np.argwhere(gap < MERGE_DISTANCE) if i < j]
+        pairs = [(i, j) for i, j in pairs if not self._distinct(alive[i], alive[j])]
+        if not pairs:
+            return False
+        marginals = Marginals(self._graph)
+        merged: set[int] = set()
+        limit = gate(self._p.gate)
+        for i, j in sorted(pairs, key=lambda p: gap[p[0], p[1]]):
+            if i in merged or j in merged:
+                continue
+            cov = _difference_cov(marginals, alive[i].index, alive[j].index)
+            d = points[i] - points[j]
+            near = gap[i, j] < self._p.min_separation
+            if near or d @ np.linalg.solve(cov + 1e-6 * np.eye(2), d) < limit:
+                self._absorb(alive[i], alive[j])
+                merged |= {i, j}
+        return bool(merged)
+
+    @staticmethod
+    def _distinct(a: _Landmark, b: _Landmark) -> bool:
+        """Whether the two were seen from one keyframe, or tell different ids."""
+        if a.id != ANONYMOUS and b.id != ANONYMOUS and a.id != b.id:
+            return True
+        return not {s[0] for s in a.sightings}.isdisjoint(s[0] for s in b.sightings)
+
+    def _absorb(self, keep: _Landmark, gone: _Landmark) -> None:
+        for pose, z, information, factor in gone.sightings:
+            self._graph.sightings.enabled[factor] = False
+            keep.sightings.append((pose, z, information, -1))
+            self._link(keep, len(keep.sightings) - 1)
+        keep.count += gone.count
+        keep.id = gone.id if keep.id == ANONYMOUS else keep.id
+        self._alias[gone.key] = keep.key
+        del self._landmarks[gone.key]
+
+    def reflectors(self) -> Reflectors:
+        """The map's reflectors with marginal covariances, sorted by key."""
+        alive = sorted(self._alive(), key=lambda m: m.key)
+        index = [m.index for m in alive]
+        cov = Marginals(self._graph).landmarks(index) if alive else np.zeros((0, 2, 2))
+        return Reflectors(
+            np.array([m.key for m in alive], dtype=np.int64),
+            self._graph.landmarks[index].copy() if alive else np.zeros((0, 2)),
+            cov,
+            np.array([m.id for m in alive], dtype=np.int64),
+            np.array([m.count for m in alive], dtype=np.int64),
+            np.full(len(alive), np.nan),
+        )
+
+
+def _difference_cov(marginals: Marginals, a: int, b: int) -> Array:
+    """Covariance (2, 2) of landmark a minus landmark b."""
+    joint = marginals.joint([], [a, b])
+    D = np.hstack([np.eye(2), -np.eye(2)])
+    cov: Array = D @ joint @ D.T
+    return cov

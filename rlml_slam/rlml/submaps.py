@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two overlapping submaps: scans are matched against the older one and inserted into both."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rlml_slam import params, se2
+from rlml_slam.matching.submap import Submap
+from rlml_slam.rlml.joint_state import JointState
+from rlml_slam.se2 import Array
+
+
+class Submaps:
+    """The front end's submaps; the anchor of submap k is slot k of the joint state."""
+
+    def __init__(self, parameters: params.Submap) -> None:
+        self._p = parameters
+        self._maps: list[Submap] = []
+        self._last: Array | None = None
+
+    @property
+    def target(self) -> Submap | None:
+        """The submap that scans are matched against, None before the first scan."""
+        return self._maps[0] if self._maps else None
+
+    def insert(self, state: JointState, points: Array, origin: Array) -> bool:
+        """Insert end points and sensor origin (base frame) where the robot has moved enough."""
+        pose = state.pose
+        if self._last is not None:
+            step = se2.between(self._last, pose)
+            if (
+                math.hypot(step[0], step[1]) < self._p.min_travel
+                and abs(step[2]) < self._p.min_turn
+            ):
+                return False
+        self._last = pose
+        self._turn_over(state)
+        for slot, submap in enumerate(self._maps):
+            T = se2.between(state.anchor(slot), pose)
+            submap.insert(se2.transform(T, points), se2.transform(T, origin[None])[0])
+        return True
+
+    def _turn_over(self, state: JointState) -> None:
+        """Retire a full submap, begin the next one at half of it."""
+        if self._maps and self._maps[0].insertions >= self._p.size and len(self._maps) > 1:
+            del self._maps[0]
+            state.move_anchor(1, 0)
+        if not self._maps or (
+            len(self._maps) == 1 and self._maps[0].insertions >= self._p.size // 2
+        ):
+            state.clone_pose(len(self._maps))
+            self._maps.append(Submap(self._p))
+
+    def cells(self) -> int:
+        """Allocated grid cells, for the memory report."""
+        return int(np.sum([m.values.size for m in self._maps]))

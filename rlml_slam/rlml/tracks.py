@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the front end knows of each reflector besides its place: identity, sightings, age."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam.se2 import Array
+from rlml_slam.types import ANONYMOUS
+
+MAX_CANDIDATES = 40  # seldom seen ones beyond this make room: ghosts must not fill the state
+
+
+def _ints() -> NDArray[np.int64]:
+    return np.zeros(0, dtype=np.int64)
+
+
+@dataclass
+class Tracks:
+    """Columns (m,) parallel to the reflectors of the joint state.
+
+    ``keys`` never repeat, ``ids`` are the reflectors' own (ANONYMOUS), ``sightings`` counts, and
+    ``last_seen`` is a stamp [ns]; ``surveyed`` ones come from a map and are never dropped.
+    """
+
+    keys: NDArray[np.int64] = field(default_factory=_ints)
+    ids: NDArray[np.int64] = field(default_factory=_ints)
+    sightings: NDArray[np.int64] = field(default_factory=_ints)
+    last_seen: NDArray[np.int64] = field(default_factory=_ints)
+    surveyed: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    diameters: Array = field(default_factory=lambda: np.zeros(0))
+    next_key: int = 0
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def append(self, stamp: int, id_: int, diameter: float, surveyed: bool = False) -> int:
+        """A new reflector, seen once; returns its key."""
+        key = self.next_key
+        self.next_key += 1
+        self.keys = np.append(self.keys, key)
+        self.ids = np.append(self.ids, id_)
+        self.sightings = np.append(self.sightings, 0 if surveyed else 1)
+        self.last_seen = np.append(self.last_seen, stamp)
+        self.surveyed = np.append(self.surveyed, surveyed)
+        self.diameters = np.append(self.diameters, diameter)
+        return key
+
+    def see(self, index: NDArray[np.int64], stamp: int, ids: NDArray[np.int64]) -> None:
+        """The reflectors at ``index`` were seen again; an id, once told, is kept."""
+        self.sightings[index] += 1
+        self.last_seen[index] = stamp
+        told = ids != ANONYMOUS
+        self.ids[index[told]] = ids[told]
+
+    def confirmed(self, min_sightings: int) -> NDArray[np.bool_]:
+        """(m,): seen often enough, or from a map."""
+        return (self.sightings >= min_sightings) | self.surveyed
+
+    def stale(self, now: int, min_sightings: int, timeout: float) -> NDArray[np.bool_]:
+        """(m,): candidates to drop, by age and, beyond MAX_CANDIDATES, the longest unseen."""
+        candidate = ~self.confirmed(min_sightings)
+        drop = candidate & (now - self.last_seen > timeout * 1e9)
+        left = np.flatnonzero(candidate & ~drop)
+        if len(left) > MAX_CANDIDATES:
+            order = np.lexsort((self.keys[left], self.last_seen[left]))
+            drop[left[order[: len(left) - MAX_CANDIDATES]]] = True
+        return drop
+
+    def keep(self, mask: NDArray[np.bool_]) -> None:
+        """Forget all where the mask (m,) is false."""
+        for name in ('keys', 'ids', 'sightings', 'last_seen', 'surveyed', 'diameters'):
+            setattr(self, name, getattr(self, name)[mask])
