@@ -4,30 +4,31 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from bisect import bisect_right
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
+from rlml_slam.compiled import kernel
 from rlml_slam.errors import InputError
 from rlml_slam.params import Simulator
 from rlml_slam.se2 import Array
 
 SECOND = 1_000_000_000
 Command = tuple[float, float]
-# what a steering function is asked: pose (x, y, theta) and the present speed
-Steering = Callable[[float, float, float, float], Command]
 
 
 class RouteFollower:
     """Pure pursuit of a polyline: an arc through the point ``lookahead`` ahead on the route."""
 
     def __init__(self, route: Array, limits: Simulator) -> None:
-        self._points = route
-        self._legs = np.diff(route, axis=0)
-        self._lengths = np.hypot(self._legs[:, 0], self._legs[:, 1])
-        self._ends = np.concatenate([[0.0], np.cumsum(self._lengths)])
+        legs = np.diff(route, axis=0)
+        lengths = np.hypot(legs[:, 0], legs[:, 1])
+        # plain floats: this runs a hundred times per simulated second
+        self._points = route.tolist()
+        self._directions = (legs / lengths[:, None]).tolist()
+        self._ends = [0.0, *np.cumsum(lengths).tolist()]
         self._limits = limits
         self._progress = 0.0
 
@@ -45,15 +46,18 @@ class RouteFollower:
         """Begin the route again."""
         self._progress = 0.0
 
+    def _leg(self, distance: float) -> int:
+        """Index of the leg at a distance along the route."""
+        k = bisect_right(self._ends, distance) - 1
+        return max(min(k, len(self._directions) - 1), 0)
+
     def point(self, distance: float) -> tuple[float, float]:
         """Point at a distance along the route; beyond its end, on the last leg produced."""
-        if not len(self._legs):
-            return float(self._points[0, 0]), float(self._points[0, 1])
-        k = int(np.searchsorted(self._ends, distance, side='right')) - 1
-        k = min(max(k, 0), len(self._legs) - 1)
-        f = (distance - self._ends[k]) / self._lengths[k]
-        p = self._points[k] + f * self._legs[k]
-        return float(p[0]), float(p[1])
+        if not self._directions:
+            return self._points[0][0], self._points[0][1]
+        k = self._leg(distance)
+        (x, y), (dx, dy), s = self._points[k], self._directions[k], distance - self._ends[k]
+        return x + s * dx, y + s * dy
 
     def _advance(self, x: float, y: float) -> None:
         """Move progress to the nearest point of the route that is not far ahead.
@@ -62,21 +66,20 @@ class RouteFollower:
         """
         best = math.inf
         end = self._progress + 2.0 * self._limits.lookahead
-        first = max(int(np.searchsorted(self._ends, self._progress, side='right')) - 1, 0)
         progress = self._progress
-        for k in range(first, len(self._legs)):
+        for k in range(self._leg(progress), len(self._directions)):
             if self._ends[k] > end:
                 break
-            (ax, ay), (ex, ey), n = self._points[k], self._legs[k], self._lengths[k]
-            s = self._ends[k] + ((x - ax) * ex + (y - ay) * ey) / n
+            (ax, ay), (dx, dy) = self._points[k], self._directions[k]
+            s = self._ends[k] + (x - ax) * dx + (y - ay) * dy
             s = min(max(s, self._ends[k], self._progress), self._ends[k + 1], end)
             px, py = self.point(s)
             distance = math.hypot(px - x, py - y)
             if distance < best:
-                best, progress = distance, float(s)
+                best, progress = distance, s
         self._progress = progress
 
-    def steer(self, x: float, y: float, theta: float, speed: float) -> Command:
+    def steer(self, x: float, y: float, theta: float) -> Command:
         """Wanted speed and turn rate; (0, 0) at the end of the route."""
         n = self._limits
         self._advance(x, y)
@@ -102,95 +105,112 @@ def approach(now: float, wanted: float, most: float) -> float:
     return now + min(max(wanted - now, -most), most)
 
 
-class Track:
-    """The true motion: poses at knots, and between them exact arcs of constant twist.
+@kernel
+def _along(knots: Array, count: int, first: int, step: int, stamps: NDArray[np.int64]) -> Array:
+    """Columns of the track (n, 7) at stamps not before ``first``, by exact arcs from the knots."""
+    out = np.empty((len(stamps), 7))
+    for i in range(len(stamps)):
+        k = min((stamps[i] - first) // step, count - 1)
+        row = knots[k]
+        dt = (stamps[i] - first - k * step) * 1e-9
+        # exp of the twist: chord of half the turn, without a division by a small turn
+        half = 0.5 * row[5] * dt
+        sinc = math.sin(half) / half if abs(half) > 1e-4 else 1.0 - half * half / 6.0
+        c, s = math.cos(row[2] + half) * sinc * dt, math.sin(row[2] + half) * sinc * dt
+        out[i, 0] = row[0] + c * row[3] - s * row[4]
+        out[i, 1] = row[1] + s * row[3] + c * row[4]
+        out[i, 2] = row[2] + row[5] * dt
+        out[i, 3:6] = row[3:6]
+        out[i, 6] = row[6] + row[3] * dt
+    return out
 
-    At least the last 300 s are kept. Headings are not wrapped inside.
+
+class Track:
+    """The true motion: poses at knots, one per step, and between them arcs of constant twist.
+
+    At least the last 300 s of 10 ms steps are kept. Headings are not wrapped inside.
     """
 
     CAPACITY = 65536
 
-    def __init__(self, stamp: int, pose: Array) -> None:
-        self._t = np.zeros(self.CAPACITY, np.int64)
+    def __init__(self, stamp: int, pose: Array, step: int = 10_000_000) -> None:
+        self._first = stamp
+        self._step = step
         # x, y, theta of the knot; vx, vy, omega from it on; wheel travel so far
-        self._k = np.zeros((self.CAPACITY, 7))
-        self._n = 1
-        self._t[0] = stamp
-        self._k[0, :3] = pose
+        self._knots = np.zeros((self.CAPACITY, 7))
+        self._count = 1
+        self._knots[0, :3] = pose
 
     @property
     def stamp(self) -> int:
         """Stamp of the newest knot."""
-        return int(self._t[self._n - 1])
+        return self._first + (self._count - 1) * self._step
 
     @property
-    def pose(self) -> Array:
-        """Pose (3,) of the newest knot."""
-        return self._k[self._n - 1, :3]
+    def pose(self) -> tuple[float, float, float]:
+        """Pose of the newest knot, theta not wrapped."""
+        x, y, theta = self._knots[self._count - 1, :3].tolist()
+        return x, y, theta
 
     @property
-    def twist(self) -> Array:
-        """Body twist (3,) from the newest knot on."""
-        return self._k[self._n - 1, 3:6]
+    def twist(self) -> tuple[float, float, float]:
+        """Body twist from the newest knot on."""
+        v, lateral, omega = self._knots[self._count - 1, 3:6].tolist()
+        return v, lateral, omega
 
     def set_twist(self, v: float, lateral: float, omega: float) -> None:
         """Choose the twist from the newest knot on."""
-        self._k[self._n - 1, 3:6] = v, lateral, omega
+        self._knots[self._count - 1, 3:6] = v, lateral, omega
 
-    def advance(self, step: int) -> None:
-        """Append a knot ``step`` [ns] later; the twist goes on."""
-        if self._n == self.CAPACITY:
+    def advance(self) -> None:
+        """Append the next knot; the twist goes on."""
+        row = self._rows(self.stamp + self._step)[0]
+        if self._count == self.CAPACITY:
             half = self.CAPACITY // 2
-            self._t[:half], self._k[:half] = self._t[half:], self._k[half:]
-            self._n = half
-        n, stamp = self._n, self.stamp + step
-        self._k[n] = self._rows(np.array([stamp]))[0]
-        self._t[n] = stamp
-        self._n += 1
+            self._knots[:half] = self._knots[half:]
+            self._first += half * self._step
+            self._count = half
+        self._knots[self._count] = row
+        self._count += 1
 
-    def _rows(self, stamps: NDArray[np.int64]) -> Array:
+    def _rows(self, *stamps: int) -> Array:
+        return self._columns(np.array(stamps, dtype=np.int64))
+
+    def _columns(self, stamps: NDArray[np.int64]) -> Array:
         """All columns (n, 7) at the stamps; the newest twist holds beyond the newest knot."""
-        k = np.searchsorted(self._t[: self._n], stamps, side='right') - 1
-        if len(k) and k.min() < 0:
+        if len(stamps) and stamps.min() < self._first:
             raise InputError('the simulated track does not reach back that far')
-        rows = self._k[k]
-        dt = (stamps - self._t[k]) / SECOND
-        d = rows[:, 3:6] * dt[:, None]
-        a = np.sinc(d[:, 2] / np.pi)
-        b = np.sinc(d[:, 2] / (2.0 * np.pi)) * np.sin(0.5 * d[:, 2])
-        x, y = a * d[:, 0] - b * d[:, 1], b * d[:, 0] + a * d[:, 1]
-        c, s = np.cos(rows[:, 2]), np.sin(rows[:, 2])
-        rows[:, 0] += c * x - s * y
-        rows[:, 1] += s * x + c * y
-        rows[:, 2] += d[:, 2]
-        rows[:, 6] += d[:, 0]
-        return rows
+        return _along(self._knots, self._count, self._first, self._step, stamps)
 
     def poses(self, stamps: NDArray[np.int64]) -> Array:
         """Poses (n, 3) at stamps (n,), theta not wrapped."""
-        return self._rows(stamps)[:, :3]
+        return self._columns(stamps)[:, :3]
 
     def pose_at(self, stamp: int) -> Array:
         """Pose (3,) at a stamp, theta wrapped."""
-        pose = self._rows(np.array([stamp]))[0, :3]
+        pose = self._rows(stamp)[0, :3]
         pose[2] = se2.wrap(pose[2])
         return pose
 
     def twist_at(self, stamp: int) -> Array:
         """Body twist (3,) at a stamp; at a knot, that from it on."""
-        return self._rows(np.array([stamp]))[0, 3:6]
+        return self._rows(stamp)[0, 3:6]
 
     def wheel_motion(self, start: int, end: int) -> tuple[float, float]:
         """Forward travel [m] and turn [rad] between two stamps, as perfect wheels measure them."""
-        a, b = self._rows(np.array([start, end]))
+        a, b = self._rows(start, end)
         return float(b[6] - a[6]), float(b[2] - a[2])
 
-    def turn_rate(self, stamp: int, window: int) -> float:
-        """Mean turn rate [rad/s] over ``window`` [ns] around the stamp.
+    def turn_rate(self, stamp: int) -> float:
+        """Mean turn rate [rad/s] over one step around the stamp.
 
         Centred, so that the trapezoids through its samples add up to the turn made.
         """
-        half = window // 2
-        start = max(stamp - half, int(self._t[0]))
-        a, b = self._rows(np.array([start, stamp + half]))
-        return float(b[2] - a[2]) * SECOND / (stamp + half - start)
+        start, end = max(stamp - self._step // 2, self._first), stamp + self._step // 2
+        a, b = self._rows(start, end)
+        return float(b[2] - a[2]) * SECOND / (end - start)
+
+
+def warm_up() -> None:
+    """Compile the kernel."""
+    Track(0, np.zeros(3)).pose_at(0)

@@ -90,10 +90,10 @@ class GyroSensor:
         self._walk = generators('bias')
         self.bias = gyro.bias
 
-    def measure(self, track: Track, stamp: int, step: int) -> Imu:
-        """The IMU at a stamp; ``step`` [ns] is the window its rate is the mean over."""
+    def measure(self, track: Track, stamp: int) -> Imu:
+        """The IMU at a stamp."""
         n = self._n
-        rate = track.turn_rate(stamp, step)
+        rate = track.turn_rate(stamp)
         sigma = (n.c * abs(rate) + n.d) * math.sqrt(n.interval * n.rate)
         measured = rate + self.bias + sigma * self._noise.standard_normal()
         self.bias += n.bias_walk / math.sqrt(n.rate) * self._walk.standard_normal()

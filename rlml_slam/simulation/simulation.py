@@ -65,7 +65,7 @@ class Simulation:
         self.world = world
         self.parameters = p
         self._seed = p.node.seed if seed is None else seed
-        self._track = Track(START, world.start)
+        self._track = Track(START, world.start, STEP)
         self._route = RouteFollower(world.route, p.node)
         self._slide = self._generator('lateral')
         self._faults = {
@@ -146,7 +146,7 @@ class Simulation:
         """Go on by 10 ms and return what arrived meanwhile, in order."""
         if not self._pushed:
             self._sense()
-        self._track.advance(STEP)
+        self._track.advance()
         self._steer()
         self._sense()
         return self._arrivals(self.time)
@@ -166,8 +166,7 @@ class Simulation:
             return self._command if fresh else (0.0, 0.0)
         if self.time - START < n.still_time * SECOND:
             return 0.0, 0.0
-        x, y, theta = self._track.pose
-        v, w = self._route.steer(x, y, theta, self._track.twist[0])
+        v, w = self._route.steer(*self._track.pose)
         if v == 0.0 and w == 0.0:
             if n.repeat:
                 self._route.restart()
@@ -181,8 +180,9 @@ class Simulation:
         dt = STEP / SECOND
         v, w = self._wanted()
         v, w = min(max(v, -n.speed), n.speed), min(max(w, -n.turn_rate), n.turn_rate)
-        v = approach(self._track.twist[0], v, n.acceleration * dt)
-        w = approach(self._track.twist[2], w, n.turn_acceleration * dt)
+        now_v, _, now_w = self._track.twist
+        v = approach(now_v, v, n.acceleration * dt)
+        w = approach(now_w, w, n.turn_acceleration * dt)
         # sideways motion of variance (lateral |v|)^2 interval dt per step, unseen by the wheels
         wheels = self.parameters.wheels
         sigma = wheels.lateral * abs(v) * (wheels.interval / dt) ** 0.5
@@ -204,7 +204,7 @@ class Simulation:
         for stamp in self._due(Odometry, p.wheels.rate):
             self._send(self._wheels.measure(self._track, stamp), stamp)
         for stamp in self._due(Imu, p.gyro.rate):
-            self._send(self._gyro.measure(self._track, stamp, STEP), stamp)
+            self._send(self._gyro.measure(self._track, stamp), stamp)
         for stamp in self._due(Scan, p.laser.rate, self._laser.sweep):
             self._scan(stamp)
 
