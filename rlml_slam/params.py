@@ -355,6 +355,9 @@ class Simulator(Group):
     repeat: bool = param(False, 'drive the route again and again')
     duration: float = param(0.0, 'stop after this long; 0 is when the route is done', 's', 0, 1e6)
     exit_at_end: bool = param(True, 'the node ends, with exit code 0, when the drive is done')
+    wait_for_subscribers: int = param(
+        0, 'time begins when the scan has this many subscribers', '', 0, 100
+    )
     still_time: float = param(1.0, 'stands still before and after the route', 's', 0.0, 600.0)
     speed: float = param(1.0, 'highest speed', 'm/s', 0.01, 10.0)
     acceleration: float = param(0.8, 'highest acceleration', 'm/s^2', 0.01, 20.0)

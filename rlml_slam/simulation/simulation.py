@@ -140,7 +140,7 @@ class Simulation:
     def __iter__(self) -> Iterator[Event]:
         while not self.done:
             yield from self.step()
-        yield from self._arrivals(None)
+        yield from self.rest()
 
     def step(self) -> list[Event]:
         """Go on by 10 ms and return what arrived meanwhile, in order."""
@@ -150,6 +150,10 @@ class Simulation:
         self._steer()
         self._sense()
         return self._arrivals(self.time)
+
+    def rest(self) -> list[Event]:
+        """What is still on its way when the drive is done, in order."""
+        return self._arrivals(None)
 
     def _arrivals(self, until: int | None) -> list[Event]:
         events = []

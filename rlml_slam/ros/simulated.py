@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the simulator says, as messages: the same for the node and for bags."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from rlml_slam import se2
+from rlml_slam.params import SimulatorParameters
+from rlml_slam.ros import build
+from rlml_slam.ros.messages import Make
+from rlml_slam.se2 import Array
+from rlml_slam.simulation.robot import SECOND
+from rlml_slam.simulation.simulation import START, GroundTruth, Message, Simulation
+from rlml_slam.types import Detections, Imu, Odometry, Scan
+
+# topic (relative) -> type, depth of its queue; the first four are sensor data, best effort
+TOPICS = {
+    'odom': ('nav_msgs/msg/Odometry', 50),
+    'imu': ('sensor_msgs/msg/Imu', 50),
+    'scan': ('sensor_msgs/msg/LaserScan', 5),
+    'reflectors': ('sensor_msgs/msg/PointCloud2', 5),
+    'ground_truth': ('nav_msgs/msg/Odometry', 10),
+}
+SENSOR_TOPICS = ('odom', 'imu', 'scan', 'reflectors')
+# latched: where the reflectors really are, in the map frame
+TRUE_REFLECTORS = 'ground_truth_reflectors'
+
+
+class SimulatedMessages:
+    """Turns the messages of one simulation into ROS's; keeps the odometry for its twist."""
+
+    def __init__(self, make: Make, parameters: SimulatorParameters) -> None:
+        self._make = make
+        self._p = parameters
+        self._last: Odometry | None = None
+
+    def __call__(self, message: Message) -> tuple[str, Any]:
+        """Topic (relative) and message."""
+        make, n = self._make, self._p.node
+        if isinstance(message, Odometry):
+            return 'odom', self._odometry(message)
+        if isinstance(message, Imu):
+            gyro = self._p.gyro
+            rate = abs(message.yaw_rate)
+            variance = (gyro.c * rate + gyro.d) ** 2 * gyro.interval * gyro.rate
+            return 'imu', build.imu(make, message, n.base_frame, variance)
+        if isinstance(message, Scan):
+            return 'scan', build.laser_scan(make, message, 1.0 / self._p.laser.rate)
+        if isinstance(message, Detections):
+            return 'reflectors', build.detections(make, message)
+        return 'ground_truth', self._truth(message)
+
+    def _truth(self, truth: GroundTruth) -> Any:
+        n = self._p.node
+        frames = (n.map_frame, n.base_frame)
+        none = np.zeros((3, 3))
+        return build.odometry(
+            self._make, truth.stamp, frames, truth.T_map_base, none, truth.twist, none
+        )
+
+    def _odometry(self, sample: Odometry) -> Any:
+        """Twist from the step before; the pose's covariance grows without bound: left at 0."""
+        n, last = self._p.node, self._last
+        self._last = sample
+        twist = np.zeros(3)
+        if last is not None and sample.stamp > last.stamp:
+            dt = (sample.stamp - last.stamp) / SECOND
+            twist = se2.log(se2.between(last.pose, sample.pose)) / dt
+        return build.odometry(
+            self._make,
+            sample.stamp,
+            (n.odom_frame, n.base_frame),
+            sample.pose,
+            np.zeros((3, 3)),
+            twist,
+            self._twist_cov(twist),
+        )
+
+    def _twist_cov(self, twist: Array) -> Array:
+        w = self._p.wheels
+        scale = w.interval * w.rate
+        v, omega = abs(twist[0]), abs(twist[2])
+        sigmas = np.array([w.a * v + w.b, w.lateral * v, w.c * omega + w.d])
+        cov: Array = np.diag(sigmas**2 * scale)
+        return cov
+
+    def true_reflectors(self, simulation: Simulation) -> Any:
+        """PointCloud2 of all reflectors with their ids, in the map frame."""
+        points, ids = simulation.true_reflectors()
+        diameters = np.where(
+            np.isnan(simulation.world.reflectors.normals), simulation.world.reflectors.widths,
+            math.nan,
+        )  # fmt: skip
+        known = Detections(
+            START, self._p.node.map_frame, points, np.zeros((len(ids), 2, 2)), ids, diameters
+        )
+        return build.detections(self._make, known)
+
+    def laser_transform(self) -> Any:
+        """TransformStamped from base to laser."""
+        n = self._p.node
+        T_base_laser = np.array(n.laser_pose)
+        return build.transform(self._make, START, (n.base_frame, n.laser_frame), T_base_laser)
