@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,11 @@ import numpy as np
 from rlml_slam import se2
 from rlml_slam.params import SimulatorParameters
 from rlml_slam.ros import build
-from rlml_slam.ros.messages import Make
+from rlml_slam.ros.messages import Make, make_rclpy, rclpy_class
+from rlml_slam.ros.tf import TF_MESSAGE
 from rlml_slam.se2 import Array
 from rlml_slam.simulation.robot import SECOND
-from rlml_slam.simulation.simulation import START, GroundTruth, Message, Simulation
+from rlml_slam.simulation.simulation import START, Event, GroundTruth, Message, Simulation
 from rlml_slam.types import Detections, Imu, Odometry, Scan
 
 # topic (relative) -> type, depth of its queue; the first four are sensor data, best effort
@@ -105,3 +107,45 @@ class SimulatedMessages:
         n = self._p.node
         T_base_laser = np.array(n.laser_pose)
         return build.transform(self._make, START, (n.base_frame, n.laser_frame), T_base_laser)
+
+
+class SimulatedTopics:
+    """The publishers of the simulator node; what never changes is published at once, latched."""
+
+    def __init__(self, node: Any, simulation: Simulation) -> None:
+        from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+        self._messages = SimulatedMessages(make_rclpy, simulation.parameters)
+        self._publishers: dict[str, Any] = {}
+        for topic, (msgtype, depth) in TOPICS.items():
+            qos = QoSProfile(depth=depth)
+            if topic in SENSOR_TOPICS:
+                qos.reliability = ReliabilityPolicy.BEST_EFFORT
+            self._publishers[topic] = node.create_publisher(rclpy_class(msgtype), topic, qos)
+        self._clock = node.create_publisher(rclpy_class('rosgraph_msgs/msg/Clock'), '/clock', 10)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        truth = self._messages.true_reflectors(simulation)
+        node.create_publisher(type(truth), TRUE_REFLECTORS, latched).publish(truth)
+        kind = rclpy_class(TF_MESSAGE)
+        if kind is None:
+            pose = list(simulation.parameters.node.laser_pose)
+            node.get_logger().warning(
+                f'tf2_msgs is not installed: give the other nodes laser_pose:={pose}'
+            )
+        else:
+            static = build.tf_message(make_rclpy, [self._messages.laser_transform()])
+            node.create_publisher(kind, '/tf_static', latched).publish(static)
+
+    def listeners(self, topic: str) -> int:
+        """Number of subscriptions that a topic has."""
+        return int(self._publishers[topic].get_subscription_count())
+
+    def publish_time(self, stamp: int) -> None:
+        """Say on /clock what time it is."""
+        self._clock.publish(build.clock(make_rclpy, stamp))
+
+    def publish(self, events: Iterable[Event]) -> None:
+        """Send what arrived."""
+        for event in events:
+            topic, message = self._messages(event.message)
+            self._publishers[topic].publish(message)

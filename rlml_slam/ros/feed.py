@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages of the sensors go into the system: the one way for live nodes and for bags."""
+
+from __future__ import annotations
+
+from typing import Any, Generic, Protocol, TypeVar
+
+from rlml_slam.errors import InputError
+from rlml_slam.params import Parameters
+from rlml_slam.ros import convert
+from rlml_slam.ros.convert import frame
+from rlml_slam.ros.tf import Extrinsics
+from rlml_slam.se2 import Array
+from rlml_slam.sensing.sequence import Inputs
+from rlml_slam.types import Detections, Imu, Odometry, Scan
+
+Out = TypeVar('Out')
+PLACED = ('scan', 'reflectors', 'reflector_poses')  # streams whose sensor has to have a place
+
+
+class Target(Protocol[Out]):
+    """A Sequencer, whose answers are observations, or a Slam, whose answers are frames."""
+
+    def set_sensor_pose(self, frame_id: str, T_base_sensor: Array) -> None:
+        """Where a sensor sits."""
+
+    def add_odometry(self, sample: Odometry) -> list[Out]:
+        """One wheel odometry sample."""
+
+    def add_imu(self, sample: Imu) -> list[Out]:
+        """One IMU sample."""
+
+    def add_scan(self, scan: Scan) -> list[Out]:
+        """One sweep."""
+
+    def add_detections(self, detections: Detections) -> list[Out]:
+        """The reflectors of one instant."""
+
+
+class Feed(Generic[Out]):
+    """Converts the messages of the streams (keys of bag.STREAMS) and hands them to a target.
+
+    ``extrinsics`` is filled by the caller from /tf_static; a sensor that it does not know gets
+    the parameter ``laser_pose``. A message that cannot be believed is counted in ``inputs``; only
+    a clock that jumped back raises InputError.
+    """
+
+    def __init__(self, params: Parameters, target: Target[Out], inputs: Inputs) -> None:
+        self._p = params
+        self._target = target
+        self._inputs = inputs
+        self.extrinsics = Extrinsics()
+        self._placed = {params.node.base_frame}
+
+    def add(self, stream: str, msg: Any) -> list[Out]:
+        """One message of a stream; what became ready by it."""
+        try:
+            if stream in PLACED:
+                self.is_placed(msg)
+            sample = self._converted(stream, msg)
+        except InputError as e:
+            name = 'reflectors' if stream == 'reflector_poses' else stream
+            self._inputs.count(name, 'invalid', str(e))
+            return []
+        if isinstance(sample, Scan):
+            return self._target.add_scan(sample)
+        if isinstance(sample, Detections):
+            return self._target.add_detections(sample)
+        if isinstance(sample, Imu):
+            return self._target.add_imu(sample)
+        return self._target.add_odometry(sample)
+
+    def is_placed(self, msg: Any) -> bool:
+        """Whether the place of the message's sensor is known; InputError if it is not planar."""
+        sensor = frame(msg.header.frame_id)
+        if sensor not in self._placed:
+            pose = self.extrinsics.pose(self._p.node.base_frame, sensor)
+            if pose is None:
+                return False
+            self._target.set_sensor_pose(sensor, pose)
+            self._placed.add(sensor)
+        return True
+
+    def _converted(self, stream: str, msg: Any) -> Odometry | Imu | Scan | Detections:
+        noise = self._p.reflector
+        if stream == 'scan':
+            return convert.scan(msg)
+        if stream == 'odom':
+            return convert.odometry(msg)
+        if stream == 'imu':
+            up = self.extrinsics.up(self._p.node.base_frame, frame(msg.header.frame_id))
+            return convert.imu(msg, up=up)
+        if stream == 'reflectors':
+            return convert.detections(msg, noise)
+        return convert.detections_of_poses(msg, noise)

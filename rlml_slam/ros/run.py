@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every executable does around its node: start, spin, stop; a user's mistake is one line."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import rclpy.utilities
+from rclpy._rclpy_pybind11 import RCLError
+from rclpy.exceptions import InvalidNodeNameException, NameValidationException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+
+from rlml_slam.errors import RlmlError
+
+
+def run(*factories: Callable[[], Any]) -> int:
+    """Spin the nodes until they ask to end or a signal comes; the exit code.
+
+    A node ends the run by raising SystemExit in a callback. SIGINT and SIGTERM end it with 0.
+    """
+    try:
+        rclpy.init(args=sys.argv)
+    except RCLError as e:
+        print(f'rlml_slam: {_cause(e)}', file=sys.stderr)
+        return 1
+    nodes: list[Any] = []
+    executor = SingleThreadedExecutor()
+    try:
+        for factory in factories:
+            nodes.append(factory())
+            executor.add_node(nodes[-1])
+        executor.spin()
+    except (RlmlError, NameValidationException, InvalidNodeNameException) as e:
+        print(f'rlml_slam: {e}', file=sys.stderr)
+        return 1
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except SystemExit as e:
+        return int(e.code or 0)
+    finally:
+        for node in nodes:
+            node.destroy_node()
+        executor.shutdown(timeout_sec=1.0)
+        rclpy.utilities.try_shutdown()
+    return 0
+
+
+def _cause(error: Exception) -> str:
+    """The first line of rcl's message, which names the argument or the file."""
+    return str(error).strip().splitlines()[0].split(', at ')[0]

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Transforms: map to odom is published, the sensors' places are read.
+
+The one place that knows of tf2_msgs, which every installed ROS 2 has and the wheels lack.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from rlml_slam.ros import build, convert
+from rlml_slam.ros.convert import Transform
+from rlml_slam.ros.messages import make_rclpy, rclpy_class
+from rlml_slam.se2 import Array
+
+TF_MESSAGE = 'tf2_msgs/msg/TFMessage'
+
+
+class Extrinsics:
+    """The tree of static transforms, from /tf_static of a robot or of a bag."""
+
+    def __init__(self) -> None:
+        self._parent: dict[str, Transform] = {}
+
+    def add(self, transforms: Iterable[Transform]) -> None:
+        """Take over transforms; a later one of the same child replaces the earlier."""
+        for t in transforms:
+            self._parent[t.child] = t
+
+    def pose(self, base: str, frame: str) -> Array | None:
+        """Planar T_base_frame (3,), None if the tree does not connect the two.
+
+        Raises InputError if the sensor is tilted against the base.
+        """
+        found = self._between(base, frame)
+        if found is None:
+            return None
+        R, t = found
+        return np.array([t[0], t[1], convert.yaw(R, f'{base} to {frame}')])
+
+    def up(self, base: str, frame: str) -> Array | None:
+        """The base z axis (3,) in the sensor's frame, None if the tree does not connect them."""
+        found = self._between(base, frame)
+        return None if found is None else found[0][2]
+
+    def _between(self, base: str, frame: str) -> tuple[Array, Array] | None:
+        """R (3, 3) and t (3,) of T_base_frame."""
+        to_base, to_frame = self._ancestors(base), self._ancestors(frame)
+        shared = next((f for f in to_frame if f in to_base), None)
+        if shared is None:
+            return None
+        (R_b, t_b), (R_f, t_f) = to_base[shared], to_frame[shared]
+        return R_b.T @ R_f, R_b.T @ (t_f - t_b)
+
+    def _ancestors(self, frame: str) -> dict[str, tuple[Array, Array]]:
+        """T_ancestor_frame as (R, t) by ancestor, nearest first, the frame itself included."""
+        R, t = np.eye(3), np.zeros(3)
+        out = {frame: (R, t)}
+        while frame in self._parent:
+            step = self._parent[frame]
+            frame = step.parent
+            if frame in out:
+                break  # a cycle: the tree is broken, what was found so far holds
+            R, t = step.R @ R, step.R @ t + step.t
+            out[frame] = (R, t)
+        return out
+
+
+class TransformPublisher:
+    """Publishes one transform on /tf, or on ``~/map_to_odom`` where there is no tf2_msgs."""
+
+    def __init__(self, node: Any) -> None:
+        self._has_tf = rclpy_class(TF_MESSAGE) is not None
+        if self._has_tf:
+            self._publisher = node.create_publisher(rclpy_class(TF_MESSAGE), '/tf', 100)
+        else:
+            kind = rclpy_class('geometry_msgs/msg/TransformStamped')
+            self._publisher = node.create_publisher(kind, '~/map_to_odom', 100)
+            node.get_logger().warning(
+                f'tf2_msgs is not installed: map to odom is on {self._publisher.topic_name} '
+                'instead of /tf'
+            )
+
+    def publish(self, stamp: int, frames: tuple[str, str], T: Array) -> None:
+        """Send T (3,) of frames (parent, child) at a stamp [ns]."""
+        message = build.transform(make_rclpy, stamp, frames, T)
+        if self._has_tf:
+            message = build.tf_message(make_rclpy, [message])
+        self._publisher.publish(message)
+
+
+def subscribe_static(node: Any, extrinsics: Extrinsics) -> bool:
+    """Keep ``extrinsics`` up to date from /tf_static; False where there is no tf2_msgs."""
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+
+    kind = rclpy_class(TF_MESSAGE)
+    if kind is None:
+        return False
+    latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    node.create_subscription(
+        kind, '/tf_static', lambda m: extrinsics.add(convert.transforms(m)), latched
+    )
+    return True

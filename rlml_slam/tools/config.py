@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``python -m rlml_slam.tools.config``: the parameter file with every default, from params.py."""
+
+from __future__ import annotations
+
+import math
+import sys
+from typing import Any
+
+from rlml_slam.params import Declaration, Parameters, SimulatorParameters, declarations
+
+FILES: dict[str, tuple[type[Any], str]] = {
+    'default.yaml': (Parameters, 'Every parameter of front_end, back_end, slam and `rlml replay`'),
+    'simulator.yaml': (SimulatorParameters, 'Every parameter of the simulator'),
+}
+
+
+def parameter_file(name: str) -> str:
+    """The text of ``config/<name>``: defaults with meaning, unit and range as comments."""
+    of, what = FILES[name]
+    lines = [
+        '# SPDX-License-Identifier: Apache-2.0',
+        f'# {what} with its default, written by `make config`.',
+        '# Copy what you change into a file of your own: names that it leaves out keep these.',
+        '/**:',
+        '  ros__parameters:',
+    ]
+    group = 'node'
+    for d in declarations(of):
+        if d.group != group:
+            group = d.group
+            lines.append(f'    {group}:')
+        indent = '    ' if group == 'node' else '      '
+        lines.append(f'{indent}# {_comment(d)}')
+        lines.append(f'{indent}{d.field}: {_value(d.default)}')
+    return '\n'.join(lines) + '\n'
+
+
+def _comment(d: Declaration) -> str:
+    unit = f' [{d.unit}]' if d.unit else ''
+    bounds = ''
+    if d.choices:
+        bounds = f' ({" | ".join(d.choices)})'
+    elif math.isfinite(d.low) or math.isfinite(d.high):
+        bounds = f' ({d.low:g} to {d.high:g})'
+    return f'{d.meaning}{unit}{bounds}'
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return f'[{", ".join(_value(v) for v in value)}]'
+    if isinstance(value, str):
+        return f"'{value}'"
+    text = repr(value)
+    # YAML 1.1 takes 1e-06 for a string
+    return text if 'e' not in text or '.' in text else text.replace('e', '.0e')
+
+
+def main() -> None:
+    """Print the file that the argument names."""
+    sys.stdout.write(parameter_file(sys.argv[1]))
+
+
+if __name__ == '__main__':
+    main()

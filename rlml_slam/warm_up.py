@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compiles all kernels, so that no first scan has to wait for the compiler.
+
+A module with kernels has a function ``warm_up()`` that calls each with every signature in use.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import sys
+from collections.abc import Callable, Iterator
+
+import rlml_slam
+
+OUTER = ('ros', 'nodes', 'tools')  # tiers without kernels
+
+
+def core_modules() -> Iterator[str]:
+    """Names of all modules of the core."""
+    for module in pkgutil.walk_packages(rlml_slam.__path__, 'rlml_slam.'):
+        if module.name.split('.')[1] not in OUTER:
+            yield module.name
+
+
+def import_core() -> None:
+    """Import every module of the core."""
+    for name in core_modules():
+        importlib.import_module(name)
+
+
+def loaded() -> list[tuple[str, Callable[[], None]]]:
+    """(module, its warm_up) of every module imported so far that has kernels."""
+    names = sorted(n for n in sys.modules if n.startswith('rlml_slam.') and n != __name__)
+    return [
+        (n, sys.modules[n].warm_up) for n in names if callable(vars(sys.modules[n]).get('warm_up'))
+    ]
+
+
+def compile_loaded() -> None:
+    """Compile the kernels of every module imported so far; quick if they are cached on disk."""
+    for _, warm_up in loaded():
+        warm_up()
