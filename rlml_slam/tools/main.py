@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command ``rlml``: a table of subcommands, each imported only when it is used.
+
+A subcommand is a module of this folder with ``add_parser(subparsers)`` and ``run(args) -> int``.
+An expected error is one line on stderr and exit code 1, a wrong command line is exit code 2, and
+a bug is a traceback.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, TypeAlias
+
+from rlml_slam import __version__
+from rlml_slam.errors import RlmlError
+
+INTERRUPTED = 130  # what a shell reports for Ctrl-C
+
+
+@dataclass(frozen=True)
+class Command:
+    """A subcommand: its module in this folder and what ``--help`` says about it."""
+
+    module: str
+    help: str
+
+
+@dataclass(frozen=True)
+class Group:
+    """Subcommands under one name."""
+
+    help: str
+    commands: Mapping[str, Command]
+
+
+Table: TypeAlias = Mapping[str, Command | Group]
+
+COMMANDS: Table = {
+    'demo': Command('demo', 'simulator, front end and back end live over DDS, then a report'),
+    'replay': Command('replay', 'run the system over a bag: no topics, deterministic'),
+    'convert': Command('convert', 'recorded data sets become bags'),
+    'evaluate': Command('evaluate', 'errors of a trajectory against relations or ground truth'),
+    'simulate': Command('simulate', 'drive through a synthetic world and record a bag'),
+    'optimize': Command('optimize', 'optimise a pose graph file (g2o, TORO)'),
+    'study': Group(
+        'experiments that answer one question each',
+        {
+            'worlds': Command('study_front_end', 'accuracy and consistency over seeds and worlds'),
+            'deformable': Command('study_deformable', 'SLAM with deformable features'),
+        },
+    ),
+    'bench': Group(
+        'measured speed and quality against other libraries',
+        {
+            'graph': Command('bench_graph', 'the graph solver against other libraries'),
+        },
+    ),
+    'docs': Command('docs', "the README's tables from the declarations in the code"),
+}
+
+
+def main(argv: Sequence[str] | None = None, table: Table = COMMANDS) -> int:
+    """Run one command line; the exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        parser, module = build_parser(arguments, table)
+        args = parser.parse_args(arguments)
+        if module is None:
+            parser.error('a command is missing')
+        code = int(module.run(args))
+        sys.stdout.flush()
+        return code
+    except RlmlError as e:
+        print(f'rlml: {e}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print('rlml: interrupted', file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        # the reader of our output went away, e.g. `rlml … | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def build_parser(
+    arguments: Sequence[str], table: Table = COMMANDS
+) -> tuple[argparse.ArgumentParser, ModuleType | None]:
+    """The parser for a command line, and the module of the command it names.
+
+    Only that module is imported, so that ``--help`` costs nothing.
+    """
+    parser = argparse.ArgumentParser(
+        prog='rlml', description='2D SLAM and localization with reflectors and a laser.'
+    )
+    parser.add_argument('--version', action='version', version=f'rlml {__version__}')
+    return parser, _add_commands(parser, table, list(arguments))
+
+
+def _add_commands(
+    parser: argparse.ArgumentParser, table: Table, arguments: Sequence[str]
+) -> ModuleType | None:
+    """Add the table to a parser; the module of the command that the arguments begin with."""
+    subparsers = parser.add_subparsers(metavar='COMMAND', title='commands', required=True)
+    words = [a for a in arguments if not a.startswith('-')]
+    wanted = words[0] if words and words[0] == next(iter(arguments), None) else None
+    module = None
+    for name, entry in table.items():
+        if name != wanted:
+            subparsers.add_parser(name, help=entry.help, add_help=False)
+        elif isinstance(entry, Group):
+            group = subparsers.add_parser(name, help=entry.help, description=entry.help)
+            module = _add_commands(group, entry.commands, arguments[1:])
+        else:
+            module = _load(name, entry)
+            module.add_parser(subparsers)
+    return module
+
+
+def _load(name: str, command: Command) -> Any:
+    """The module of a command; one line of advice if what it needs is not installed."""
+    try:
+        return importlib.import_module(f'rlml_slam.tools.{command.module}')
+    except ModuleNotFoundError as e:
+        missing = e.name or ''
+        if missing.startswith('rlml_slam.tools.'):
+            raise RlmlError(f'this installation has no command {name!r}') from e
+        if missing.startswith('rlml_slam'):
+            raise
+        raise RlmlError(f'{name} needs the Python package {missing!r}; install it') from e
+
+
+if __name__ == '__main__':
+    sys.exit(main())

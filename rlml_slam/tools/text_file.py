@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Text files of numbers, plain or compressed (gz, xz): their lines, stamps and values."""
+
+from __future__ import annotations
+
+import gzip
+import lzma
+import math
+from collections.abc import Iterator, Sequence
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from rlml_slam.errors import FileFormatError
+from rlml_slam.se2 import Array
+
+SECOND = 1_000_000_000
+_GZIP, _XZ = b'\x1f\x8b', b'\xfd7zXZ'
+
+
+def read_lines(path: str | Path) -> Iterator[tuple[int, str]]:
+    """Yield (number from 1, line) of all lines that are neither empty nor a # comment.
+
+    What a file is compressed with is seen from its first bytes, not from its name. Raises
+    FileFormatError if it cannot be read or is damaged.
+    """
+    try:
+        with _open(Path(path)) as f:
+            for number, raw in enumerate(f, start=1):
+                line = raw.decode('utf-8', errors='replace').strip()
+                if line and not line.startswith('#'):
+                    yield number, line
+    except (EOFError, lzma.LZMAError, gzip.BadGzipFile) as e:
+        raise FileFormatError(f'{path}: the compressed file is damaged: {e}') from e
+    except OSError as e:
+        raise FileFormatError(f'{path}: cannot be read: {e.strerror or e}') from e
+
+
+def _open(path: Path) -> IO[bytes]:
+    with path.open('rb') as f:
+        head = f.read(len(_XZ))
+    if head.startswith(_GZIP):
+        return gzip.open(path)
+    if head == _XZ:
+        return lzma.open(path)
+    return path.open('rb')
+
+
+def parse_stamp(word: str) -> int:
+    """Nanoseconds of a decimal number of seconds, exactly (a float has only some 100 ns left).
+
+    Raises ValueError.
+    """
+    whole, _, fraction = word.partition('.')
+    if whole.isdecimal() and len(fraction) <= 9 and (fraction.isdecimal() or not fraction):
+        return int(whole) * SECOND + int(fraction.ljust(9, '0'))
+    try:
+        return int((Decimal(word) * SECOND).to_integral_value())
+    except (InvalidOperation, ValueError, OverflowError) as e:
+        raise ValueError(f'{word!r} is not a time in seconds') from e
+
+
+def format_stamp(stamp: int) -> str:
+    """Seconds with all nine decimals of a stamp [ns]."""
+    sign = '-' if stamp < 0 else ''
+    sec, ns = divmod(abs(int(stamp)), SECOND)
+    return f'{sign}{sec}.{ns:09d}'
+
+
+def parse_numbers(words: Sequence[str]) -> Array:
+    """Finite numbers of words; raises ValueError."""
+    values = [float(word) for word in words]
+    if not all(map(math.isfinite, values)):
+        raise ValueError('a number is not finite')
+    return np.array(values)
