@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,14 +23,18 @@ SECOND = 1_000_000_000
 
 
 @kernel
-def integrate(v: Array, w: Array, dt: Array, var_v: Array, var_w: Array, var_lat: Array) -> Array:
+def integrate(
+    v: Array, w: Array, dt: Array, var_v: Array, var_w: Array, var_lat: Array, gyro: Array
+) -> Array:
     """Compose control intervals (eq. 5, 7-9); all arguments ``(n,)``.
 
-    Returns ``(4, 3)``: the relative pose in row 0 (theta not wrapped), its covariance in rows 1-3.
+    Returns ``(5, 3)``: the relative pose in row 0 (theta not wrapped), its covariance in rows 1-3,
+    its derivative by a bias of the turn rate in row 4 (``gyro`` is 1 where w is from the IMU).
     The sideways variance ``var_lat`` is that of a velocity across the heading, which the notes'
     (v, omega) cannot express and which keeps the covariance regular.
     """
     x = y = th = 0.0
+    bx = by = bt = 0.0
     P = np.zeros((3, 3))
     for k in range(len(v)):
         h = dt[k]
@@ -52,14 +57,18 @@ def integrate(v: Array, w: Array, dt: Array, var_v: Array, var_w: Array, var_lat
         P[0, 2] += wx * h * var_w[k]
         P[1, 2] += wy * h * var_w[k]
         P[2, 2] += h * h * var_w[k]
+        bx += gx * bt - gyro[k] * wx
+        by += gy * bt - gyro[k] * wy
+        bt -= gyro[k] * h
         x += d * c
         y += d * s
         th += w[k] * h
-    out = np.empty((4, 3))
+    out = np.empty((5, 3))
     out[0, 0], out[0, 1], out[0, 2] = x, y, th
     out[1, 0], out[1, 1], out[1, 2] = P[0, 0], P[0, 1], P[0, 2]
     out[2, 0], out[2, 1], out[2, 2] = P[0, 1], P[1, 1], P[1, 2]
     out[3, 0], out[3, 1], out[3, 2] = P[0, 2], P[1, 2], P[2, 2]
+    out[4, 0], out[4, 1], out[4, 2] = bx, by, bt
     return out
 
 
@@ -67,10 +76,25 @@ def compose_motion(first: Motion, second: Motion) -> Motion:
     """Two motions, one after the other; their errors are independent."""
     J_a, J_b = se2.compose_jacobians(first.delta, second.delta)
     cov = J_a @ first.cov @ J_a.T + J_b @ second.cov @ J_b.T
-    return Motion(se2.compose(first.delta, second.delta), cov, first.known and second.known)
+    gain = J_a @ first.bias_gain + J_b @ second.bias_gain
+    return Motion(se2.compose(first.delta, second.delta), cov, first.known and second.known, gain)
 
 
 STILL = Motion(np.zeros(3), np.zeros((3, 3)))
+
+
+@dataclass
+class _Control:
+    """Speed and turn rate of one interval; ``gyro`` is 1 where the turn rate is the IMU's."""
+
+    v: float
+    w: float
+    sigma_v: float
+    sigma_w: float
+    known: bool
+    gyro: float = 0.0
+    bias: float = 0.0
+    bias_sigma: float = math.inf
 
 
 class MotionBuffer:
@@ -86,19 +110,12 @@ class MotionBuffer:
         self._w: list[float] = [0.0]
         self._imu_stamps: list[int] = []
         self._rates: list[float] = []
-        self._bias = 0.0
-        self._bias_var = 0.05**2
         self.jumps = 0
 
     @property
     def newest(self) -> int | None:
         """Stamp of the newest odometry, None before the first."""
         return self._stamps[-1] if self._stamps else None
-
-    @property
-    def gyro_bias(self) -> tuple[float, float]:
-        """The IMU's bias [rad/s] and its standard deviation."""
-        return self._bias, math.sqrt(self._bias_var)
 
     def add_odometry(self, sample: Odometry) -> None:
         """Append a sample; its stamp must be later than the newest one's."""
@@ -122,7 +139,6 @@ class MotionBuffer:
         """Append a sample; its stamp must be later than the newest one's."""
         self._imu_stamps.append(sample.stamp)
         self._rates.append(sample.yaw_rate)
-        self._observe_bias(sample)
         self._forget(self._imu_stamps, sample.stamp, self._rates)
 
     def _forget(self, stamps: list[int], now: int, *columns: list) -> None:  # type: ignore[type-arg]
@@ -130,27 +146,6 @@ class MotionBuffer:
         if k > 256:  # in batches: deleting from the front of a list moves all of it
             for column in (stamps, *columns):
                 del column[:k]
-
-    def _observe_bias(self, sample: Imu) -> None:
-        """Scalar Kalman filter: the IMU minus the wheels' turn rate measures the bias.
-
-        The wheels are exact at standstill and as good as the motion model says when moving.
-        """
-        if len(self._w) < 2 or sample.stamp - self._stamps[-1] > SECOND // 5:
-            return
-        v, w = self._v[-1], self._w[-1]
-        if math.isnan(w):
-            return
-        n = self._noise
-        still = abs(v) < 1e-4 and abs(w) < 1e-4
-        var = n.imu_d**2 + (0.0 if still else (n.c * abs(w) + n.d) ** 2 * 4.0 + 0.02**2)
-        self._bias_var += (2e-5) ** 2  # random walk per sample
-        error = sample.yaw_rate - w - self._bias
-        if error * error > 16.0 * (var + self._bias_var):
-            return  # wheels slip, or the robot is being turned: not a measurement of the bias
-        gain = self._bias_var / (self._bias_var + var)
-        self._bias += gain * error
-        self._bias_var *= 1.0 - gain
 
     def extrapolate(self, start: int, end: int) -> Motion:
         """Motion from ``start`` to ``end`` where odometry ends in between: the last speed goes on.
@@ -201,43 +196,56 @@ class MotionBuffer:
             cuts = sorted({*cuts, *self._imu_stamps[i0:i1]})
         cuts.append(end)
         n = self._noise
-        rows = np.empty((6, len(cuts) - 1))
+        rows = np.empty((7, len(cuts) - 1))
         known = True
+        weight = weighted = 0.0
         for k in range(len(cuts) - 1):
             dt = (cuts[k + 1] - cuts[k]) / SECOND
-            v, w, sigma_v, sigma_w, sure = self._control((cuts[k] + cuts[k + 1]) // 2)
-            known = known and sure
+            c = self._control((cuts[k] + cuts[k + 1]) // 2)
+            known = known and c.known
             # the figures hold for n.interval: a shorter one has the same accumulated noise; where
             # the motion is too fast for its interval, the stamps are wrong, not the noise larger
-            lasted = max(dt, abs(v) * dt / n.max_speed, abs(w) * dt / n.max_turn_rate)
+            lasted = max(dt, abs(c.v) * dt / n.max_speed, abs(c.w) * dt / n.max_turn_rate)
             scale = n.interval / lasted
-            lateral = n.lateral * abs(v) if sure else n.max_speed / 5.0
-            rows[:, k] = v, w, dt, sigma_v**2 * scale, sigma_w**2 * scale, lateral**2 * scale
+            lateral = n.lateral * abs(c.v) if c.known else n.max_speed / 5.0
+            rows[:, k] = (
+                c.v, c.w, dt, c.sigma_v**2 * scale, c.sigma_w**2 * scale, lateral**2 * scale,
+                c.gyro,
+            )  # fmt: skip
+            if c.bias_sigma < np.inf:
+                weight += 1.0 / (c.bias_sigma**2 * scale)
+                weighted += c.bias / (c.bias_sigma**2 * scale)
         out = integrate(*rows)
         out[0, 2] = se2.wrap(out[0, 2])
-        return Motion(out[0], out[1:], known)
+        bias = weighted / weight if weight > 0.0 else 0.0
+        variance = 1.0 / weight if weight > 0.0 else np.inf
+        return Motion(out[0], out[1:4], known, out[4], bias, variance)
 
-    def _control(self, stamp: int) -> tuple[float, float, float, float, bool]:
-        """Speed, turn rate, their sigmas (eq. 6) at a stamp; False where odometry is missing."""
+    def _control(self, stamp: int) -> _Control:
+        """The control at a stamp with its sigmas (eq. 6)."""
         n = self._noise
         k = bisect_left(self._stamps, stamp)
-        sure = 0 < k < len(self._stamps)
-        if sure:
-            gap = (self._stamps[k] - self._stamps[k - 1]) / SECOND
-            sure = gap <= n.max_gap
-            v, w = self._v[k], self._w[k]
-        if not sure or math.isnan(v):
-            v, w, sigma_v, sigma_w = 0.0, 0.0, n.max_speed / 5.0, n.max_turn_rate / 5.0
-            sure = False
+        known = 0 < k < len(self._stamps)
+        gap = (self._stamps[k] - self._stamps[k - 1]) / SECOND if known else 0.0
+        rate = self._rate(stamp)
+        if not known or gap > n.max_gap or math.isnan(self._v[k]):
+            c = _Control(0.0, 0.0, n.max_speed / 5.0, n.max_turn_rate / 5.0, False)
         else:
+            v, w = self._v[k], self._w[k]
             # when inside a long interval the motion happened is a guess
             guess = n.guess if gap > 2.0 * n.interval else 0.0
-            sigma_v, sigma_w = (n.a + guess) * abs(v) + n.b, (n.c + guess) * abs(w) + n.d
-        rate = self._rate(stamp)
+            c = _Control(v, w, (n.a + guess) * abs(v) + n.b, (n.c + guess) * abs(w) + n.d, True)
+            if v == 0.0 and w == 0.0:
+                # the wheels do not turn: so does the robot not, and the IMU shows its bias
+                c.sigma_v, c.sigma_w = 0.1 * n.b, 0.1 * n.d
         if rate is not None:
-            w = rate - self._bias
-            sigma_w = math.hypot(n.imu_c * abs(w) + n.imu_d, math.sqrt(self._bias_var))
-        return v, w, sigma_v, sigma_w, sure
+            if c.known:
+                c.bias = rate - c.w
+                c.bias_sigma = math.hypot(n.imu_c * abs(rate) + n.imu_d, c.sigma_w)
+            if not (c.known and c.v == 0.0 and c.w == 0.0):
+                c.w, c.gyro = rate, 1.0
+                c.sigma_w = n.imu_c * abs(rate) + n.imu_d
+        return c
 
     def _rate(self, stamp: int) -> float | None:
         """The IMU's yaw rate, linear between its samples; None outside or across a gap."""
@@ -253,4 +261,4 @@ class MotionBuffer:
 
 def warm_up() -> None:
     """Compile the kernel."""
-    integrate(*np.ones((6, 1)))
+    integrate(*np.ones((7, 1)))

@@ -146,13 +146,15 @@ class MotionNoise(Group):
     the accumulated covariance does not depend on the odometry's rate.
     """
 
-    a: float = param(0.05, 'speed noise per speed', '', 0.0, 10.0)
+    a: float = param(0.1, 'speed noise per speed', '', 0.0, 10.0)
     b: float = param(0.01, 'speed noise floor', 'm/s', 0.0, 10.0)
-    c: float = param(0.05, 'turn rate noise per turn rate', '', 0.0, 10.0)
-    d: float = param(0.01, 'turn rate noise floor', 'rad/s', 0.0, 10.0)
-    lateral: float = param(0.02, 'sideways slip per speed', '', 0.0, 10.0)
+    c: float = param(0.2, 'turn rate noise per turn rate', '', 0.0, 10.0)
+    d: float = param(0.02, 'turn rate noise floor', 'rad/s', 0.0, 10.0)
+    lateral: float = param(0.05, 'sideways slip per speed', '', 0.0, 10.0)
     imu_c: float = param(0.005, "the IMU's turn rate noise per turn rate", '', 0.0, 10.0)
     imu_d: float = param(0.003, "the IMU's turn rate noise floor", 'rad/s', 0.0, 10.0)
+    imu_bias: float = param(0.02, "the IMU's bias at start, 1 sigma", 'rad/s', 0.0, 10.0)
+    imu_bias_walk: float = param(2e-4, "random walk of the IMU's bias", 'rad/s/sqrt(s)', 0.0, 1.0)
     interval: float = param(0.1, 'control interval that a, b, c, d are given for', 's', 1e-3, 10.0)
     guess: float = param(
         0.2,
@@ -210,7 +212,7 @@ class Submap(Group):
 
     resolution: float = param(0.05, 'cell size', 'm', 0.01, 1.0)
     max_laser_range: float = param(30.0, 'beams longer than this are not used', 'm', 0.5, 300.0)
-    p_hit: float = param(0.55, 'occupancy probability that one hit adds', '', 0.5, 0.99)
+    p_hit: float = param(0.65, 'occupancy probability that one hit adds', '', 0.5, 0.99)
     p_miss: float = param(0.49, 'occupancy probability that one miss leaves', '', 0.01, 0.5)
     size: int = param(90, 'insertions that complete a submap', '', 2, 10000)
     min_travel: float = param(0.1, 'travel between two insertions', 'm', 0.0, 10.0)

@@ -74,12 +74,17 @@ class Motion:
     """Motion ``delta`` (3,) of base and its covariance ``cov`` (3, 3), both in the start frame.
 
     ``known`` is False where no odometry covered the interval: delta is then an extrapolation and
-    cov is wide.
+    cov is wide. Where the turn rate is the IMU's, ``bias_gain`` (3,) is d delta / d bias, delta
+    being that of a bias of zero; ``bias`` [rad/s] is what IMU and wheels together say of it, with
+    variance ``bias_var``, infinite without an IMU.
     """
 
     delta: Array
     cov: Array
     known: bool = True
+    bias_gain: Array = field(default_factory=lambda: np.zeros(3))
+    bias: float = 0.0
+    bias_var: float = np.inf
 
 
 @dataclass(frozen=True)

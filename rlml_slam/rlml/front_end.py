@@ -18,13 +18,14 @@ from rlml_slam.matching.scan_match import match
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.health import Evidence, HealthMonitor
 from rlml_slam.rlml.information import calibrated
-from rlml_slam.rlml.joint_state import JointState
+from rlml_slam.rlml.joint_state import ANCHORS, JointState
 from rlml_slam.rlml.submaps import Submaps
 from rlml_slam.rlml.tracks import Tracks
 from rlml_slam.se2 import Array
 from rlml_slam.types import Detections, Frame, Health, Motion, Observation, Reflectors, Status
 
 REFLECTOR_ITERATIONS = 4
+POSE_AND_TARGET = np.array([0, 1, 2, *range(ANCHORS[0], ANCHORS[0] + 3)])
 CONVERGED = np.array([1e-5, 1e-5, 1e-6])
 
 
@@ -42,7 +43,7 @@ class FrontEnd:
 
     def reset(self, pose: Array, cov: Array) -> None:
         """Forget everything and start at a pose (3,) of the map with covariance (3, 3)."""
-        self.state = JointState(pose, cov)
+        self.state = JointState(pose, cov, self._p.motion.imu_bias)
         self.tracks = Tracks()
         self.submaps = Submaps(self._p.submap)
         self.health = HealthMonitor(self._p.health)
@@ -68,7 +69,7 @@ class FrontEnd:
         """The pose at the observation's stamp; never raises for what was measured."""
         began = time.perf_counter()
         before = self.state.pose
-        self.state.predict(self._motion(observation))
+        self.state.predict(self._motion(observation), self._bias_walk(observation.stamp))
         matched = _Matched.none(observation.detections)
         self._use_reflectors(observation, matched)
         evidence = self._use_scan(observation)
@@ -93,6 +94,11 @@ class FrontEnd:
         # white acceleration: sigma = a dt^2 / 2 for each axis, floored for the first steps
         sigma = np.array([1.0, 0.5, 2.0]) * dt * dt * 2.0 + np.array([0.02, 0.02, 0.02])
         return Motion(se2.exp(self._velocity * dt), np.diag(sigma**2), known=False)
+
+    def _bias_walk(self, stamp: int) -> float:
+        """Variance that the gyro's bias gains until ``stamp``."""
+        dt = 0.0 if self._last_stamp is None else (stamp - self._last_stamp) * 1e-9
+        return self._p.motion.imu_bias_walk**2 * dt
 
     def _remember_velocity(self, before: Array, stamp: int) -> None:
         if self._last_stamp is not None and stamp > self._last_stamp:
@@ -194,7 +200,7 @@ class FrontEnd:
         anchor = self.state.anchor(0)
         J_a, J_x = se2.between_jacobians(anchor, self.state.x[:3])
         J = np.hstack([J_x, J_a])
-        cov = J @ self.state.P[:6, :6] @ J.T
+        cov = J @ self.state.P[np.ix_(POSE_AND_TARGET, POSE_AND_TARGET)] @ J.T
         prior = se2.between(anchor, self.state.x[:3])
         floor = np.zeros((3, 3))
         floor[[0, 1, 2], [0, 1, 2]] = p.floor2
@@ -217,7 +223,7 @@ class FrontEnd:
         offset[2] = se2.wrap(offset[2])
         # the prior pulled the match off the scan's own optimum by H^-1 g; take that back
         v = root @ offset
-        self.state.apply(np.arange(6), H, np.eye(len(v)), v)
+        self.state.apply(POSE_AND_TARGET, H, np.eye(len(v)), v)
         return Evidence(
             scan=True,
             used=True,

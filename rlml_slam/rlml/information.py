@@ -18,5 +18,5 @@ def calibrated(information: Array, floor2: tuple[float, ...]) -> Array:
     """
     floor = np.zeros((3, 3))
     floor[[0, 1, 2], [0, 1, 2]] = floor2
-    out: Array = np.linalg.solve(np.eye(3) + information @ floor, information)
+    out = np.linalg.solve(np.eye(3) + information @ floor, information)
     return 0.5 * (out + out.T)

@@ -17,19 +17,20 @@ from rlml_slam import se2
 from rlml_slam.se2 import Array
 from rlml_slam.types import Motion
 
-POSE = 0
-ANCHORS = (3, 6)
-LANDMARKS = 9
+BIAS = 3
+ANCHORS = (4, 7)
+LANDMARKS = 10
 
 
 class JointState:
-    """Mean ``x`` (9 + 2m,) = pose, anchor 0, anchor 1, reflectors; and covariance ``P``."""
+    """Mean ``x`` (10 + 2m,) = pose, gyro bias, two anchors, reflectors; and covariance ``P``."""
 
-    def __init__(self, pose: Array, cov: Array) -> None:
+    def __init__(self, pose: Array, cov: Array, bias_sigma: float) -> None:
         self.x = np.zeros(LANDMARKS)
         self.P = np.zeros((LANDMARKS, LANDMARKS))
         self.x[:3] = pose
         self.P[:3, :3] = cov
+        self.P[BIAS, BIAS] = bias_sigma**2
 
     @property
     def num_landmarks(self) -> int:
@@ -63,14 +64,32 @@ class JointState:
         P: Array = self.P[np.ix_(keep, keep)]
         return P
 
-    def predict(self, motion: Motion) -> None:
-        """Move the pose by a relative motion with its covariance (eq. 5)."""
-        J_a, J_b = se2.compose_jacobians(self.x[:3], motion.delta)
-        self.x[:3] = se2.compose(self.x[:3], motion.delta)
-        P = self.P
-        P[:3, :] = J_a @ P[:3, :]
-        P[:, :3] = P[:, :3] @ J_a.T
+    def predict(self, motion: Motion, walk: float) -> None:
+        """Move the pose by a relative motion with its covariance (eq. 5), less the gyro's bias.
+
+        ``walk`` is the variance that the bias gained meanwhile.
+        """
+        if np.isfinite(motion.bias_var):
+            self._measure_bias(motion.bias, motion.bias_var)
+        P, gain = self.P, motion.bias_gain
+        delta = motion.delta + gain * self.x[BIAS]
+        J_a, J_b = se2.compose_jacobians(self.x[:3], delta)
+        self.x[:3] = se2.compose(self.x[:3], delta)
+        J_bias = J_b @ gain
+        P[:3, :] = J_a @ P[:3, :] + np.outer(J_bias, P[BIAS, :])
+        P[:, :3] = P[:, :3] @ J_a.T + np.outer(P[:, BIAS], J_bias)
         P[:3, :3] += J_b @ motion.cov @ J_b.T
+        P[BIAS, BIAS] += walk
+
+    def _measure_bias(self, bias: float, variance: float) -> None:
+        """Scalar update with what IMU and wheels say of the bias, gated against slip."""
+        S = float(self.P[BIAS, BIAS]) + variance
+        error = bias - float(self.x[BIAS])
+        if error * error < 16.0 * S:
+            gain = self.P[:, BIAS] / S
+            self.x += gain * error
+            self.x[2] = se2.wrap(self.x[2])
+            self.P -= np.outer(gain, gain) * S
 
     def widen(self, cov: Array) -> None:
         """Add independent uncertainty (3, 3) to the pose."""
@@ -131,7 +150,7 @@ class JointState:
 
     def active(self, landmarks: NDArray[np.int64]) -> NDArray[np.int64]:
         """Columns of pose, anchor 0 and the given reflectors: all that a measurement can touch."""
-        first = np.array([0, 1, 2, 3, 4, 5], dtype=np.int64)
+        first = np.array([0, 1, 2, *range(ANCHORS[0], ANCHORS[0] + 3)], dtype=np.int64)
         base = LANDMARKS + 2 * landmarks
         return np.concatenate([first, np.stack([base, base + 1], axis=-1).ravel()])
 

@@ -61,7 +61,8 @@ class Interval:
     def add_motion(self, frame: Frame) -> None:
         """Compose the odometry motion of one more frame."""
         self.motion = compose_motion(self.motion, frame.observation.motion)
-        self.scanned |= np.isfinite(frame.scan_score)
+        motion = frame.observation.motion
+        self.scanned |= bool(np.isfinite(frame.scan_score)) or bool(motion.bias_gain.any())
 
     def add_detections(self, frame: Frame) -> None:
         """Move the frame's associated detections to the keyframe and fuse them.

@@ -104,7 +104,7 @@ class ScanGraph:
         info = calibrated(information, p.floor2)
         # a direction that the scan leaves open still needs a regular covariance
         cov = np.linalg.inv(info + np.diag([1e-4, 1e-4, 1e-4]))
-        self.changed = True
+        self.changed |= kind is EdgeKind.CLOSURE
         return self._graph.add_edge(kind, i, j, delta, relative_information(delta, cov))
 
     def _insert(self, key: Keyframe) -> None:

@@ -8,6 +8,7 @@ by stamps and order of arrival alone, never by a clock, so a replay repeats it e
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -70,7 +71,8 @@ class Sequencer:
         self._extrapolated: tuple[int, Array] | None = None
         self._strange: Counter[str] = Counter()
         self._last: int | None = None
-        self._paired = -(2**62)  # stamp of the last observation that had scan and detections
+        # stamp of the last observation that had, or should have had, scan and detections
+        self._paired = -(2**62)
 
     def set_sensor_pose(self, frame_id: str, T_base_sensor: Array) -> None:
         """Where a sensor sits; without it the parameter ``laser_pose`` is used."""
@@ -150,6 +152,8 @@ class Sequencer:
         limit = self._last if measured else newest
         if limit is not None and stamp <= limit:
             self.inputs.count(stream, 'late', f'{stream} at {stamp} ns is late')
+            if measured and stamp == self._last:
+                self._paired = stamp  # the next one's other half will be waited for
             self._jumped(stream, self._newest_any - stamp, 'back')
             return False
         if self._first_any is not None and self._jumped(stream, stamp - self._newest_any, 'ahead'):
@@ -207,7 +211,8 @@ class Sequencer:
                     return False
             elif newest < end:
                 return False
-        if len(group) == 1 and stamp - self._paired < SECOND:
+        fresh = self._first_any is None or stamp - self._first_any < SECOND
+        if len(group) == 1 and (fresh or stamp - self._paired < SECOND):
             other = 'reflectors' if group[0][1] == 'scan' else 'scan'
             # the streams come in pairs: the other half is on its way, unless it was left out
             if self._newest.get(other, 0) <= stamp and waited <= self._timeout // 2:
@@ -248,7 +253,7 @@ class Sequencer:
         else:
             motion = self.buffer.motion(start, stamp)
             self._extrapolated = None
-        return Motion(se2.between(used, motion.delta), motion.cov, motion.known)
+        return dataclasses.replace(motion, delta=se2.between(used, motion.delta))
 
     def _in_base(self, d: Detections) -> Detections:
         """Detections moved from their sensor's frame to the base frame, far ones left out."""
