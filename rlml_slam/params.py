@@ -235,7 +235,7 @@ class ScanMatch(Group):
         (2.5e-5, 2.5e-5, 4e-6), 'variance of a match that more beams do not lower', 'm², m², rad²'
     )
     min_score: float = param(
-        0.45, 'mean hit probability below which a match is not used', '', 0.0, 1.0
+        0.3, 'mean hit probability below which a match is not used', '', 0.0, 1.0
     )
     search_window: float = param(0.1, 'half width of the search', 'm', 0.0, 10.0)
     search_angle: float = param(0.35, 'half width of the search', 'rad', 0.0, 3.2)
@@ -291,7 +291,7 @@ class BackEnd(Group):
         3.0, 'Cauchy scale of odometry edges, in sigmas', '', 0.5, 1e3
     )
     closure_robust_scale: float = param(
-        2.0, 'Cauchy scale of loop closures, in sigmas', '', 0.5, 1e3
+        2.0, 'Huber scale of loop closures, in sigmas', '', 0.5, 1e3
     )
     resolution: float = param(0.05, 'cell size of the published map', 'm', 0.01, 1.0)
 
@@ -302,8 +302,11 @@ class LoopClosure(Group):
 
     enabled: bool = param(True, 'look for loop closures')
     max_distance: float = param(8.0, 'candidates nearer than this are tried', 'm', 0.1, 100.0)
-    min_score: float = param(0.6, 'mean hit probability that a closure must reach', '', 0.1, 1.0)
-    every: int = param(5, 'try every n-th keyframe', '', 1, 1000)
+    min_score: float = param(0.55, 'mean hit probability that a closure must reach', '', 0.1, 1.0)
+    every: int = param(3, 'try every n-th keyframe', '', 1, 1000)
+    floor2: tuple[float, ...] = param(
+        (4e-4, 4e-4, 2.5e-5), 'variance of a closure that more beams do not lower', 'm², m², rad²'
+    )
     candidates: int = param(3, 'submaps tried per keyframe, nearest first', '', 1, 100)
     max_second: float = param(0.95, 'score of the second place relative to the best', '', 0.1, 1.0)
     search_window: float = param(3.0, 'half width of the search', 'm', 0.1, 100.0)

@@ -48,7 +48,7 @@ class BackEnd:
         self.graph = Graph(
             Losses(
                 odometry=Loss(LossKind.CAUCHY, p.back_end.odometry_robust_scale),
-                closure=Loss(LossKind.GEMAN_MCCLURE, p.back_end.closure_robust_scale),
+                closure=Loss(LossKind.HUBER, p.back_end.closure_robust_scale),
                 scan=Loss(LossKind.CAUCHY, p.back_end.scan_robust_scale),
                 reflector=Loss(LossKind.CAUCHY, p.reflector.robust_scale),
             )

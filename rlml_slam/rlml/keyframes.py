@@ -39,7 +39,7 @@ class Sighting:
         """Fuse z (2,) with covariance (2, 2), in the keyframe's frame."""
         W = np.linalg.inv(cov)
         self.information += W
-        self.weighted += W @ z
+        self.weighted += np.asarray(W @ z, dtype=np.float64)
         self.count += 1
 
     @property

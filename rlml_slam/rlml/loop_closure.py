@@ -100,11 +100,12 @@ class ScanGraph:
         self._edge(EdgeKind.SCAN, m.anchor.index, key.index, found.pose, found.information)
 
     def _edge(self, kind: EdgeKind, i: int, j: int, delta: Array, information: Array) -> int:
-        p = self._p.scan_match
-        info = calibrated(information, p.floor2)
+        closure = kind is EdgeKind.CLOSURE
+        floor2 = self._p.loop_closure.floor2 if closure else self._p.scan_match.floor2
+        info = calibrated(information, floor2)
         # a direction that the scan leaves open still needs a regular covariance
         cov = np.linalg.inv(info + np.diag([1e-4, 1e-4, 1e-4]))
-        self.changed |= kind is EdgeKind.CLOSURE
+        self.changed |= closure
         return self._graph.add_edge(kind, i, j, delta, relative_information(delta, cov))
 
     def _insert(self, key: Keyframe) -> None:
