@@ -84,12 +84,14 @@ def test_the_errors_of_wheels_and_gyro_are_consistent_with_the_motion_models_cov
     parameters = SimulatorParameters(
         gyro=Gyro(bias=0.0, bias_walk=0.0), laser=Laser(rate=0.5, beams=2)
     )
+    w, g = parameters.wheels, parameters.gyro
+    noise = MotionNoise(
+        a=w.a, b=w.b, c=w.c, d=w.d, lateral=w.lateral, interval=w.interval, imu_c=g.c, imu_d=g.d
+    )
     values = {False: [], True: []}
     for use_imu in (False, True):
         simulation = Simulation(load_world('hall'), parameters, seed=3)
-        buffer = MotionBuffer(MotionNoise(), memory=1000.0)
-        buffer._bias_var = 0.0  # there is no bias here: only the noise is in question
-        buffer._observe_bias = lambda sample: None
+        buffer = MotionBuffer(noise, memory=1000.0)
         for event in simulation:
             if isinstance(event.message, Odometry):
                 buffer.add_odometry(event.message)

@@ -17,7 +17,7 @@ from rlml_slam.params import (
 )
 from rlml_slam.simulation.robot import SECOND
 from rlml_slam.simulation.simulation import START, GroundTruth, Simulation
-from rlml_slam.simulation.world_file import load_world
+from rlml_slam.simulation.world_file import load_world, world_names
 from rlml_slam.types import Detections, Imu, Odometry, Scan
 
 SHORT = SimulatorParameters(
@@ -205,7 +205,7 @@ def test_no_detector_is_silence():
 
 
 def test_nothing_that_moves_comes_near_the_robot():
-    for name in ('hall',):
+    for name in ('hall', 'room'):
         world = load_world(name)
         parameters = SimulatorParameters(laser=Laser(rate=0.5, beams=2))
         simulation = Simulation(world, parameters)
@@ -218,9 +218,9 @@ def test_nothing_that_moves_comes_near_the_robot():
 
 
 def test_the_robot_keeps_clear_of_walls_in_every_world():
-    for name in ('hall', 'corridor', 'symmetric', 'yard'):
+    for name in world_names():
         parameters = SimulatorParameters(
-            laser=Laser(beams=90, rate=2.0, dropped=0.0, range_sigma=0.0)
+            laser=Laser(beams=90, rate=2.0, dropped=0.0, range_sigma=0.0), gyro=Gyro(rate=1.0)
         )
         scans = of(run(parameters, name), Scan)
         assert min(float(s.ranges.min()) for s in scans) > 0.4

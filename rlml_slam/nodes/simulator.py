@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Node ``simulator``: a robot drives through a synthetic world, and time is what it says."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+from geometry_msgs.msg import Twist
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+
+from rlml_slam import warm_up
+from rlml_slam.errors import InputError
+from rlml_slam.params import SimulatorParameters
+from rlml_slam.ros import convert
+from rlml_slam.ros.declare import declare
+from rlml_slam.ros.pace import Pace
+from rlml_slam.ros.run import run
+from rlml_slam.ros.simulated import SimulatedTopics
+from rlml_slam.simulation.robot import SECOND
+from rlml_slam.simulation.simulation import START, STEP, Simulation
+from rlml_slam.simulation.world_file import load_world
+
+LINGER = 0.5  # [s] between the last message and the end of the process
+BATCH = 20  # steps at most in one tick, so that a rate beyond reach does not shut out the rest
+
+
+class SimulatorNode(Node):
+    """Steps the simulation along the wall clock and publishes what it says."""
+
+    def __init__(self, wall: Callable[[], float] = time.monotonic, **options: Any) -> None:
+        super().__init__('simulator', **options)
+        self.parameters = declare(self, SimulatorParameters)
+        n = self.parameters.node
+        self.simulation = Simulation(load_world(n.world), self.parameters)
+        self._topics = SimulatedTopics(self, self.simulation)
+        self._wall = wall
+        self._pace: Pace | None = None
+        self._finished: float | None = None
+        if n.drive == 'cmd_vel':
+            self.create_subscription(Twist, 'cmd_vel', self.on_cmd_vel, 10)
+        warm_up.compile_loaded()
+        # a steady timer: with use_sim_time, a ROS timer would wait for this node's own clock
+        self.create_timer(0.005, self.tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def on_cmd_vel(self, msg: Any) -> None:
+        """Drive as told."""
+        try:
+            self.simulation.command(*convert.twist(msg))
+        except InputError as e:
+            self.get_logger().warning(str(e), throttle_duration_sec=1.0)
+
+    def tick(self) -> None:
+        """Bring the simulation up to the wall clock; raises SystemExit when all is done."""
+        n, now = self.parameters.node, self._wall()
+        if self._pace is None:
+            self._topics.publish_time(START)
+            if self._topics.listeners('scan') < n.wait_for_subscribers:
+                return
+            self._pace = Pace(n.rate, now)
+        for _ in range(BATCH):
+            if self.simulation.done:
+                self._finish(now)
+                return
+            stalls = self._pace.stalls
+            if not self._pace.is_due((self.simulation.time + STEP - START) / SECOND, now):
+                return
+            if self._pace.stalls > stalls:
+                self.get_logger().warning('cannot keep up with the rate', once=True)
+            events = self.simulation.step()
+            self._topics.publish_time(self.simulation.time)
+            self._topics.publish(events)
+
+    def _finish(self, now: float) -> None:
+        if self._finished is None:
+            self._topics.publish(self.simulation.rest())
+            self._finished = now
+            seconds = (self.simulation.time - START) / SECOND
+            self.get_logger().info(f'the drive is done after {seconds:.1f} s')
+        if self.parameters.node.exit_at_end and now - self._finished >= LINGER:
+            raise SystemExit(0)
+
+
+def main() -> int:
+    """Run the node until the drive is done or a signal comes; the exit code."""
+    return run(SimulatorNode)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
