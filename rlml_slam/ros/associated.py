@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topic ``reflectors/associated``: detections with what the front end made of each.
+"""Reflectors between the nodes, as clouds that RViz shows: detections and the map.
 
-A PointCloud2 in the base frame with the stamp of the front end's pose, for the back end and RViz.
+``reflectors/associated`` has the detections of one pose, in the base frame, with what the front
+end made of each; ``reflector_map_points`` is the map's reflectors.
 """
 
 from __future__ import annotations
@@ -17,16 +18,17 @@ from rlml_slam.ros import build
 from rlml_slam.ros.cloud import build_cloud, read_cloud
 from rlml_slam.ros.convert import frame, stamp
 from rlml_slam.ros.messages import Make
-from rlml_slam.types import Detections, Frame
+from rlml_slam.se2 import Array
+from rlml_slam.types import Detections, Frame, Reflectors
 
 # z = 0 for RViz; landmark is the front end's key, id the reflector's own; both -1 for none
-ASSOCIATED = np.dtype(
-    [
-        ('x', '<f4'), ('y', '<f4'), ('z', '<f4'),
-        ('cov_xx', '<f4'), ('cov_xy', '<f4'), ('cov_yy', '<f4'),
-        ('landmark', '<i4'), ('status', '<i4'), ('id', '<i4'), ('diameter', '<f4'),
-    ]
-)  # fmt: skip
+_PLACED = [
+    ('x', '<f4'), ('y', '<f4'), ('z', '<f4'),
+    ('cov_xx', '<f4'), ('cov_xy', '<f4'), ('cov_yy', '<f4'),
+    ('landmark', '<i4'), ('id', '<i4'), ('diameter', '<f4'),
+]  # fmt: skip
+ASSOCIATED = np.dtype([*_PLACED, ('status', '<i4')])
+MAPPED = np.dtype([*_PLACED, ('sightings', '<i4')])
 
 
 @dataclass(frozen=True)
@@ -42,29 +44,38 @@ def build_associated(make: Make, result: Frame, base_frame: str) -> Any:
     """PointCloud2 of the detections of a frame, which must have some (or an empty set)."""
     d = result.observation.detections
     assert d is not None
-    cloud = np.zeros(len(d), dtype=ASSOCIATED)
-    cloud['x'], cloud['y'] = d.points[:, 0], d.points[:, 1]
-    cloud['cov_xx'], cloud['cov_xy'] = d.cov[:, 0, 0], d.cov[:, 0, 1]
-    cloud['cov_yy'] = d.cov[:, 1, 1]
-    cloud['landmark'], cloud['status'] = result.landmarks, result.statuses
-    cloud['id'], cloud['diameter'] = d.ids, d.diameters
+    cloud = _placed(ASSOCIATED, d, result.landmarks)
+    cloud['status'] = result.statuses
     return build_cloud(make, build.header(make, result.stamp, base_frame), cloud)
+
+
+def build_reflector_map(make: Make, stamp: int, map_frame: str, reflectors: Reflectors) -> Any:
+    """PointCloud2 of a map's reflectors."""
+    cloud = _placed(MAPPED, reflectors, reflectors.keys)
+    cloud['sightings'] = reflectors.sightings
+    return build_cloud(make, build.header(make, stamp, map_frame), cloud)
+
+
+def _placed(
+    dtype: np.dtype[np.void], of: Detections | Reflectors, landmarks: NDArray[np.int64]
+) -> NDArray[np.void]:
+    cloud = np.zeros(len(of), dtype=dtype)
+    cloud['x'], cloud['y'] = of.points[:, 0], of.points[:, 1]
+    cloud['cov_xx'], cloud['cov_xy'] = of.cov[:, 0, 0], of.cov[:, 0, 1]
+    cloud['cov_yy'] = of.cov[:, 1, 1]
+    cloud['landmark'], cloud['id'], cloud['diameter'] = landmarks, of.ids, of.diameters
+    return cloud
 
 
 def read_associated(msg: Any, topic: str = 'reflectors/associated') -> Associated:
     """The inverse of build_associated; InputError if it is another kind of cloud."""
-    cloud = read_cloud(msg, topic)
-    missing = set(ASSOCIATED.names or ()) - set(cloud.dtype.names or ())
-    if missing:
-        raise InputError(f'{topic}: cloud has no field {", ".join(sorted(missing))}')
-    cov = np.empty((len(cloud), 2, 2))
-    cov[:, 0, 0], cov[:, 1, 1] = cloud['cov_xx'], cloud['cov_yy']
-    cov[:, 0, 1] = cov[:, 1, 0] = cloud['cov_xy']
+    cloud = _read(msg, ASSOCIATED, topic)
+    points, cov = _places(cloud)
     return Associated(
         Detections(
             stamp(msg, topic),
             frame(msg.header.frame_id),
-            np.stack([cloud['x'], cloud['y']], -1).astype(np.float64),
+            points,
             cov,
             cloud['id'].astype(np.int64),
             cloud['diameter'].astype(np.float64),
@@ -72,3 +83,33 @@ def read_associated(msg: Any, topic: str = 'reflectors/associated') -> Associate
         cloud['landmark'].astype(np.int64),
         cloud['status'].astype(np.int64),
     )
+
+
+def read_reflector_map(msg: Any, topic: str = 'reflector_map_points') -> Reflectors:
+    """The inverse of build_reflector_map; InputError if it is another kind of cloud."""
+    cloud = _read(msg, MAPPED, topic)
+    points, cov = _places(cloud)
+    return Reflectors(
+        cloud['landmark'].astype(np.int64),
+        points,
+        cov,
+        cloud['id'].astype(np.int64),
+        cloud['sightings'].astype(np.int64),
+        cloud['diameter'].astype(np.float64),
+    )
+
+
+def _read(msg: Any, dtype: np.dtype[np.void], topic: str) -> NDArray[np.void]:
+    cloud = read_cloud(msg, topic)
+    missing = set(dtype.names or ()) - set(cloud.dtype.names or ())
+    if missing:
+        raise InputError(f'{topic}: cloud has no field {", ".join(sorted(missing))}')
+    return cloud
+
+
+def _places(cloud: NDArray[np.void]) -> tuple[Array, Array]:
+    """Points (n, 2) and covariances (n, 2, 2)."""
+    cov = np.empty((len(cloud), 2, 2))
+    cov[:, 0, 0], cov[:, 1, 1] = cloud['cov_xx'], cloud['cov_yy']
+    cov[:, 0, 1] = cov[:, 1, 0] = cloud['cov_xy']
+    return np.stack([cloud['x'], cloud['y']], -1).astype(np.float64), cov

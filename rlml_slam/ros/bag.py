@@ -29,21 +29,8 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 
 from rlml_slam.errors import BagError
 from rlml_slam.params import Node
+from rlml_slam.ros.feed import STREAMS, USED_BY
 from rlml_slam.ros.messages import bag_types
-
-# stream of the sequencer -> parameter with the topic's name, type, whether the only topic of the
-# type may stand in. Any PointCloud2 or PoseArray may be something else than reflectors.
-STREAMS: Mapping[str, tuple[str, str, bool]] = {
-    'scan': ('scan_topic', 'sensor_msgs/msg/LaserScan', True),
-    'odom': ('odom_topic', 'nav_msgs/msg/Odometry', True),
-    'imu': ('imu_topic', 'sensor_msgs/msg/Imu', True),
-    'reflectors': ('reflectors_topic', 'sensor_msgs/msg/PointCloud2', False),
-    'reflector_poses': ('reflector_poses_topic', 'geometry_msgs/msg/PoseArray', False),
-}
-USED_BY = {
-    'scan': 'use_scan', 'odom': 'use_odom', 'imu': 'use_imu',
-    'reflectors': 'use_reflectors', 'reflector_poses': 'use_reflectors',
-}  # fmt: skip
 
 
 @dataclass(frozen=True)

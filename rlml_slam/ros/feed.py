@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Generic, Protocol, TypeVar
 
 from rlml_slam.errors import InputError
@@ -15,6 +16,19 @@ from rlml_slam.sensing.sequence import Inputs
 from rlml_slam.types import Detections, Imu, Odometry, Scan
 
 Out = TypeVar('Out')
+# stream of the sequencer -> parameter with the topic's name, type, whether the only topic of the
+# type may stand in. Any PointCloud2 or PoseArray may be something else than reflectors.
+STREAMS: Mapping[str, tuple[str, str, bool]] = {
+    'scan': ('scan_topic', 'sensor_msgs/msg/LaserScan', True),
+    'odom': ('odom_topic', 'nav_msgs/msg/Odometry', True),
+    'imu': ('imu_topic', 'sensor_msgs/msg/Imu', True),
+    'reflectors': ('reflectors_topic', 'sensor_msgs/msg/PointCloud2', False),
+    'reflector_poses': ('reflector_poses_topic', 'geometry_msgs/msg/PoseArray', False),
+}
+USED_BY = {
+    'scan': 'use_scan', 'odom': 'use_odom', 'imu': 'use_imu',
+    'reflectors': 'use_reflectors', 'reflector_poses': 'use_reflectors',
+}  # fmt: skip
 PLACED = ('scan', 'reflectors', 'reflector_poses')  # streams whose sensor has to have a place
 
 
@@ -38,7 +52,7 @@ class Target(Protocol[Out]):
 
 
 class Feed(Generic[Out]):
-    """Converts the messages of the streams (keys of bag.STREAMS) and hands them to a target.
+    """Converts the messages of the streams (keys of STREAMS) and hands them to a target.
 
     ``extrinsics`` is filled by the caller from /tf_static; a sensor that it does not know gets
     the parameter ``laser_pose``. A message that cannot be believed is counted in ``inputs``; only

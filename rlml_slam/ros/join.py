@@ -17,6 +17,7 @@ from rlml_slam.sensing.sequence import PAIRING
 from rlml_slam.types import Frame, Motion, Observation
 
 MAX_WAITING = 2000  # observations or poses without their other half; the oldest are dropped
+WAIT = 2.0  # [s] of stamps that a scan waits for the front end's detections
 # the local frame is continuous: a larger step against the odometry is another front end's
 RESTART = np.array([2.0, 2.0, 1.0])
 
@@ -24,7 +25,8 @@ RESTART = np.array([2.0, 2.0, 1.0])
 class FrameJoin:
     """Two ordered streams are merged by stamp; each ``add_…`` returns what became whole.
 
-    An observation that the front end never answered adds its motion to the next one.
+    An observation that the front end never answered, or that came while ``paused``, adds its
+    motion to the next one.
     """
 
     def __init__(self, params: Parameters) -> None:
@@ -33,6 +35,7 @@ class FrameJoin:
         self._poses: deque[PoseEstimate] = deque(maxlen=MAX_WAITING)
         self._associated: dict[int, Associated] = {}
         self._pending: Motion = STILL
+        self.paused = False
         self.unanswered = 0
 
     def add_observation(self, observation: Observation) -> list[Frame]:
@@ -65,7 +68,10 @@ class FrameJoin:
             else:
                 self._observations.popleft()
                 self._poses.popleft()
-                out.append(self._frame(observation, pose))
+                if self.paused:
+                    self._pending = compose_motion(self._pending, observation.motion)
+                else:
+                    out.append(self._frame(observation, pose))
         return out
 
     def _frame(self, observation: Observation, pose: PoseEstimate) -> Frame:
@@ -99,3 +105,15 @@ def restarted(before: Frame, after: Frame) -> bool:
     step = se2.between(before.T_local_base, after.T_local_base)
     error = np.abs(se2.between(after.observation.motion.delta, step))
     return bool(np.any(error > RESTART) and after.observation.motion.known)
+
+
+def follower(params: Parameters) -> Parameters:
+    """Parameters for a sequencer behind the front end: it waits longer and leaves nothing out."""
+    node = params.node
+    return dataclasses.replace(
+        params,
+        node=dataclasses.replace(
+            node, transform_timeout=max(WAIT, node.transform_timeout), use_reflectors=True
+        ),
+        reflector=dataclasses.replace(params.reflector, max_range=1000.0),
+    )

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+# Every target sets up what it needs by itself. PYTHON chooses the interpreter (3.10 to 3.13).
+PYTHON ?= python3
+PYTEST_ARGS ?= -n 2
+VENV := .venv
+BIN := $(VENV)/bin
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+
+# a sourced ROS 2 is used instead of the wheels
+ifdef ROS_DISTRO
+  ifeq ($(shell $(PYTHON) -c 'import rclpy' 2>/dev/null && echo yes),yes)
+    ROS := $(ROS_DISTRO)
+  endif
+endif
+ROS ?= wheels
+MADE := $(VENV)/.made-for-$(ROS)
+
+# the wheels mark a process that has set itself up; another environment's Python must not see it
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
+
+.PHONY: help env demo test lint types ci tf config clean
+
+help:  ## this list
+	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile | expand -t 16
+
+env: $(MADE)  ## make .venv, in which .venv/bin/rlml is the command
+
+$(MADE): setup.py $(wildcard requirements/*.txt) requirements/install
+	@PYTHON='$(PYTHON)' requirements/install $(VENV) $(ROS)
+	@touch $@
+
+demo: env  ## simulator, front end and back end live over DDS, with a report in out/demo
+	@$(BIN)/rlml demo
+
+test: env  ## all tests
+	@$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+lint: env  ## ruff: rules and format
+	@$(BIN)/ruff check . && $(BIN)/ruff format --check .
+
+types: env  ## mypy, strict
+	@$(BIN)/mypy
+
+config: env  ## write config/*.yaml anew from the declared parameters
+	@for name in default simulator; do \
+	  $(BIN)/python -m rlml_slam.tools.config $$name.yaml >config/.new && \
+	  mv config/.new config/$$name.yaml; done
+
+tf: env  ## build tf2_msgs, which the wheels lack, into .venv
+	@[ $(ROS) != wheels ] || .ci/tf2_msgs/install $(VENV)
+
+ci:  ## all that is checked before a change is taken
+	@.ci/run
+
+clean:  ## remove what make made
+	rm -rf $(VENV) build install log out

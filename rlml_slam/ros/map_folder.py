@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Saved maps: files of one folder, never outside of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from rlml_slam.errors import MapError
+from rlml_slam.maps import occupancy, reflector_file
+from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.types import Reflectors
+
+
+@dataclass(frozen=True)
+class SavedMap:
+    """Reflectors and, where scans were used, the grid."""
+
+    reflectors: Reflectors
+    grid: OccupancyGrid | None = None
+
+
+class MapFolder:
+    """The folder of the parameter ``map_directory``."""
+
+    def __init__(self, directory: str) -> None:
+        self._folder = Path(directory).expanduser().resolve()
+
+    def path(self, name: str) -> Path:
+        """The path of a map without its suffixes; MapError if it lies outside of the folder."""
+        name = name.removeprefix('file://')
+        for suffix in ('.yaml', '.csv', '.pgm'):
+            name = name.removesuffix(suffix)
+        path = (self._folder / name).resolve()
+        if not name or path == self._folder or not path.is_relative_to(self._folder):
+            raise MapError(f'map {name!r} is not inside of map_directory, {self._folder}')
+        return path
+
+    def save(self, name: str, saved: SavedMap) -> Path:
+        """Write name.csv, and name.pgm with name.yaml where there is a grid."""
+        path = self.path(name)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as e:
+            raise MapError(f'{path.parent}: cannot be made: {e.strerror}') from e
+        reflector_file.save(saved.reflectors, path.with_name(path.name + '.csv'))
+        if saved.grid is not None:
+            occupancy.save(saved.grid, path)
+        return path
+
+    def load(self, name: str) -> SavedMap:
+        """Read what save wrote; MapError or FileFormatError says what is wrong with which file."""
+        path = self.path(name)
+        reflectors = reflector_file.load(path.with_name(path.name + '.csv'))
+        meta = path.with_name(path.name + '.yaml')
+        return SavedMap(reflectors, occupancy.load(meta) if meta.exists() else None)

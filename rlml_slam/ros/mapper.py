@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The live back end: a worker thread owns the graph and publishes what changes by each frame."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rlml_slam import se2
+from rlml_slam.errors import MapError
+from rlml_slam.params import Parameters
+from rlml_slam.rlml.back_end import BackEnd
+from rlml_slam.ros import build
+from rlml_slam.ros.map_folder import MapFolder, SavedMap
+from rlml_slam.ros.messages import make_rclpy, rclpy_class
+from rlml_slam.ros.products import MapProducts
+from rlml_slam.ros.sensors import LATCHED
+from rlml_slam.ros.tf import TransformPublisher
+from rlml_slam.ros.worker import Worker
+from rlml_slam.se2 import Array
+from rlml_slam.types import Frame
+
+MAX_BACKLOG = 20  # frames behind which pictures of the map are left out
+CERTAIN = 1e-6 * np.eye(3)
+
+
+class Mapper:
+    """Frames in; correction, map and map to odom out. ``T_map_odom`` (3,) is None at first.
+
+    In localization mode the graph is left alone: the saved map is published and never changes.
+    """
+
+    def __init__(self, node: Any, params: Parameters) -> None:
+        self._p = params
+        self.folder = MapFolder(params.node.map_directory)
+        self.saved: SavedMap | None = None
+        if params.node.mode == 'localization':
+            self.saved = self.folder.load(params.node.map_file_name)
+        self.back_end = BackEnd(params)
+        self.worker = Worker()
+        self.products = MapProducts(node, params.node)
+        self.T_map_odom: Array | None = None
+        self._newest: Frame | None = None
+        self._resume = 0  # frames before this stamp are still the old front end's
+        self._sent = 0
+        self._tf = TransformPublisher(node)
+        kind = rclpy_class('geometry_msgs/msg/PoseWithCovarianceStamped')
+        self._correction = node.create_publisher(kind, 'correction', LATCHED)
+        self._initialpose = node.create_publisher(kind, 'initialpose', 10)
+        if self.saved is not None:
+            self.worker.submit(self.publish_map)
+
+    @property
+    def stamp(self) -> int:
+        """Stamp of the newest frame, 1 before the first."""
+        return self._newest.stamp if self._newest is not None else 1
+
+    def add(self, frame: Frame) -> None:
+        """Give one frame to the worker."""
+        if frame.stamp > self._resume:
+            self.worker.submit(lambda: self._add(frame))
+
+    def _add(self, frame: Frame) -> None:
+        self._newest = frame
+        if self.saved is None:
+            update = self.back_end.add(frame)
+            if update is not None and update.optimized:
+                self._send_correction()
+        T_map_base = se2.compose(self.back_end.T_map_local, frame.T_local_base)
+        T_odom_base = frame.observation.odom_pose
+        if T_odom_base is None:  # without odometry, odom is the front end's local frame
+            T_odom_base = frame.T_local_base
+        self.T_map_odom = se2.compose(T_map_base, se2.inverse(T_odom_base))
+        due = self.saved is None and self.products.is_due(frame.stamp)
+        if due and self.worker.backlog < MAX_BACKLOG:
+            self.publish_map()
+
+    def _send_correction(self) -> None:
+        frame, T = self._p.node.map_frame, self.back_end.T_map_local
+        message = build.pose_with_covariance(make_rclpy, self.stamp, frame, T, CERTAIN)
+        self._correction.publish(message)
+
+    def publish_map(self) -> None:
+        """In the worker: send map, trajectory, reflectors and graph now."""
+        self.products.publish(self.back_end, self.saved, self.stamp)
+
+    def send_transform(self, stamp: int | None) -> None:
+        """Publish map to odom for a newer stamp than the last one."""
+        self.worker.check()
+        stamp = max(self.stamp, stamp or 0)
+        if self.T_map_odom is not None and stamp > self._sent:
+            n = self._p.node
+            self._tf.publish(stamp, (n.map_frame, n.odom_frame), self.T_map_odom)
+            self._sent = stamp
+
+    def restart(self) -> None:
+        """Forget the graph: the front end began anew, or the clock jumped back."""
+        self._sent = 0
+        self.worker.submit(self._forget)
+
+    def _forget(self) -> None:
+        self.back_end.reset()
+        self.products.restart()
+        self._newest, self.T_map_odom = None, None
+        self._send_correction()
+
+    def start_at(self, pose: Array, wait: int) -> None:
+        """In the worker: begin anew at a pose; frames of the next ``wait`` ns are old ones."""
+        stamp = self.stamp
+        self._resume = stamp + wait
+        self._forget()
+        frame = self._p.node.map_frame
+        self._initialpose.publish(
+            build.pose_with_covariance(make_rclpy, stamp, frame, pose, CERTAIN)
+        )
+
+    def save(self, name: str) -> str:
+        """In the worker: write the map; what was written, in words. Raises MapError."""
+        if self.saved is not None:
+            raise MapError('in localization mode the map does not change: nothing to save')
+        reflectors, grid = self.back_end.reflectors(), self.back_end.occupancy_grid()
+        if grid is None and len(reflectors) == 0:
+            raise MapError('there is no map yet')
+        path = self.folder.save(name, SavedMap(reflectors, grid))
+        return f'{path}: {len(reflectors)} reflectors' + ('' if grid is None else ' and a grid')
+
+    def load(self, name: str) -> SavedMap:
+        """In the worker: localise in another saved map. Raises MapError."""
+        if self.saved is None:
+            raise MapError('load_map needs mode:=localization')
+        self.saved = self.folder.load(name)
+        self.publish_map()
+        return self.saved

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sensors of a live robot: subscriptions that feed a sequencer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from rlml_slam.errors import InputError
+from rlml_slam.params import Parameters
+from rlml_slam.ros.convert import frame
+from rlml_slam.ros.feed import PLACED, STREAMS, USED_BY, Feed
+from rlml_slam.ros.messages import rclpy_class
+from rlml_slam.ros.tf import Extrinsics, subscribe_static
+from rlml_slam.sensing.sequence import Sequencer
+from rlml_slam.types import Detections, Observation
+
+TF_PATIENCE = 1_000_000_000  # [ns] of stamps that a sensor's place on /tf_static is waited for
+RELIABLE = QoSProfile(depth=10)
+# deeper than sensor data's 5: a pause of the interpreter must not cost a scan
+SENSOR = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class Sensors:
+    """Feeds the messages of the streams to a Sequencer and its observations to ``handle``.
+
+    Where the clock jumps back by more than the buffer holds, ``restart`` is called and a new
+    sequencer begins. Scans and detections wait, in order, until /tf_static tells where their
+    sensor is, but no longer than TF_PATIENCE.
+    """
+
+    def __init__(
+        self,
+        node: Any,
+        params: Parameters,
+        streams: Iterable[str],
+        handle: Callable[[Observation], None],
+        restart: Callable[[], None],
+    ) -> None:
+        self._logger = node.get_logger()
+        self._p = params
+        self._handle = handle
+        self._restart = restart
+        self._begin(Extrinsics())
+        self._waits = subscribe_static(node, self._feed.extrinsics)
+        self._held: list[tuple[str, Any]] = []
+        for stream in streams:
+            parameter, msgtype, _ = STREAMS[stream]
+            # without scan matching, a scan still asks for a pose at its stamp
+            if getattr(params.node, USED_BY[stream]) or stream == 'scan':
+                node.create_subscription(
+                    rclpy_class(msgtype), getattr(params.node, parameter),
+                    lambda msg, stream=stream: self.add(stream, msg), SENSOR,
+                )  # fmt: skip
+
+    def _begin(self, extrinsics: Extrinsics) -> None:
+        self.sequencer = Sequencer(self._p)
+        self._feed = Feed(self._p, self.sequencer, self.sequencer.inputs)
+        self._feed.extrinsics = extrinsics
+
+    def add(self, stream: str, msg: Any) -> None:
+        """One message of a stream."""
+        if stream not in PLACED or not self._waits:
+            self._use(stream, msg)
+            return
+        self._held.append((stream, msg))
+        unknown = {frame(m.header.frame_id) for _, m in self._held if not self._is_placed(m)}
+        if unknown and _stamp(msg) - _stamp(self._held[0][1]) <= TF_PATIENCE:
+            return
+        if unknown:
+            self._waits = False
+            self._logger.warning(
+                f'no transform from {self._p.node.base_frame} to {", ".join(sorted(unknown))} '
+                f'on /tf_static: the parameter laser_pose is used'
+            )
+        held, self._held = self._held, []
+        for item in held:
+            self._use(*item)
+
+    def _is_placed(self, msg: Any) -> bool:
+        try:
+            return self._feed.is_placed(msg)
+        except InputError:  # not planar: the feed refuses and counts it
+            return True
+
+    def _use(self, stream: str, msg: Any) -> None:
+        self._observe(lambda: self._feed.add(stream, msg))
+
+    def add_detections(self, detections: Detections) -> None:
+        """Detections that are converted already."""
+        self._observe(lambda: self.sequencer.add_detections(detections))
+
+    def _observe(self, add: Callable[[], list[Observation]]) -> None:
+        try:
+            observations = add()
+        except InputError as e:
+            self._logger.warning(f'{e}: everything begins anew')
+            self._begin(self._feed.extrinsics)
+            self._restart()
+            return
+        for observation in observations:
+            self._handle(observation)
+
+
+def _stamp(msg: Any) -> int:
+    return int(msg.header.stamp.sec) * 1_000_000_000 + int(msg.header.stamp.nanosec)
+
+
+def checked(node: Any, callback: Callable[[Any], None]) -> Callable[[Any], None]:
+    """The callback, which warns instead of raising where a message cannot be believed."""
+
+    def call(msg: Any) -> None:
+        try:
+            callback(msg)
+        except InputError as e:
+            node.get_logger().warning(f'not used: {e}')
+
+    return call

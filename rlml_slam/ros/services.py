@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The services of the back end; each answers with what happened, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from nav_msgs.srv import GetMap, LoadMap
+from rclpy.task import Future
+from std_srvs.srv import SetBool, Trigger
+
+from rlml_slam.errors import RlmlError
+from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.params import Parameters
+from rlml_slam.ros import build
+from rlml_slam.ros.join import FrameJoin
+from rlml_slam.ros.mapper import Mapper
+from rlml_slam.ros.messages import make_rclpy
+
+RESET_WAIT = 500_000_000  # [ns] in which the front end has surely got its new start
+
+
+class MapServices:
+    """Answers in the mapper's thread, between two frames, so that no subscription waits."""
+
+    def __init__(self, node: Any, params: Parameters, mapper: Mapper, join: FrameJoin) -> None:
+        self._node = node
+        self._p = params
+        self._mapper = mapper
+        self._join = join
+        for kind, name, answer in (
+            (Trigger, '~/save_map', self.save_map),
+            (LoadMap, '~/load_map', self.load_map),
+            (Trigger, '~/reset', self.reset),
+            (GetMap, '~/dynamic_map', self.dynamic_map),
+            (SetBool, '~/pause_new_measurements', self.pause),
+        ):
+            node.create_service(kind, name, self._in_worker(answer))
+
+    def _in_worker(self, answer: Callable[[Any, Any], Any]) -> Any:
+        async def call(request: Any, response: Any) -> Any:
+            done = Future(executor=self._node.executor)
+            job = self._mapper.worker.submit(lambda: answer(request, response))
+            job.add_done_callback(lambda _: done.set_result(None))
+            await done
+            return response
+
+        return call
+
+    def save_map(self, _request: Any, response: Any) -> None:
+        """Write the map under map_file_name."""
+        self._try(response, lambda: self._mapper.save(self._p.node.map_file_name))
+
+    def reset(self, _request: Any, response: Any) -> None:
+        """Forget the map and begin at map_start_pose; the front end does as well."""
+        self._mapper.start_at(np.array(self._p.node.map_start_pose), RESET_WAIT)
+        response.success, response.message = True, 'the map begins anew'
+
+    def pause(self, request: Any, response: Any) -> None:
+        """Leave new measurements out of the map, or take them in again."""
+        self._join.paused = bool(request.data)
+        response.success = True
+        response.message = 'paused' if request.data else 'measurements are used again'
+
+    def dynamic_map(self, _request: Any, response: Any) -> None:
+        """The grid as it is now."""
+        saved = self._mapper.saved
+        grid = self._mapper.back_end.occupancy_grid() if saved is None else saved.grid
+        if grid is not None:
+            response.map = self._message(grid)
+
+    def load_map(self, request: Any, response: Any) -> None:
+        """Localise in another map of map_directory; map_url is its name."""
+        try:
+            saved = self._mapper.load(request.map_url or self._p.node.map_file_name)
+        except RlmlError as e:
+            self._node.get_logger().warning(f'load_map: {e}')
+            missing = 'cannot be read' in str(e)
+            response.result = (
+                LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
+                if missing
+                else LoadMap.Response.RESULT_UNDEFINED_FAILURE
+            )
+            return
+        response.result = LoadMap.Response.RESULT_SUCCESS
+        if saved.grid is not None:
+            response.map = self._message(saved.grid)
+
+    def _message(self, grid: OccupancyGrid) -> Any:
+        return build.occupancy_grid(make_rclpy, self._mapper.stamp, self._p.node.map_frame, grid)
+
+    @staticmethod
+    def _try(response: Any, act: Callable[[], str]) -> None:
+        try:
+            response.message = act()
+            response.success = True
+        except RlmlError as e:
+            response.success, response.message = False, str(e)

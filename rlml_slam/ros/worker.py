@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One thread for heavy work, so that subscriptions keep draining; jobs run in order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+
+class Worker:
+    """Runs jobs one after the other. A job that fails is a bug: ``check`` raises its error."""
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(max_workers=1)
+        self._failed: BaseException | None = None
+        self._given = 0
+        self._done = 0
+
+    @property
+    def backlog(self) -> int:
+        """Jobs that are waiting or running."""
+        return self._given - self._done
+
+    def submit(self, job: Callable[[], Any]) -> Future[Any]:
+        """Run ``job`` after all that were given before."""
+        self.check()
+        self._given += 1
+        future = self._pool.submit(job)
+        future.add_done_callback(self._finish)
+        return future
+
+    def _finish(self, future: Future[Any]) -> None:
+        self._done += 1
+        if not future.cancelled() and future.exception() is not None:
+            self._failed = future.exception()
+
+    def check(self) -> None:
+        """Raise what a job raised."""
+        if self._failed is not None:
+            raise self._failed
+
+    def close(self) -> None:
+        """Finish the running job and forget the others."""
+        self._pool.shutdown(wait=True, cancel_futures=True)

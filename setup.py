@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Package description for colcon (ament_python) and pip alike."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = 'rlml_slam'
+NODES = ('front_end', 'back_end', 'slam', 'simulator', 'bag_player')
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    description='2D localization and SLAM with retro-reflective markers and a 2D laser',
+    author='rlml_slam maintainers',
+    maintainer='rlml_slam maintainers',
+    maintainer_email='maintainers@rlml-slam.invalid',
+    license='Apache-2.0',
+    python_requires='>=3.10',
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
+    package_data={NAME: ['py.typed', 'simulation/worlds/*.yaml']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+        (f'share/{NAME}/config', sorted(glob('config/*'))),
+    ],
+    install_requires=[
+        'matplotlib',
+        'numba',
+        'numpy',
+        'pyyaml',
+        'rich',
+        'rosbags',
+        'scipy',
+        'setuptools',
+    ],
+    extras_require={
+        # a machine without ROS 2 gets it from wheels
+        'ros': ['ros-jazzy-common-interfaces', 'ros-jazzy-rclpy[fastrtps]'],
+        'dev': ['hypothesis', 'mypy', 'pytest', 'pytest-xdist', 'ruff'],
+        'bench': ['g2o-python', 'gtsam', 'pyceres', 'yag-slam'],
+    },
+    zip_safe=False,
+    entry_points={
+        'console_scripts': [
+            'rlml = rlml_slam.tools.main:main',
+            *(f'{node} = {NAME}.nodes.{node}:main' for node in NODES),
+        ],
+    },
+)
