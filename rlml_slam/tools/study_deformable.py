@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``rlml study deformable``: the 8-row table over many seeds, or the note's own two runs."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
+from rich.table import Table
+
+from rlml_slam.deformable.experiment import CONTROLS, ROWS, Row
+from rlml_slam.deformable.replay_note import replay
+from rlml_slam.deformable.study import RowResult, concatenate, run_row, summarize
+from rlml_slam.errors import ParameterError, RlmlError
+
+CHUNK = 50  # seeds per task: small enough for a moving bar, large enough to be worth sending
+
+
+def add_parser(subparsers: Any) -> None:
+    """Declare the command below ``study``."""
+    parser = subparsers.add_parser(
+        'deformable',
+        help='deformable-feature SLAM: EKF against NLS over many seeds',
+        description='EKF, NLS, RTS smoother and dead reckoning on the same runs of 8 experiments.',
+    )
+    parser.add_argument('--seeds', type=int, default=2000, help='runs per row (default 2000)')
+    parser.add_argument('--control', choices=('both', *CONTROLS), default='both')
+    parser.add_argument('--out', type=Path, help='folder for report.html, figures, results.json')
+    parser.add_argument('--figure-seed', type=int, default=0, help='the run that is drawn')
+    parser.add_argument('--jobs', type=int, default=0, help='processes (default: one per core)')
+    parser.add_argument('--json', action='store_true', help='print the results as JSON alone')
+    parser.add_argument(
+        '--replay-note', type=Path, metavar='DIR', help="replay the note's stored noise instead"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the study or the replay; 0, or RlmlError."""
+    if args.replay_note is not None:
+        replayed = replay(args.replay_note)
+        print(json.dumps(replayed)) if args.json else _show_replay(_console(), replayed)
+        return 0
+    if args.seeds < 2 or args.jobs < 0 or args.figure_seed < 0:
+        raise ParameterError(
+            'study deformable: --seeds must be >= 2, --jobs and --figure-seed >= 0'
+        )
+    rows = tuple(r for r in ROWS if args.control in ('both', r.control))
+    started = time.perf_counter()
+    results = run_study(rows, args.seeds, args.jobs or _cores())
+    summary = summarize(results)
+    summary['wall_s'] = round(time.perf_counter() - started, 2)
+    if args.out is not None:
+        from rlml_slam.tools.study_deformable_report import write_report
+
+        write_report(args.out, summary, results, args.figure_seed)
+    if args.json:
+        print(json.dumps(summary))
+    else:
+        show(_console(), summary)
+        if args.out is not None:
+            print(f'report: {args.out / "report.html"}')
+    return 0
+
+
+def run_study(rows: tuple[Row, ...], seeds: int, jobs: int) -> dict[Row, RowResult]:
+    """Results of ``rows`` over seeds 0 .. seeds-1, whatever the number of processes.
+
+    A bar on stderr shows the progress.
+    """
+    tasks = [
+        (row, range(k, min(k + CHUNK, seeds)))
+        for row in sorted(rows, key=lambda r: r.control != 'active')  # the long ones first
+        for k in range(0, seeds, CHUNK)
+    ]
+    parts: dict[Row, dict[int, RowResult]] = {row: {} for row in rows}
+    with Progress(
+        '{task.description}', BarColumn(), MofNCompleteColumn(), 'runs', TimeElapsedColumn(),
+        console=Console(stderr=True),
+    ) as progress:  # fmt: skip
+        bar = progress.add_task('compiling', total=len(rows) * seeds)
+        run_row(Row('straight', 'fixed', 'active'), range(1))  # fills the cache for all processes
+        progress.update(bar, description='simulating')
+        context = multiprocessing.get_context('spawn')
+        with ProcessPoolExecutor(jobs, mp_context=context) as pool:
+            pending = {pool.submit(run_row, *task): task for task in tasks}
+            for done in as_completed(pending):
+                row, part = pending[done]
+                parts[row][part.start] = done.result()
+                progress.advance(bar, len(part))
+    return {row: concatenate(p for _, p in sorted(parts[row].items())) for row in rows}
+
+
+def _cores() -> int:
+    """Cores this process may use."""
+    if hasattr(os, 'sched_getaffinity'):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _console() -> Console:
+    """The terminal; a pipe gets lines wide enough for the tables."""
+    console = Console()
+    return console if console.is_terminal else Console(width=170)
+
+
+def show(console: Console, summary: dict[str, Any]) -> None:
+    """The tables of the study."""
+    for title, header, lines in tables(summary):
+        table = Table(title=escape(title), title_justify='left')
+        for k, name in enumerate(header):
+            table.add_column(escape(name), justify='left' if k == 0 else 'right', no_wrap=k == 0)
+        for line in lines:
+            table.add_row(*line)
+        console.print(table)
+    failed = [c for c in summary['claims'] if not c['holds']]
+    console.print(
+        f'{len(summary["claims"]) - len(failed)} of {len(summary["claims"])} claims hold'
+    )
+    for c in failed:
+        console.print(f'  not shown: {c["claim"]}, {c["where"]}: {c["found"]}', markup=False)
+    console.print(f'{summary["seeds"]} seeds, {summary["wall_s"]} s')
+
+
+def tables(summary: dict[str, Any]) -> list[tuple[str, list[str], list[list[str]]]]:
+    """Title, header and cells of each table, for the terminal and the report alike."""
+    rows = summary['rows']
+    errors = [
+        [name, *(_ci(r['ss3'][e]) for e in ('ekf', 'nls', 'rts', 'dead_reckoning')),
+         f'{r["relative_to_dead_reckoning"]["ekf"]:.3f}',
+         f'{r["relative_to_dead_reckoning"]["nls"]:.3f}',
+         f'{r["unseen"][0]:.2f}', f'{r["path_m"][0]:.2f}', f'{r["mean_step_m"]:.3f}']
+        for name, r in rows.items()
+    ]  # fmt: skip
+    paired = [
+        [name, *(_ci(r['paired'][k], sign=True)
+                 for k in ('nls-ekf', 'rts-ekf', 'nls-rts', 'ekf-dead_reckoning')),
+         f'{100 * r["share_nls_below_ekf"]:.1f} %']
+        for name, r in rows.items()
+    ]  # fmt: skip
+    consistency = [
+        [name, f'{r["nees_nls"]["mean"]:.2f}', _bounds(r['nees_nls']),
+         f'{r["nees_ekf"]["mean"]:.2f}', _bounds(r['nees_ekf']),
+         f'{r["nees_ekf"]["steps_outside"]} of {r["nees_ekf"]["steps"]}',
+         f'{100 * r["converged"]:.2f} %',
+         f'{r["iterations"]["mean"]:.1f} / {r["iterations"]["max"]}']
+        for name, r in rows.items()
+    ]  # fmt: skip
+    rmse = [
+        [name, *(f'{r["position_rmse_m"][e]:.3f} / {1e3 * r["heading_rmse_rad"][e]:.1f}'
+                 for e in ('ekf', 'nls', 'rts', 'dead_reckoning'))]
+        for name, r in rows.items()
+    ]  # fmt: skip
+    out = [
+        ('Pose error of one run: sum over 20 poses of dx² + dy² + dθ², mean ± 95 % CI',
+         ['row', 'EKF', 'NLS', 'RTS', 'dead reckoning', 'EKF / d.r.', 'NLS / d.r.', 'unseen of 60',
+          'path [m]', 'step [m]'], errors),
+        ('Paired differences of it on the same seeds, mean ± 95 % CI',
+         ['row', 'NLS − EKF', 'RTS − EKF', 'NLS − RTS', 'EKF − dead reckoning',
+          'runs with NLS < EKF'], paired),
+        ('Consistency: normalised error (NEES) with its 99.9 % bounds, and convergence',
+         ['row', 'NLS, run', 'bounds (177)', 'EKF, steps', 'bounds per step (9)',
+          'EKF steps outside', 'converged', 'iterations mean / max'], consistency),
+        ('RMSE per pose: position [m] / heading [mrad]',
+         ['row', 'EKF', 'NLS', 'RTS', 'dead reckoning'], rmse),
+    ]  # fmt: skip
+    pairs = summary['active_minus_predetermined']
+    if pairs:
+        out.append((
+            'Active minus predetermined control on the same seeds, mean ± 95 % CI',
+            ['path and noise', 'EKF', 'NLS', 'dead reckoning', 'EKF / d.r.', 'NLS / d.r.',
+             'unseen', 'path [m]'],
+            [[name, *(_ci(p[k], sign=True) for k in (
+                'ss3_ekf', 'ss3_nls', 'ss3_dead_reckoning', 'relative_ekf', 'relative_nls',
+                'unseen', 'path_m'))] for name, p in pairs.items()],
+        ))  # fmt: skip
+    return out
+
+
+def _ci(interval: tuple[float, float], sign: bool = False) -> str:
+    mean, half = interval
+    return f'{mean:{"+" if sign else ""}.3f} ± {half:.3f}'
+
+
+def _bounds(nees: dict[str, Any]) -> str:
+    low, high = nees['bounds']
+    return f'{low:.2f} … {high:.2f}'
+
+
+def _show_replay(console: Console, replayed: dict[str, Any]) -> None:
+    """Our figures beside the note's Table 1."""
+    table = Table(title="The note's two runs, from its stored noise", title_justify='left')
+    for name in ('path', 'NLS is given', 'EKF', 'NLS', 'EKF, note', 'NLS, note'):
+        table.add_column(name, justify='left' if name in ('path', 'NLS is given') else 'right')
+    for path, r in replayed.items():
+        for key, given in (('leak_on', 'realised motion'), ('leak_off', 'nominal motion')):
+            note = r['note'] if key == 'leak_on' else {'ekf': None, 'nls': None}
+            table.add_row(
+                path, given, f'{r[key]["ekf"]:.4f}', f'{r[key]["nls"]:.4f}',
+                *('' if note[e] is None else f'{note[e]:.4f}' for e in ('ekf', 'nls')),
+            )  # fmt: skip
+    console.print(table)
+    for path, r in replayed.items():
+        console.print(
+            f'{path}: EKF given the realised motion too {r["ekf_leaked"]:.4f}; on the nominal '
+            f'motion RTS smoother {r["rts"]:.4f}, dead reckoning {r["dead_reckoning"]:.4f}'
+        )
+
+
+def main() -> int:
+    """``python -m rlml_slam.tools.study_deformable``, the command without ``rlml study``."""
+    parser = argparse.ArgumentParser(prog='study')
+    add_parser(parser.add_subparsers(required=True))
+    args = parser.parse_args(['deformable', *sys.argv[1:]])
+    try:
+        return run(args)
+    except RlmlError as e:
+        print(f'error: {e}', file=sys.stderr)
+        return 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())
