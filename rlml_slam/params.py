@@ -230,6 +230,9 @@ class ScanMatch(Group):
     sigma: float = param(
         0.3, 'sigma_s of one end point (eq. 2), calibrated by NEES', '', 1e-3, 100.0
     )
+    sigma_point: float = param(
+        0.15, 'error of an end point across its surface, correlation included', 'm', 1e-3, 10.0
+    )
     min_points: int = param(20, 'scans with fewer end points are not used', '', 3, 10000)
     floor2: tuple[float, ...] = param(
         (2.5e-5, 2.5e-5, 4e-6), 'variance of a match that more beams do not lower', 'm², m², rad²'

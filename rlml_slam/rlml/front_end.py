@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.matching import association, thinning
+from rlml_slam.matching import association, observability, thinning
 from rlml_slam.matching.scan_match import match
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.health import Evidence, HealthMonitor
-from rlml_slam.rlml.information import calibrated
 from rlml_slam.rlml.joint_state import ANCHORS, JointState
 from rlml_slam.rlml.submaps import Submaps
 from rlml_slam.rlml.tracks import Tracks
@@ -207,22 +206,21 @@ class FrontEnd:
         found = match(submap, points, prior, np.linalg.inv(cov + floor), p)
         if found.score < p.min_score:
             return Evidence(scan=True, beams=len(points), score=found.score)
-        if found.prior_weight < 0.9:
-            # the scan disagrees with the odometry and wins: the prior is as wide as it was wrong
-            scale = min(1.0 / max(found.prior_weight, 1e-6), 1e6) - 1.0
-            back = np.linalg.inv(J_x)
-            self.state.widen(back @ (scale * (cov + floor)) @ back.T)
-        # the quadratic of the scan at the match, as three independent measurements of it
-        information = calibrated(found.information, p.floor2)
+        information = observability.information(submap, points, found.pose, p)
         values, axes = np.linalg.eigh(information)
         keep = values > 1e-6
+        # the match as independent measurements of the pose in the submap, unit variance each
         root = (axes[:, keep] * np.sqrt(values[keep])).T
         at_match = se2.between_jacobians(anchor, se2.compose(anchor, found.pose))
         H = root @ np.hstack([at_match[1], at_match[0]])
         offset = found.pose - prior
         offset[2] = se2.wrap(offset[2])
-        # the prior pulled the match off the scan's own optimum by H^-1 g; take that back
         v = root @ offset
+        surprise = float(v @ np.linalg.solve(root @ cov @ root.T + np.eye(len(v)), v))
+        if surprise > p.prior_scale**2 * max(len(v), 1):
+            # the scan disagrees with the odometry and wins: the prior was wrong by what shows
+            seen = np.linalg.pinv(root) @ v
+            self.state.widen(np.outer(at_match[1].T @ seen, at_match[1].T @ seen))
         self.state.apply(POSE_AND_TARGET, H, np.eye(len(v)), v)
         return Evidence(
             scan=True,

@@ -15,11 +15,10 @@ import numpy as np
 from rlml_slam import se2
 from rlml_slam.graph.factors import relative_information
 from rlml_slam.graph.graph import Graph
-from rlml_slam.matching import search, thinning
+from rlml_slam.matching import observability, search, thinning
 from rlml_slam.matching.scan_match import match
 from rlml_slam.matching.submap import Submap
 from rlml_slam.params import Parameters
-from rlml_slam.rlml.information import calibrated
 from rlml_slam.rlml.keyframes import Keyframe
 from rlml_slam.se2 import Array
 from rlml_slam.types import EdgeKind
@@ -94,17 +93,19 @@ class ScanGraph:
             return
         guess = se2.between(m.anchor.T_local, key.T_local)
         prior = np.diag(1.0 / np.array(self._p.back_end.match_sigma) ** 2)
-        found = match(m.submap, points, guess, prior, self._p.scan_match, searched=False)
-        if found.score < self._p.scan_match.min_score or key.index == m.anchor.index:
+        p = self._p.scan_match
+        found = match(m.submap, points, guess, prior, p, searched=False)
+        if found.score < p.min_score or key.index == m.anchor.index:
             return
-        self._edge(EdgeKind.SCAN, m.anchor.index, key.index, found.pose, found.information)
+        information = observability.information(m.submap, points, found.pose, p)
+        self._edge(EdgeKind.SCAN, m.anchor.index, key.index, found.pose, information)
 
     def _edge(self, kind: EdgeKind, i: int, j: int, delta: Array, information: Array) -> int:
         closure = kind is EdgeKind.CLOSURE
-        floor2 = self._p.loop_closure.floor2 if closure else self._p.scan_match.floor2
-        info = calibrated(information, floor2)
         # a direction that the scan leaves open still needs a regular covariance
-        cov = np.linalg.inv(info + np.diag([1e-4, 1e-4, 1e-4]))
+        cov = np.linalg.inv(information + np.diag([1e-4, 1e-4, 1e-4]))
+        if closure:
+            cov[[0, 1, 2], [0, 1, 2]] += self._p.loop_closure.floor2
         self.changed |= closure
         return self._graph.add_edge(kind, i, j, delta, relative_information(delta, cov))
 
@@ -166,7 +167,8 @@ class ScanGraph:
         found = match(m.submap, points, result.best.pose, weak, self._p.scan_match, searched=False)
         if found.score < p.min_score:
             return rejected('the refined fit is too weak', found.score)
-        edge = self._edge(EdgeKind.CLOSURE, i, j, found.pose, found.information)
+        information = observability.information(m.submap, points, found.pose, self._p.scan_match)
+        edge = self._edge(EdgeKind.CLOSURE, i, j, found.pose, information)
         return Closure(i, j, found.pose, found.score, edge, 'fits')
 
     def _pyramid(self, k: int) -> search.Pyramid:
