@@ -35,9 +35,10 @@ BEARING_NOISE = 0.01  # [rad]
 
 @dataclass(frozen=True)
 class MrclamRobot:
-    """One robot's run. ``truth`` is None where the data set has none; ``landmark_ids`` (m,) are
-    subject numbers, ``landmark_points`` (m, 2) [m] in the frame of the truth.
+    """One robot's run.
 
+    ``truth`` is None where the data set has none; ``landmark_ids`` (m,) are subject numbers,
+    ``landmark_points`` (m, 2) [m] in the frame of the truth.
     ``counts``: measurements ``used``, ``of_robots``, ``misread``, ``invalid``.
     """
 

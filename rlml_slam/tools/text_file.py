@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator, Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import IO
+from typing import IO, cast
 
 import numpy as np
 
@@ -42,7 +42,7 @@ def _open(path: Path) -> IO[bytes]:
     with path.open('rb') as f:
         head = f.read(len(_XZ))
     if head.startswith(_GZIP):
-        return gzip.open(path)
+        return cast(IO[bytes], gzip.open(path))
     if head == _XZ:
         return lzma.open(path)
     return path.open('rb')

@@ -35,7 +35,8 @@ def read_tum(path: str | Path) -> Trajectory:
 
     Raises FileFormatError, with the line, for a malformed line and for stamps that do not rise.
     """
-    stamps, poses = [], []
+    stamps: list[int] = []
+    poses: list[tuple[float, float, float]] = []
     for number, line in read_lines(path):
         try:
             stamp, pose = _parse(line)

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The files of a run; each appears whole or not at all."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rlml_slam.errors import MapError
+from rlml_slam.maps.occupancy import UNKNOWN, OccupancyGrid, save, write_atomically
+from rlml_slam.tools.metrics import judge, metrics
+from rlml_slam.tools.record import Run
+from rlml_slam.tools.tum import Trajectory, write_tum
+from rlml_slam.types import Reflectors
+
+REFLECTOR_COLUMNS = 'key,id,x_m,y_m,cov_xx_m2,cov_xy_m2,cov_yy_m2,sightings,diameter_m'
+
+
+def write_outputs(run: Run, folder: str | Path) -> dict[str, Any]:
+    """Write all results and pictures of a run into a folder; the figures of metrics.json.
+
+    trajectory.tum, front_end.tum, map.pgm, map.yaml and reflectors.csv depend on the data alone:
+    two replays give the same bytes. Raises MapError if the folder cannot be written.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise MapError(f'{folder}: cannot be made: {e.strerror}') from e
+    write_tum(folder / 'trajectory.tum', run.trajectory)
+    write_tum(folder / 'front_end.tum', run.frames.trajectory())
+    save(run.grid if run.grid is not None else unknown_grid(run.trajectory), folder / 'map')
+    write_atomically(folder / 'reflectors.csv', reflector_table(run.reflectors).encode())
+    judged = judge(run)
+    figures = metrics(run, judged)
+    write_atomically(folder / 'metrics.json', (json.dumps(figures, indent=2) + '\n').encode())
+    write_report(run, judged, figures, folder)
+    return figures
+
+
+def write_report(run: Run, judged: Any, figures: dict[str, Any], folder: Path) -> None:
+    """Pictures as PNG, and report.html that carries the same ones inside."""
+    # matplotlib takes half a second to import, which other commands need not wait for
+    from rlml_slam.tools.pictures import draw
+    from rlml_slam.tools.report import report_html
+
+    pictures = draw(run, judged)
+    for name, png in pictures.items():
+        write_atomically(folder / f'{name}.png', png)
+    html = report_html(run, figures, pictures)
+    write_atomically(folder / 'report.html', html.encode())
+
+
+def reflector_table(r: Reflectors) -> str:
+    """CSV of the reflector map, map frame."""
+    rows = [REFLECTOR_COLUMNS]
+    for k in range(len(r)):
+        c = r.cov[k]
+        diameter = f'{r.diameters[k]:.4f}' if np.isfinite(r.diameters[k]) else ''
+        rows.append(
+            f'{r.keys[k]},{r.ids[k]},{r.points[k, 0]:.6f},{r.points[k, 1]:.6f},'
+            f'{c[0, 0]:.6e},{c[0, 1]:.6e},{c[1, 1]:.6e},{r.sightings[k]},{diameter}'
+        )
+    return '\n'.join(rows) + '\n'
+
+
+def unknown_grid(trajectory: Trajectory) -> OccupancyGrid:
+    """A map without any knowledge, around the trajectory: what a run without scans has.
+
+    Cells of 5 cm, or larger ones where more than 2000 of them would lie side by side.
+    """
+    xy = trajectory.poses[:, :2] if len(trajectory) else np.zeros((1, 2))
+    low, high = np.floor(xy.min(axis=0) - 1.0), np.ceil(xy.max(axis=0) + 1.0)
+    resolution = max(0.05, float((high - low).max()) / 2000.0)
+    columns, rows = np.round((high - low) / resolution).astype(int)
+    cells = np.full((rows, columns), UNKNOWN, dtype=np.int8)
+    return OccupancyGrid(resolution, (float(low[0]), float(low[1])), cells)

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``rlml replay``: a bag through the system, without topics and the same from run to run."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rlml_slam import warm_up
+from rlml_slam.errors import BagError, InputError
+from rlml_slam.params import Parameters, from_mapping, read_yaml
+from rlml_slam.rlml.slam import Slam
+from rlml_slam.ros.bag import BagReader
+from rlml_slam.tools.bag_inputs import BagInputs, Input
+from rlml_slam.tools.outputs import write_outputs
+from rlml_slam.tools.progress import Progress
+from rlml_slam.tools.record import FrameLog, Run, Truth
+from rlml_slam.tools.summary import summary_text
+from rlml_slam.tools.tum import Trajectory, read_tum
+from rlml_slam.types import Detections, Frame, Imu, Odometry, Scan
+
+SYSTEMS: Mapping[str, Callable[[Parameters], Slam]] = {'rlml': Slam}
+SENSED = ('scan', 'reflectors', 'reflector_poses')
+
+
+def add_parser(subparsers: Any) -> None:
+    """Declare ``rlml replay``."""
+    parser = subparsers.add_parser(
+        'replay', help='run the system over a bag: no topics, deterministic'
+    )
+    parser.add_argument(
+        'bag', metavar='BAG', type=Path, help='rosbag2 folder (sqlite3, mcap) or ROS 1 .bag'
+    )
+    parser.add_argument('--out', metavar='DIR', type=Path, required=True, help='results go here')
+    parser.add_argument('--config', metavar='YAML', type=Path, help='ROS parameter file')
+    parser.add_argument(
+        '--system', choices=sorted(SYSTEMS), default='rlml', help='default: %(default)s'
+    )
+    parser.add_argument(
+        '--truth', metavar='TUM', type=Path, help='ground truth, aligned before it is compared'
+    )
+    parser.add_argument('--json', action='store_true', help='print metrics.json and no more')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Replay, write the results, and say what they are."""
+    params = from_mapping(read_yaml(args.config)) if args.config else Parameters()
+    truth = Truth(read_tum(args.truth), is_map=False) if args.truth else None
+    result = replay(args.bag, params, truth, args.system, quiet=args.json)
+    figures = write_outputs(result, args.out)
+    if args.json:
+        print(json.dumps(figures))
+    else:
+        print(summary_text(result.name, figures))
+        print(f'report: {args.out / "report.html"}')
+    if result.problem:
+        print(f'rlml: {result.problem}; the results hold what came before', file=sys.stderr)
+        return 1
+    return 0
+
+
+def replay(
+    path: str | Path,
+    params: Parameters,
+    truth: Truth | None = None,
+    system: str = 'rlml',
+    quiet: bool = True,
+) -> Run:
+    """Drive the system with a bag's messages in the order of the log.
+
+    ``truth`` replaces that of the bag. A damaged bag, or one whose clock jumps back, gives what
+    came before, and ``Run.problem`` says so. Raises BagError if there is nothing to use at all.
+    """
+    warm_up.compile_loaded()
+    with BagReader(path) as bag:
+        inputs = BagInputs(bag, params)
+        slam = SYSTEMS[system](params)
+        log, problem = FrameLog(), bag.damage
+        began = time.perf_counter()
+        try:
+            _drive(slam, inputs, log, (bag.start, bag.end), quiet)
+        except BagError as e:
+            problem = str(e)
+        except InputError as e:
+            problem = f'{path}: {e}'
+        log.add(slam.finish())
+        wall = time.perf_counter() - began
+        if not log.stamps:
+            why = problem or inputs.last_error or _why_empty(slam)
+            raise BagError(f'{path}: nothing in it could be used: {why}')
+        counts = fates(slam.counts, inputs.invalid, bag, inputs.topics)
+        name = Path(path).resolve().name
+        result = collect(slam, log, name, truth or inputs.truth())
+    result.inputs, result.wall_s, result.problem = counts, wall, problem
+    return result
+
+
+def _why_empty(slam: Slam) -> str:
+    return slam.sequencer.inputs.last_error or 'no scan and no reflectors'
+
+
+def _drive(
+    slam: Slam, inputs: BagInputs, log: FrameLog, span: tuple[int, int], quiet: bool
+) -> None:
+    """Feed all inputs; sensors are placed when they are first heard of."""
+    placed: set[str] = set()
+    began, start, end = time.perf_counter(), span[0], span[1]
+    with Progress('replay', (end - start) * 1e-9, quiet) as progress:
+        for k, (log_time, stream, value) in enumerate(inputs):
+            if stream in SENSED:
+                assert isinstance(value, Scan | Detections)
+                if value.frame_id not in placed:
+                    placed.add(value.frame_id)
+                    place_sensor(slam, value.frame_id, inputs.sensor_pose)
+            log.add(feed(slam, value))
+            if k % 200 == 0:
+                done = (log_time - start) * 1e-9
+                factor = done / max(time.perf_counter() - began, 1e-3)
+                progress.update(done, f'{factor:.0f} x real time')
+
+
+def place_sensor(
+    slam: Slam, frame_id: str, sensor_pose: Callable[[str], np.ndarray[Any, Any] | None]
+) -> None:
+    """Tell the system where a sensor sits, if that is known; else ``laser_pose`` holds."""
+    T_base_sensor = sensor_pose(frame_id)
+    if T_base_sensor is not None:
+        slam.set_sensor_pose(frame_id, T_base_sensor)
+
+
+def feed(slam: Slam, value: Input) -> list[Frame]:
+    """One input of whatever kind."""
+    if isinstance(value, Odometry):
+        return slam.add_odometry(value)
+    if isinstance(value, Imu):
+        return slam.add_imu(value)
+    if isinstance(value, Scan):
+        return slam.add_scan(value)
+    return slam.add_detections(value)
+
+
+def collect(slam: Slam, log: FrameLog, name: str, truth: Truth | None) -> Run:
+    """The products of a finished system."""
+    back_end = slam.back_end
+    indices = [key.index for key in back_end.keyframes]
+    poses = back_end.graph.poses
+    tried = back_end.scans.closures
+    ends = [poses[[c.i, c.j], :2] for c in tried if c.accepted]
+    stamps, optimized = slam.trajectory()
+    return Run(
+        name,
+        log,
+        Trajectory(stamps, optimized),
+        slam.reflectors(),
+        slam.occupancy_grid(),
+        np.array(poses[indices]).reshape(-1, 3),
+        np.array(ends).reshape(-1, 2, 2),
+        sum(not c.accepted for c in tried),
+        np.array([u.wall_ms for u in slam.updates]),
+        truth=truth,
+    )
+
+
+def fates(
+    counts: Mapping[str, Mapping[str, int]],
+    invalid: Mapping[str, int],
+    bag: BagReader,
+    topics: Mapping[str, str],
+) -> dict[str, dict[str, int]]:
+    """What became of the inputs of each stream: used, late, invalid, and whatever else occurred.
+
+    Messages that could not be converted or read count as invalid.
+    """
+    out: dict[str, dict[str, int]] = {}
+    for stream in _streams(topics, counts):
+        unread = bag.skipped.get(topics.get(stream, ''), 0)
+        fate = {'used': 0, 'late': 0, 'invalid': 0} | dict(counts.get(stream, {}))
+        fate['invalid'] += invalid.get(stream, 0) + unread
+        out[stream] = fate
+    return out
+
+
+def _streams(topics: Mapping[str, str], counts: Mapping[str, Any]) -> Iterable[str]:
+    return [*topics, *(s for s in counts if s not in topics)]
