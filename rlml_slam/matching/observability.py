@@ -60,19 +60,18 @@ def _accumulate(
                 sxx += dx * dx
                 sxy += dx * dy
                 syy += dy * dy
-        flat = False
-        nx = ny = noise = 0.0
-        if count >= 5:
-            sxx -= sx * sx / count
-            sxy -= sx * sy / count
-            syy -= sy * sy / count
-            mean, half = 0.5 * (sxx + syy), 0.5 * (sxx - syy)
-            root = math.sqrt(half * half + sxy * sxy)
-            along, across = mean + root, mean - root
-            flat = across < FLAT * along
-            angle = 0.5 * math.atan2(sxy, half)  # of the surface
-            nx, ny = -math.sin(angle), math.cos(angle)
-            noise = max(across, 0.0) / along / (count - 2)  # variance of that angle
+        if count < 5:
+            continue  # too lonely to tell a pole from a wall seen at a grazing angle
+        sxx -= sx * sx / count
+        sxy -= sx * sy / count
+        syy -= sy * sy / count
+        mean, half = 0.5 * (sxx + syy), 0.5 * (sxx - syy)
+        root = math.sqrt(half * half + sxy * sxy)
+        along, across = mean + root, mean - root
+        flat = across < FLAT * along
+        angle = 0.5 * math.atan2(sxy, half)  # of the surface
+        nx, ny = -math.sin(angle), math.cos(angle)
+        noise = max(across, 0.0) / along / (count - 2)  # variance of that angle
         for axis in range(2):
             if axis == 0 and flat:
                 ax, ay, weight = c * nx - s * ny, s * nx + c * ny, 1.0

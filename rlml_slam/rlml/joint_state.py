@@ -95,10 +95,10 @@ class JointState:
         """Add independent uncertainty (3, 3) to the pose."""
         self.P[:3, :3] += cov
 
-    def clone_pose(self, slot: int) -> None:
-        """Make anchor ``slot`` a copy of the pose, with all its correlations."""
+    def clone_pose(self, slot: int, turn: float) -> None:
+        """Make anchor ``slot`` the pose turned on the spot, with all its correlations."""
         a = ANCHORS[slot]
-        self.x[a : a + 3] = self.x[:3]
+        self.x[a : a + 3] = se2.compose(self.x[:3], (0.0, 0.0, turn))
         self.P[a : a + 3, :] = self.P[:3, :]
         self.P[:, a : a + 3] = self.P[:, :3]
 

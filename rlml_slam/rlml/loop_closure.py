@@ -20,9 +20,13 @@ from rlml_slam.matching.scan_match import match
 from rlml_slam.matching.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.keyframes import Keyframe
+from rlml_slam.rlml.submaps import GRID_TURN
 from rlml_slam.se2 import Array
 from rlml_slam.types import EdgeKind
 
+TURN = np.array([0.0, 0.0, GRID_TURN])
+TURN_ROTATION = np.eye(3)
+TURN_ROTATION[:2, :2] = se2.rotation(GRID_TURN)
 PYRAMIDS = 16  # search pyramids kept: each is several times as large as its submap
 
 
@@ -48,7 +52,7 @@ class Closure:
 
 @dataclass
 class _KeyMap:
-    """A submap of keyframes; its frame is that of keyframe ``anchor``."""
+    """A submap of keyframes; its frame is that of keyframe ``anchor``, turned by GRID_TURN."""
 
     anchor: Keyframe
     submap: Submap
@@ -91,7 +95,7 @@ class ScanGraph:
         """A scan edge from the submap's anchor, where the scan fits."""
         if not m.members:
             return
-        guess = se2.between(m.anchor.T_local, key.T_local)
+        guess = se2.between(se2.compose(m.anchor.T_local, TURN), key.T_local)
         prior = np.diag(1.0 / np.array(self._p.back_end.match_sigma) ** 2)
         p = self._p.scan_match
         found = match(m.submap, points, guess, prior, p, searched=False)
@@ -104,6 +108,8 @@ class ScanGraph:
         closure = kind is EdgeKind.CLOSURE
         # a direction that the scan leaves open still needs a regular covariance
         cov = np.linalg.inv(information + np.diag([1e-4, 1e-4, 1e-4]))
+        cov = TURN_ROTATION @ cov @ TURN_ROTATION.T
+        delta = se2.compose(TURN, delta)
         if closure:
             cov[[0, 1, 2], [0, 1, 2]] += self._p.loop_closure.floor2
         self.changed |= closure
@@ -120,7 +126,7 @@ class ScanGraph:
             self._active.append(_KeyMap(key, Submap(self._p.submap)))
         for m in self._active:
             # inside one submap the front end's path is smoother than the graph's
-            T = se2.between(m.anchor.T_local, key.T_local)
+            T = se2.between(se2.compose(m.anchor.T_local, TURN), key.T_local)
             assert key.points is not None
             assert key.origin is not None
             m.submap.insert(se2.transform(T, key.points), se2.transform(T, key.origin[None])[0])
@@ -131,13 +137,16 @@ class ScanGraph:
         pose: Array = self._graph.poses[key.index]
         return pose
 
+    def _grid(self, m: _KeyMap) -> Array:
+        return se2.compose(self._pose(m.anchor), TURN)
+
     def _close(self, key: Keyframe, points: Array) -> tuple[Closure, ...]:
         """Try the finished submaps near the keyframe, the nearest first."""
         p = self._p.loop_closure
         here = self._pose(key)[:2]
         near = []
         for k, m in enumerate(self._finished):
-            centre = se2.transform(self._pose(m.anchor), m.centre[None])[0]
+            centre = se2.transform(self._grid(m), m.centre[None])[0]
             distance = float(np.linalg.norm(centre - here))
             if distance < p.max_distance:
                 near.append((distance, k))
@@ -150,7 +159,7 @@ class ScanGraph:
 
     def _try(self, k: int, key: Keyframe, points: Array) -> Closure:
         p, m = self._p.loop_closure, self._finished[k]
-        guess = se2.between(self._pose(m.anchor), self._pose(key))
+        guess = se2.between(self._grid(m), self._pose(key))
         i, j = m.anchor.index, key.index
 
         def rejected(why: str, score: float = 0.0) -> Closure:

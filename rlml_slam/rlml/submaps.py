@@ -12,6 +12,10 @@ from rlml_slam.matching.submap import Submap
 from rlml_slam.rlml.joint_state import JointState
 from rlml_slam.se2 import Array
 
+# Walls run along and across the way that robots drive: a grid turned against them spreads its
+# rounding over a wall, where one along them would shift the whole wall by up to half a cell.
+GRID_TURN = 0.53
+
 
 class Submaps:
     """The front end's submaps; the anchor of submap k is slot k of the joint state."""
@@ -51,7 +55,7 @@ class Submaps:
         if not self._maps or (
             len(self._maps) == 1 and self._maps[0].insertions >= self._p.size // 2
         ):
-            state.clone_pose(len(self._maps))
+            state.clone_pose(len(self._maps), GRID_TURN)
             self._maps.append(Submap(self._p))
 
     def cells(self) -> int:
