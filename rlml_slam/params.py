@@ -474,6 +474,26 @@ class SimulatorParameters:
 
 
 @dataclass(frozen=True)
+class Player(Group):
+    """The bag that bag_player publishes, and how."""
+
+    bag: str = param('', 'rosbag2 folder (sqlite3 or mcap), .mcap, .db3 or ROS 1 .bag')
+    rate: float = param(1.0, 'seconds of the recording per second', '', 0.01, 1000.0)
+    clock_rate: float = param(100.0, 'rate of /clock in time of the recording', 'Hz', 1.0, 1e4)
+    wait_for_subscribers: int = param(
+        0, 'time begins when some topic has this many subscribers', '', 0, 100
+    )
+    start_delay: float = param(1.0, 'pause before time begins, for discovery', 's', 0.0, 600.0)
+
+
+@dataclass(frozen=True)
+class PlayerParameters:
+    """Parameters of bag_player."""
+
+    node: Player = Player()
+
+
+@dataclass(frozen=True)
 class Declaration:
     """One parameter as the outside world sees it; ``name`` is its ROS name."""
 

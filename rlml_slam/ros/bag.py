@@ -16,7 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
-from rosbags.interfaces import MessageDefinitionFormat, Qos
+from rosbags.interfaces import ConnectionExtRosbag1, MessageDefinitionFormat, Nodetype, Qos
 from rosbags.interfaces import QosDurability as Durability
 from rosbags.interfaces import QosHistory as History
 from rosbags.interfaces import QosLiveliness as Liveliness
@@ -55,6 +55,7 @@ class BagReader:
         self.skipped: Counter[str] = Counter()
         self.damage = ''
         self._types: dict[str, Any] = {}
+        self._todays: dict[str, bool] = {}
         if not self.path.exists():
             raise BagError(f'{path}: no such bag')
         self.is_ros1 = self.path.suffix == '.bag'
@@ -85,6 +86,19 @@ class BagReader:
         """Number of messages of the topics (all if None), as the bag's index says."""
         return sum(t.count for t in self.topics.values() if topics is None or t.name in topics)
 
+    def is_latched(self, topic: str) -> bool:
+        """Whether late subscribers got the topic's last message as well."""
+        if topic.endswith('tf_static'):
+            return True
+        for c in self._reader.connections:
+            if c.topic != topic:
+                continue
+            if isinstance(c.ext, ConnectionExtRosbag1):
+                return bool(c.ext.latching)
+            offered = c.ext.offered_qos_profiles
+            return any(q.durability == Durability.TRANSIENT_LOCAL for q in offered)
+        return False
+
     def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[int, str, Any]]:
         """Yield (log time [ns], topic, message) in log time order.
 
@@ -106,16 +120,36 @@ class BagReader:
     def serialized(
         self, topics: Collection[str] | None = None
     ) -> Iterator[tuple[int, str, bytes]]:
-        """Like ``messages``, but CDR bytes that rclpy publishes as they are."""
+        """Like ``messages``, but as bytes that ROS 2 publishes as they are.
+
+        Types whose fields are others than Jazzy's are skipped.
+        """
         for time, connection, raw in self._raw(topics):
-            if not self.is_ros1:
-                yield time, connection.topic, bytes(raw)
+            topic, msgtype = connection.topic, connection.msgtype
+            if not self._is_todays(connection):
+                self.skipped[topic] += 1
                 continue
-            types = self._typestore(connection)
+            if not self.is_ros1:
+                yield time, topic, bytes(raw)
+                continue
             try:
-                yield time, connection.topic, bytes(types.ros1_to_cdr(raw, connection.msgtype))
-            except Exception:
-                self.skipped[connection.topic] += 1
+                data = bytes(bag_types().ros1_to_cdr(raw, msgtype))
+            except Exception:  # a broken payload, as in messages
+                self.skipped[topic] += 1
+                continue
+            yield time, topic, data
+
+    def _is_todays(self, connection: Any) -> bool:
+        """Whether the type in the bag has the fields of today's; a type of others is believed."""
+        msgtype = connection.msgtype
+        if msgtype not in self._todays:
+            types, today = self._typestore(connection), bag_types()
+            if msgtype in today.fielddefs:
+                same = types is not None and _layout(types, msgtype) == _layout(today, msgtype)
+            else:
+                same = not self.is_ros1
+            self._todays[msgtype] = same
+        return self._todays[msgtype]
 
     def _raw(self, topics: Collection[str] | None) -> Iterator[tuple[int, Any, bytes]]:
         wanted = [c for c in self._reader.connections if topics is None or c.topic in topics]
@@ -151,6 +185,20 @@ class BagReader:
         except Exception:
             return None
         return types
+
+
+def _layout(types: Any, msgtype: str) -> Any:
+    """The fields of a type, with those of its parts in place of their names."""
+    if msgtype == 'std_msgs/msg/Header':  # that of ROS 1 has a counter, which is left out
+        return msgtype
+
+    def part(description: Any) -> Any:
+        kind, what = description
+        if kind == Nodetype.NAME:
+            return _layout(types, what)
+        return (kind, what) if kind == Nodetype.BASE else (kind, part(what[0]), what[1])
+
+    return [(name, part(description)) for name, description in types.fielddefs[msgtype][1]]
 
 
 def _line(error: Exception) -> str:

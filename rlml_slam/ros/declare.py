@@ -18,12 +18,13 @@ from rclpy.parameter import Parameter
 from rlml_slam.params import (
     Declaration,
     Parameters,
+    PlayerParameters,
     SimulatorParameters,
     declarations,
     from_mapping,
 )
 
-AGGREGATES: tuple[type[Any], ...] = (Parameters, SimulatorParameters)
+AGGREGATES: tuple[type[Any], ...] = (Parameters, SimulatorParameters, PlayerParameters)
 # rclpy's own, which it takes from the same overrides
 _OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 
