@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag as the inputs of the system: chosen topics, core types, the sensors' places, the truth."""
+"""A bag as the inputs of the system: chosen topics, the sensors' places, the ground truth."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterator
-from typing import Any, TypeAlias
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -18,18 +17,17 @@ from rlml_slam.ros.tf import Extrinsics
 from rlml_slam.se2 import Array
 from rlml_slam.tools.record import Truth
 from rlml_slam.tools.tum import Trajectory
-from rlml_slam.types import Detections, Imu, Odometry, Scan
+from rlml_slam.types import Detections
 
-Input: TypeAlias = Odometry | Imu | Scan | Detections
 TRUTH = 'ground_truth'
 _TF_SAMPLE = 500  # messages of /tf that are searched for a sensor that /tf_static does not place
 
 
 class BagInputs:
-    """Iterate for (log time [ns], stream, input) in log order.
+    """Iterate for (log time [ns], stream of ros/feed.py, message) in log order.
 
-    What cannot be believed is counted in ``invalid`` by stream and left out; ``last_error`` says
-    why the last one was. Truth on the way is collected for :meth:`truth`.
+    ``extrinsics`` knows the static transforms of the whole bag from the beginning. Truth on the
+    way is collected for :meth:`truth`; ``refused`` counts what of it cannot be believed.
     """
 
     def __init__(self, bag: BagReader, params: Parameters) -> None:
@@ -37,21 +35,16 @@ class BagInputs:
         self._p = params
         self.topics = choose_topics(bag.topics, params.node)
         self.extrinsics = Extrinsics()
-        self.invalid: Counter[str] = Counter()
-        self.last_error = ''
+        self.refused = 0
         self._true: list[tuple[int, Array]] = []
         self._true_frame = ''
         self._true_reflectors: Detections | None = None
         self._truth_topic = _named(bag, TRUTH)
-        self._up: dict[str, Array | None] = {}
+        self._reflectors_topic = _named(bag, TRUE_REFLECTORS)
         self._read_tf()
 
-    def sensor_pose(self, frame: str) -> Array | None:
-        """T_base_sensor (3,), None where the bag does not tell."""
-        return self.extrinsics.pose(self._p.node.base_frame, frame)
-
     def _read_tf(self) -> None:
-        """Static transforms wherever they are in the bag; else those that /tf begins with."""
+        """Static transforms wherever they are in the bag, and those that /tf begins with."""
         for topic in ('/tf', '/tf_static'):
             if topic not in self._bag.topics:
                 continue
@@ -66,40 +59,24 @@ class BagInputs:
     def _add_transforms(self, topic: str, message: Any) -> None:
         try:
             self.extrinsics.add(convert.transforms(message, topic))
-        except InputError as e:
-            self.last_error = str(e)
+        except InputError:
+            self.refused += 1
 
-    def __iter__(self) -> Iterator[tuple[int, str, Input]]:
+    def __iter__(self) -> Iterator[tuple[int, str, Any]]:
         stream_of = {topic: stream for stream, topic in self.topics.items()}
-        others = [t for t in (self._truth_topic, _named(self._bag, TRUE_REFLECTORS)) if t]
+        others = [t for t in (self._truth_topic, self._reflectors_topic) if t is not None]
         for time, topic, message in self._bag.messages([*stream_of, *others]):
-            stream = stream_of.get(topic, TRUTH)
+            if topic in stream_of:
+                yield time, stream_of[topic], message
+                continue
             try:
-                if stream == TRUTH:
-                    self._add_truth(topic, message)
-                else:
-                    yield time, stream, self._convert(stream, topic, message)
-            except InputError as e:
-                self.invalid[stream] += 1
-                self.last_error = str(e)
-
-    def _convert(self, stream: str, topic: str, message: Any) -> Input:
-        if stream == 'imu':
-            frame = convert.frame(message.header.frame_id)
-            if frame not in self._up:
-                self._up[frame] = self.extrinsics.up(self._p.node.base_frame, frame)
-            return convert.imu(message, topic, self._up[frame])
-        if stream == 'reflectors':
-            return convert.detections(message, self._p.reflector, topic)
-        if stream == 'reflector_poses':
-            return convert.detections_of_poses(message, self._p.reflector, topic)
-        of: Callable[[Any, str], Input] = convert.scan if stream == 'scan' else convert.odometry
-        return of(message, topic)
+                self._add_truth(topic, message)
+            except InputError:
+                self.refused += 1
 
     def _add_truth(self, topic: str, message: Any) -> None:
-        if topic != self._truth_topic:
-            seen = convert.detections(message, self._p.reflector, topic)
-            self._true_reflectors = seen
+        if topic == self._reflectors_topic:
+            self._true_reflectors = convert.detections(message, self._p.reflector, topic)
             return
         pose = _true_pose(message, topic)
         if pose is not None:

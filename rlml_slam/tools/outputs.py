@@ -4,19 +4,18 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rlml_slam.errors import MapError
+from rlml_slam.maps import reflector_file
 from rlml_slam.maps.occupancy import UNKNOWN, OccupancyGrid, save, write_atomically
 from rlml_slam.tools.metrics import judge, metrics
 from rlml_slam.tools.record import Run
 from rlml_slam.tools.tum import Trajectory, write_tum
-from rlml_slam.types import Reflectors
-
-REFLECTOR_COLUMNS = 'key,id,x_m,y_m,cov_xx_m2,cov_xy_m2,cov_yy_m2,sightings,diameter_m'
 
 
 def write_outputs(run: Run, folder: str | Path) -> dict[str, Any]:
@@ -25,20 +24,28 @@ def write_outputs(run: Run, folder: str | Path) -> dict[str, Any]:
     trajectory.tum, front_end.tum, map.pgm, map.yaml and reflectors.csv depend on the data alone:
     two replays give the same bytes. Raises MapError if the folder cannot be written.
     """
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as e:
-        raise MapError(f'{folder}: cannot be made: {e.strerror}') from e
+    folder = make_folder(folder)
     write_tum(folder / 'trajectory.tum', run.trajectory)
     write_tum(folder / 'front_end.tum', run.frames.trajectory())
     save(run.grid if run.grid is not None else unknown_grid(run.trajectory), folder / 'map')
-    write_atomically(folder / 'reflectors.csv', reflector_table(run.reflectors).encode())
+    reflector_file.save(run.reflectors, folder / 'reflectors.csv')
     judged = judge(run)
     figures = metrics(run, judged)
     write_atomically(folder / 'metrics.json', (json.dumps(figures, indent=2) + '\n').encode())
     write_report(run, judged, figures, folder)
     return figures
+
+
+def make_folder(folder: str | Path) -> Path:
+    """The folder, made if need be; MapError if nothing can be written there."""
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise MapError(f'{folder}: cannot be made: {e.strerror}') from e
+    if not os.access(folder, os.W_OK):
+        raise MapError(f'{folder}: cannot be written')
+    return folder
 
 
 def write_report(run: Run, judged: Any, figures: dict[str, Any], folder: Path) -> None:
@@ -52,19 +59,6 @@ def write_report(run: Run, judged: Any, figures: dict[str, Any], folder: Path) -
         write_atomically(folder / f'{name}.png', png)
     html = report_html(run, figures, pictures)
     write_atomically(folder / 'report.html', html.encode())
-
-
-def reflector_table(r: Reflectors) -> str:
-    """CSV of the reflector map, map frame."""
-    rows = [REFLECTOR_COLUMNS]
-    for k in range(len(r)):
-        c = r.cov[k]
-        diameter = f'{r.diameters[k]:.4f}' if np.isfinite(r.diameters[k]) else ''
-        rows.append(
-            f'{r.keys[k]},{r.ids[k]},{r.points[k, 0]:.6f},{r.points[k, 1]:.6f},'
-            f'{c[0, 0]:.6e},{c[0, 1]:.6e},{c[1, 1]:.6e},{r.sightings[k]},{diameter}'
-        )
-    return '\n'.join(rows) + '\n'
 
 
 def unknown_grid(trajectory: Trajectory) -> OccupancyGrid:

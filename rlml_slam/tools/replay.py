@@ -7,7 +7,8 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +19,15 @@ from rlml_slam.errors import BagError, InputError
 from rlml_slam.params import Parameters, from_mapping, read_yaml
 from rlml_slam.rlml.slam import Slam
 from rlml_slam.ros.bag import BagReader
-from rlml_slam.tools.bag_inputs import BagInputs, Input
-from rlml_slam.tools.outputs import write_outputs
+from rlml_slam.ros.feed import Feed
+from rlml_slam.tools.bag_inputs import BagInputs
+from rlml_slam.tools.outputs import make_folder, write_outputs
 from rlml_slam.tools.progress import Progress
 from rlml_slam.tools.record import FrameLog, Run, Truth
 from rlml_slam.tools.summary import summary_text
 from rlml_slam.tools.tum import Trajectory, read_tum
-from rlml_slam.types import Detections, Frame, Imu, Odometry, Scan
 
 SYSTEMS: Mapping[str, Callable[[Parameters], Slam]] = {'rlml': Slam}
-SENSED = ('scan', 'reflectors', 'reflector_poses')
 
 
 def add_parser(subparsers: Any) -> None:
@@ -52,6 +52,7 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Replay, write the results, and say what they are."""
     params = from_mapping(read_yaml(args.config)) if args.config else Parameters()
+    make_folder(args.out)  # before the work, not after it
     truth = Truth(read_tum(args.truth), is_map=False) if args.truth else None
     result = replay(args.bag, params, truth, args.system, quiet=args.json)
     figures = write_outputs(result, args.out)
@@ -82,68 +83,45 @@ def replay(
     with BagReader(path) as bag:
         inputs = BagInputs(bag, params)
         slam = SYSTEMS[system](params)
-        log, problem = FrameLog(), bag.damage
+        log, problem = FrameLog(), ''
         began = time.perf_counter()
         try:
-            _drive(slam, inputs, log, (bag.start, bag.end), quiet)
+            _drive(slam, params, inputs, log, (bag.start, bag.end), quiet)
         except BagError as e:
             problem = str(e)
         except InputError as e:
             problem = f'{path}: {e}'
         log.add(slam.finish())
         wall = time.perf_counter() - began
+        problem = problem or bag.damage
         if not log.stamps:
-            why = problem or inputs.last_error or _why_empty(slam)
+            why = problem or slam.sequencer.inputs.last_error or 'no scan and no reflectors'
             raise BagError(f'{path}: nothing in it could be used: {why}')
-        counts = fates(slam.counts, inputs.invalid, bag, inputs.topics)
-        name = Path(path).resolve().name
-        result = collect(slam, log, name, truth or inputs.truth())
-    result.inputs, result.wall_s, result.problem = counts, wall, problem
+        result = collect(slam, log, Path(path).resolve().name, truth or inputs.truth())
+        result.inputs = fates(slam.counts, bag.skipped, inputs.topics)
+    result.wall_s, result.problem = wall, problem
     return result
 
 
-def _why_empty(slam: Slam) -> str:
-    return slam.sequencer.inputs.last_error or 'no scan and no reflectors'
-
-
 def _drive(
-    slam: Slam, inputs: BagInputs, log: FrameLog, span: tuple[int, int], quiet: bool
+    slam: Slam,
+    params: Parameters,
+    inputs: BagInputs,
+    log: FrameLog,
+    span: tuple[int, int],
+    quiet: bool,
 ) -> None:
-    """Feed all inputs; sensors are placed when they are first heard of."""
-    placed: set[str] = set()
-    began, start, end = time.perf_counter(), span[0], span[1]
+    """Feed all inputs, the same way as the live nodes do."""
+    feed = Feed(params, slam, slam.sequencer.inputs)
+    feed.extrinsics = inputs.extrinsics
+    began, (start, end) = time.perf_counter(), span
     with Progress('replay', (end - start) * 1e-9, quiet) as progress:
-        for k, (log_time, stream, value) in enumerate(inputs):
-            if stream in SENSED:
-                assert isinstance(value, Scan | Detections)
-                if value.frame_id not in placed:
-                    placed.add(value.frame_id)
-                    place_sensor(slam, value.frame_id, inputs.sensor_pose)
-            log.add(feed(slam, value))
+        for k, (log_time, stream, message) in enumerate(inputs):
+            log.add(feed.add(stream, message))
             if k % 200 == 0:
                 done = (log_time - start) * 1e-9
                 factor = done / max(time.perf_counter() - began, 1e-3)
                 progress.update(done, f'{factor:.0f} x real time')
-
-
-def place_sensor(
-    slam: Slam, frame_id: str, sensor_pose: Callable[[str], np.ndarray[Any, Any] | None]
-) -> None:
-    """Tell the system where a sensor sits, if that is known; else ``laser_pose`` holds."""
-    T_base_sensor = sensor_pose(frame_id)
-    if T_base_sensor is not None:
-        slam.set_sensor_pose(frame_id, T_base_sensor)
-
-
-def feed(slam: Slam, value: Input) -> list[Frame]:
-    """One input of whatever kind."""
-    if isinstance(value, Odometry):
-        return slam.add_odometry(value)
-    if isinstance(value, Imu):
-        return slam.add_imu(value)
-    if isinstance(value, Scan):
-        return slam.add_scan(value)
-    return slam.add_detections(value)
 
 
 def collect(slam: Slam, log: FrameLog, name: str, truth: Truth | None) -> Run:
@@ -170,22 +148,23 @@ def collect(slam: Slam, log: FrameLog, name: str, truth: Truth | None) -> Run:
 
 def fates(
     counts: Mapping[str, Mapping[str, int]],
-    invalid: Mapping[str, int],
-    bag: BagReader,
+    skipped: Mapping[str, int],
     topics: Mapping[str, str],
 ) -> dict[str, dict[str, int]]:
     """What became of the inputs of each stream: used, late, invalid, and whatever else occurred.
 
-    Messages that could not be converted or read count as invalid.
+    ``skipped`` messages, by topic, could not even be read, and count as invalid.
     """
+    unread: Counter[str] = Counter()
+    for stream, topic in topics.items():
+        unread[_counted_as(stream)] += skipped.get(topic, 0)
     out: dict[str, dict[str, int]] = {}
-    for stream in _streams(topics, counts):
-        unread = bag.skipped.get(topics.get(stream, ''), 0)
+    for stream in dict.fromkeys([*map(_counted_as, topics), *counts]):
         fate = {'used': 0, 'late': 0, 'invalid': 0} | dict(counts.get(stream, {}))
-        fate['invalid'] += invalid.get(stream, 0) + unread
+        fate['invalid'] += unread[stream]
         out[stream] = fate
     return out
 
 
-def _streams(topics: Mapping[str, str], counts: Mapping[str, Any]) -> Iterable[str]:
-    return [*topics, *(s for s in counts if s not in topics)]
+def _counted_as(stream: str) -> str:
+    return 'reflectors' if stream == 'reflector_poses' else stream
