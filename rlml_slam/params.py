@@ -214,6 +214,11 @@ class Submap(Group):
     max_laser_range: float = param(30.0, 'beams longer than this are not used', 'm', 0.5, 300.0)
     p_hit: float = param(0.65, 'occupancy probability that one hit adds', '', 0.5, 0.99)
     p_miss: float = param(0.49, 'occupancy probability that one miss leaves', '', 0.01, 0.5)
+    bias2: tuple[float, ...] = param(
+        (1e-4, 1e-4, 2.25e-6),
+        "variance of a submap's own error, common to its scans",
+        'm², m², rad²',
+    )
     size: int = param(90, 'insertions that complete a submap', '', 2, 10000)
     min_travel: float = param(0.1, 'travel between two insertions', 'm', 0.0, 10.0)
     min_turn: float = param(0.08, 'turn between two insertions', 'rad', 0.0, 3.2)
@@ -242,6 +247,10 @@ class ScanMatch(Group):
     )
     search_window: float = param(0.1, 'half width of the search', 'm', 0.0, 10.0)
     search_angle: float = param(0.35, 'half width of the search', 'rad', 0.0, 3.2)
+    search_share: float = param(
+        0.05, 'share of the hits that a component far from the prior costs in the search', '',
+        0.0, 1.0,
+    )  # fmt: skip
     max_iterations: int = param(20, 'Gauss-Newton iterations at most', '', 1, 200)
     prior_scale: float = param(
         3.0,
@@ -333,6 +342,32 @@ class Solver(Group):
         'computes one only where the estimate fits badly',
         choices=('none', 'auto', 'odometry', 'spanning_tree', 'chordal'),
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Deformable(Group):
+    """The sliding window over the robot and the features of a moving, deforming carrier."""
+
+    window: int = param(15, 'steps that are estimated together; older ones are marginalised', '',
+                        2, 200)  # fmt: skip
+    drift: float = param(
+        0.05, "random walk of each feature against the carrier's nominal motion", 'm/sqrt(s)',
+        1e-4, 10.0,
+    )  # fmt: skip
+    common_drift: float = param(
+        0.05, 'random walk of the whole carrier against its nominal motion', 'm/sqrt(s)', 0.0, 10.0
+    )
+    forget_after: float = param(5.0, 'a feature not seen for this long is dropped', 's', 0.1, 1e4)
+    candidate_timeout: float = param(
+        1.0, 'a feature with few sightings is dropped sooner', 's', 0.05, 1e4
+    )
+    start_sigma: tuple[float, ...] = param(
+        (1e-3, 1e-3, 1e-4), 'uncertainty of the first pose', 'm, m, rad'
+    )
+    max_iterations: int = param(5, 'Gauss-Newton iterations per update at most', '', 1, 100)
+    tolerance: float = param(
+        1e-4, 'iterations stop when no state moves by more than this', 'm or rad', 1e-12, 1.0
+    )
 
 
 @dataclass(frozen=True)

@@ -140,7 +140,7 @@ class Frame:
     (never corrected backwards), ``T_map_base`` and ``cov_map`` in the map frame with the newest
     correction of the back end. Covariances are of (x, y, theta) in the axes of their frame.
     ``landmarks`` (n,) int64: the front end's key of each detection's reflector, -1 where it has
-    none; ``statuses`` (n,) of Status.
+    none; ``statuses`` (n,) of Status. ``scan_used``: the scan fitted and moved the estimate.
     """
 
     stamp: int
@@ -153,6 +153,7 @@ class Frame:
     statuses: NDArray[np.int64]
     health: Health = field(default_factory=Health)
     scan_score: float = float('nan')
+    scan_used: bool = False
     chi2: float = 0.0
     iterations: int = 0
     wall_ms: float = 0.0

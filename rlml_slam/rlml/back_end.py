@@ -132,9 +132,11 @@ class BackEnd:
             self.graph.add_edge(
                 EdgeKind.ODOMETRY, index - 1, index, delta, relative_information(delta, cov)
             )
+        # a scan that the front end could not place has no place in the map either
+        placed = frame.scan_used or not self.keyframes
         key = Keyframe(
-            index, frame.stamp, frame.T_local_base, frame.cov_local, o.points, o.origin, since,
-            scanned,
+            index, frame.stamp, frame.T_local_base, frame.cov_local,
+            o.points if placed else None, o.origin if placed else None, since, scanned,
         )  # fmt: skip
         self.keyframes.append(key)
         self._interval = Interval(frame.T_local_base)

@@ -50,6 +50,7 @@ class FrontEnd:
         self._velocity = np.zeros(3)
         self._velocity_known = False
         self._has_odometry = False
+        self._last_fit = 0
         self._last_stamp: int | None = None
 
     def use_map(self, reflectors: Reflectors) -> None:
@@ -74,7 +75,7 @@ class FrontEnd:
         evidence = self._use_scan(observation)
         self._use_reflectors(observation, matched)
         self._map_reflectors(observation, matched)
-        self._map_scan(observation)
+        self._map_scan(observation, evidence)
         self._remember_velocity(before, observation.stamp)
         health = self._judge(observation, matched, evidence)
         return self._frame(observation, matched, evidence, health, began)
@@ -233,11 +234,19 @@ class FrontEnd:
             iterations=found.iterations,
         )
 
-    def _map_scan(self, observation: Observation) -> None:
-        """Insert the scan into the submaps; a submap that is begun clones the pose."""
+    def _map_scan(self, observation: Observation, evidence: Evidence) -> None:
+        """Insert the scan into the submaps; a submap that is begun clones the pose.
+
+        A single scan that does not fit is more likely a bad scan (a wrong stamp) than a new
+        place, and would mislead all that follow; only where none fits for a while, it is new.
+        """
         if observation.points is None or observation.origin is None:
             return
         if len(observation.points) < self._p.scan_match.min_points:
+            return
+        if evidence.used or self.submaps.target is None:
+            self._last_fit = observation.stamp
+        elif observation.stamp - self._last_fit < self._p.health.patience * 1e9:
             return
         self.submaps.insert(self.state, observation.points, observation.origin)
 
@@ -276,6 +285,7 @@ class FrontEnd:
             statuses=matched.status,
             health=health,
             scan_score=evidence.score,
+            scan_used=evidence.used,
             chi2=float(np.nansum(matched.distance2[used])),
             iterations=evidence.iterations,
             wall_ms=(time.perf_counter() - began) * 1e3,

@@ -95,12 +95,17 @@ class JointState:
         """Add independent uncertainty (3, 3) to the pose."""
         self.P[:3, :3] += cov
 
-    def clone_pose(self, slot: int, turn: float) -> None:
-        """Make anchor ``slot`` the pose turned on the spot, with all its correlations."""
+    def clone_pose(self, slot: int, turn: float, cov: Array) -> None:
+        """Make anchor ``slot`` the pose turned on the spot, with all its correlations.
+
+        ``cov`` (3, 3) is added: the part of a submap's error that is the same for all scans that
+        are matched against it, and so does not average out over them.
+        """
         a = ANCHORS[slot]
         self.x[a : a + 3] = se2.compose(self.x[:3], (0.0, 0.0, turn))
         self.P[a : a + 3, :] = self.P[:3, :]
         self.P[:, a : a + 3] = self.P[:, :3]
+        self.P[a : a + 3, a : a + 3] += cov
 
     def move_anchor(self, source: int, target: int) -> None:
         """Let slot ``target`` take over the anchor in slot ``source``."""
