@@ -61,6 +61,11 @@ class Sensors:
         self._feed = Feed(self._p, self.sequencer, self.sequencer.inputs)
         self._feed.extrinsics = extrinsics
 
+    @property
+    def extrinsics(self) -> Extrinsics:
+        """Where the sensors sit, as far as /tf_static has told."""
+        return self._feed.extrinsics
+
     def add(self, stream: str, msg: Any) -> None:
         """One message of a stream."""
         if stream not in PLACED or not self._waits:
@@ -71,11 +76,19 @@ class Sensors:
         if unknown and _stamp(msg) - _stamp(self._held[0][1]) <= TF_PATIENCE:
             return
         if unknown:
-            self._waits = False
             self._logger.warning(
                 f'no transform from {self._p.node.base_frame} to {", ".join(sorted(unknown))} '
                 f'on /tf_static: the parameter laser_pose is used'
             )
+            self.stop_waiting()
+        self._release()
+
+    def stop_waiting(self) -> None:
+        """Do without what /tf_static has not told yet."""
+        self._waits = False
+        self._release()
+
+    def _release(self) -> None:
         held, self._held = self._held, []
         for item in held:
             self._use(*item)
@@ -98,7 +111,7 @@ class Sensors:
             observations = add()
         except InputError as e:
             self._logger.warning(f'{e}: everything begins anew')
-            self._begin(self._feed.extrinsics)
+            self._begin(self.extrinsics)
             self._restart()
             return
         for observation in observations:

@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Node tests run where ROS 2 is installed, in a domain of their own on this machine."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import pytest
+
+if importlib.util.find_spec('rclpy') is None:
+    collect_ignore_glob = ['test_*.py']
+
+
+@pytest.fixture
+def live(monkeypatch):
+    """A ROS context that hears nothing but the test."""
+    from live import Live
+
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    context = Live()
+    yield context
+    context.close()

@@ -1,0 +1,284 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The front end node: what it hears, what it says, and what it does with bad input."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+from live import LATCHED, room
+
+from rlml_slam.errors import ParameterError
+from rlml_slam.nodes.front_end import FrontEndNode
+from rlml_slam.ros import build, convert
+from rlml_slam.ros.associated import read_associated
+from rlml_slam.ros.messages import make_rclpy as make
+from rlml_slam.ros.messages import rclpy_class
+from rlml_slam.types import Status
+
+SECOND = 1_000_000_000
+
+
+def feed(node, seconds, change=lambda stream, msg: msg):
+    """Give the sample bag to the node; ``change`` may alter or drop (None) a message."""
+    sent = []
+    for stream, msg in room(seconds=seconds):
+        changed = change(stream, msg)
+        if changed is not None:
+            node.sensors.add(stream, changed)
+            sent.append((stream, changed))
+    return sent
+
+
+def stamps(sent, stream):
+    return [convert.stamp(m, stream) for s, m in sent if s == stream]
+
+
+@pytest.fixture
+def node(live):
+    for topic, kind in (
+        ('pose', 'geometry_msgs/msg/PoseWithCovarianceStamped'),
+        ('odometry/filtered', 'nav_msgs/msg/Odometry'),
+        ('reflectors/associated', 'sensor_msgs/msg/PointCloud2'),
+        ('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray'),
+    ):
+        live.listen(topic, kind)
+    node = live.start(FrontEndNode)
+    node.sensors.stop_waiting()
+    live.spin_until(lambda: node.count_subscribers('pose') == 1)
+    return node
+
+
+def used(node, stream, what='used'):
+    return node.sensors.sequencer.inputs.totals().get(stream, {}).get(what, 0)
+
+
+def test_each_scan_gets_a_pose_with_its_own_stamp(live, node):
+    sent = feed(node, 3.0)
+    live.drain()
+    got = [convert.stamp(m, '') for m in live.heard['pose']]
+    want = stamps(sent, 'scan')
+    assert got == want[: len(got)]
+    # the last scan may still wait for odometry
+    assert len(want) - 1 <= len(got) <= len(want)
+    assert [convert.stamp(m, '') for m in live.heard['odometry/filtered']] == got
+
+
+def test_local_pose_moves_on_without_jumps_and_with_its_twist(live, node):
+    feed(node, 6.0)
+    live.drain()
+    local = live.heard['odometry/filtered']
+    assert {m.header.frame_id for m in local} == {'rlml_local'}
+    assert {m.child_frame_id for m in local} == {'base_link'}
+    poses = np.array([convert.planar_pose(m.pose.pose, '') for m in local])
+    steps = np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1)
+    speeds = np.array([np.hypot(m.twist.twist.linear.x, m.twist.twist.linear.y) for m in local])
+    # 10 Hz scans; an arc is longer than its chord by less than 1 % at these turn rates
+    np.testing.assert_allclose(speeds[1:] * 0.1, steps, rtol=0.01, atol=1e-6)
+    assert steps.max() < 0.15
+
+
+def test_detections_are_told_what_became_of_them(live, node):
+    feed(node, 3.0)
+    live.drain()
+    last = read_associated(live.heard['reflectors/associated'][-1])
+    assert last.detections.frame_id == 'base_link'
+    assert (last.statuses == Status.USED).sum() >= 2
+    assert (last.landmarks[last.statuses == Status.USED] >= 0).all()
+
+
+def test_correction_moves_the_map_pose_only(live, node):
+    feed(node, 2.0)
+    correction = np.array([1.0, -2.0, 0.5])
+    node.correct(build.pose_with_covariance(make, SECOND, 'map', correction, np.eye(3)))
+    frame = node.front_end.process(node._last.observation)
+    from rlml_slam import se2
+
+    np.testing.assert_allclose(
+        frame.T_map_base, se2.compose(correction, frame.T_local_base), atol=1e-12
+    )
+
+
+def test_initialpose_begins_anew_there(live, node):
+    feed(node, 2.0)
+    start = np.array([5.0, 6.0, 1.0])
+    node.start_at(build.pose_with_covariance(make, SECOND, 'map', start, 0.01 * np.eye(3)))
+    np.testing.assert_allclose(node.front_end.state.pose, start)
+
+
+def test_diagnostics_tell_health_and_inputs(live, node):
+    feed(node, 3.0)
+    live.drain()
+    node.health.publish()
+    live.spin_until(lambda: live.heard['/diagnostics'])
+    status = live.heard['/diagnostics'][-1].status[0]
+    assert status.name == 'front_end'
+    assert status.level == bytes([0])
+    assert {v.key: v.value for v in status.values}['scan used'] == str(used(node, 'scan'))
+
+
+def test_silence_is_told(live, node):
+    node.health.publish()
+    live.spin_until(lambda: live.heard['/diagnostics'])
+    assert 'no input yet' in live.heard['/diagnostics'][0].status[0].message
+
+
+# --- bad input ------------------------------------------------------------------------------
+
+
+def test_ranges_that_are_no_ranges_cost_only_themselves(live, node):
+    bad = np.array([np.nan, np.inf, -np.inf, -1.0, 0.0, 1e30], dtype=np.float32)
+
+    def spoil(stream, msg):
+        if stream == 'scan':
+            ranges = np.array(msg.ranges)
+            ranges[::7] = np.resize(bad, len(ranges[::7]))
+            msg.ranges = ranges.tolist()
+        return msg
+
+    sent = feed(node, 3.0, spoil)
+    assert used(node, 'scan') >= len(stamps(sent, 'scan')) - 1
+    assert np.isfinite(node._last.T_local_base).all()
+    assert node._last.health.reasons == ()
+
+
+def test_empty_scan_is_counted_and_the_next_is_used(live, node):
+    seen = []
+
+    def spoil(stream, msg):
+        if stream == 'scan':
+            seen.append(msg)
+            if len(seen) == 5:
+                msg.ranges, msg.intensities = [], []
+        return msg
+
+    sent = feed(node, 3.0, spoil)
+    assert used(node, 'scan', 'invalid') == 1
+    # the detections of that instant still give a pose
+    assert len(live_frames(live)) >= len(stamps(sent, 'scan')) - 1
+
+
+def live_frames(live):
+    live.drain()
+    return live.heard['pose']
+
+
+def test_wrong_frame_is_counted_and_named(live, node):
+    def spoil(stream, msg):
+        if stream == 'scan' and convert.stamp(msg, '') > 3 * SECOND:
+            msg.header.frame_id = 'camera'
+        return msg
+
+    feed(node, 3.0, spoil)
+    assert used(node, 'scan', 'invalid') > 5
+    assert "scan in frame 'camera'" in node.sensors.sequencer.inputs.last_error
+
+
+def test_missing_odometry_does_not_stop_the_poses(live, node):
+    sent = feed(node, 4.0, lambda stream, msg: None if stream == 'odom' else msg)
+    # the first second is the wait for odometry that may come
+    assert len(live_frames(live)) >= len(stamps(sent, 'scan')) - 15
+
+
+def test_missing_reflectors_and_imu_do_not_stop_the_poses(live, node):
+    sent = feed(node, 3.0, lambda stream, msg: msg if stream in ('odom', 'scan') else None)
+    assert len(live_frames(live)) >= len(stamps(sent, 'scan')) - 1
+
+
+def test_duplicates_are_counted_once(live, node):
+    for stream, msg in room(seconds=2.0):
+        node.sensors.add(stream, msg)
+        node.sensors.add(stream, msg)
+    for stream in ('odom', 'imu', 'scan', 'reflectors'):
+        assert used(node, stream, 'duplicate') >= used(node, stream) > 0
+    poses = [convert.stamp(m, '') for m in live_frames(live)]
+    assert len(set(poses)) == len(poses)
+
+
+def test_late_and_future_messages_are_counted_and_harmless(live, node):
+    sent = feed(node, 3.0)
+    early = next(m for s, m in sent if s == 'scan')
+    future = copy.deepcopy(early)
+    future.header.stamp.sec += 1000
+    before = node._last
+    node.sensors.add('scan', early)
+    node.sensors.add('scan', future)
+    assert used(node, 'scan', 'late') == 1
+    assert used(node, 'scan', 'future') == 1
+    assert node._last is before
+
+
+@pytest.mark.parametrize('sec', [0, -5])
+def test_stamps_that_are_not_positive_are_refused(live, node, sec):
+    _, msg = next(room(['/scan']))
+    msg.header.stamp.sec, msg.header.stamp.nanosec = sec, 0
+    node.sensors.add('scan', msg)
+    assert used(node, 'scan', 'invalid') == 1
+    assert 'header.stamp' in node.sensors.sequencer.inputs.last_error
+
+
+def test_odometry_that_is_not_finite_is_refused(live, node):
+    def spoil(stream, msg):
+        if stream == 'odom' and convert.stamp(msg, '') % SECOND == 0:
+            msg.pose.pose.position.x = float('nan')
+        return msg
+
+    feed(node, 3.0, spoil)
+    assert used(node, 'odom', 'invalid') >= 2
+    assert np.isfinite(node._last.T_local_base).all()
+
+
+def test_clock_that_jumps_back_begins_anew(live, node):
+    for _, msg in room(['/odom']):
+        msg.header.stamp.sec += 100
+        node.sensors.add('odom', msg)
+    feed(node, 2.0)
+    assert used(node, 'scan') >= 15
+    assert convert.stamp(live_frames(live)[-1], '') < 5 * SECOND
+
+
+# --- the place of the laser -----------------------------------------------------------------
+
+
+@pytest.mark.skipif(
+    rclpy_class('tf2_msgs/msg/TFMessage') is None, reason='tf2_msgs is not installed: make tf'
+)
+def test_scans_wait_for_the_place_of_the_laser(live):
+    node = live.start(FrontEndNode, use_reflectors=False)
+    scans = [(s, m) for s, m in room(['/scan', '/odom'], seconds=2.0)]
+    for stream, msg in scans[:10]:
+        node.sensors.add(stream, msg)
+    assert used(node, 'scan') == 0
+    place = build.transform(make, SECOND, ('base_link', 'laser'), np.array([0.3, 0.1, 0.0]))
+    publisher = live.ear.create_publisher(
+        rclpy_class('tf2_msgs/msg/TFMessage'), '/tf_static', LATCHED
+    )
+    publisher.publish(build.tf_message(make, [place]))
+    live.spin_until(lambda: node.sensors.extrinsics.pose('base_link', 'laser') is not None)
+    for stream, msg in scans[10:]:
+        node.sensors.add(stream, msg)
+    n = len([1 for s, _ in scans if s == 'scan'])
+    assert used(node, 'scan') >= n - 1
+    np.testing.assert_allclose(node._last.observation.origin, [0.3, 0.1], atol=1e-6)
+
+
+def test_parameter_serves_where_nobody_tells_the_place_of_the_laser(live):
+    node = live.start(FrontEndNode, laser_pose=[0.3, 0.1, 0.0])
+    sent = feed(node, 4.0)
+    assert used(node, 'scan') >= len(stamps(sent, 'scan')) - 1
+    np.testing.assert_allclose(node._last.observation.origin, [0.3, 0.1])
+
+
+# --- parameters -----------------------------------------------------------------------------
+
+
+def test_wrong_value_refuses_to_start(live):
+    with pytest.raises(ParameterError, match=r'Submap.resolution = -1.0 is outside \[0.01, 1\]'):
+        live.start(FrontEndNode, submap__resolution=-1.0)
+
+
+def test_topics_are_relative_and_named_by_parameters(live):
+    node = live.start(FrontEndNode, scan_topic='front/scan')
+    assert node.count_subscribers('front/scan') == 1
+    assert node.count_subscribers('scan') == 0

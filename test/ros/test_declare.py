@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Declared parameters and ROS parameters are the same thing."""
+
+from __future__ import annotations
+
+import os
+from types import SimpleNamespace
+
+import pytest
+
+rclpy = pytest.importorskip('rclpy', reason='needs ROS 2 (rclpy)')
+
+from rclpy.node import Node  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+
+from rlml_slam.errors import ParameterError  # noqa: E402
+from rlml_slam.params import Parameters, declarations  # noqa: E402
+from rlml_slam.ros.declare import AGGREGATES, declare  # noqa: E402
+
+
+@pytest.fixture
+def make_node(monkeypatch):
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=10 + os.getpid() % 90)
+    nodes = []
+
+    def make(**given):
+        overrides = [Parameter(n.replace('__', '.'), value=v) for n, v in given.items()]
+        nodes.append(Node('declaring', context=context, parameter_overrides=overrides))
+        return nodes[-1]
+
+    yield make
+    for node in nodes:
+        node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def warnings_of(node, monkeypatch):
+    said = []
+    logger = SimpleNamespace(warning=said.append)
+    monkeypatch.setattr(node, 'get_logger', lambda: logger)
+    return said
+
+
+@pytest.mark.parametrize('of', AGGREGATES, ids=lambda of: of.__name__)
+def test_every_parameter_is_declared_with_its_default_and_documented(make_node, of):
+    node = make_node()
+    assert declare(node, of) == of()
+    for d in declarations(of):
+        value = node.get_parameter(d.name).value
+        assert (tuple(value) if isinstance(d.default, tuple) else value) == d.default
+        described = node.describe_parameter(d.name)
+        assert d.meaning in described.description
+        assert d.unit in described.description
+        assert described.read_only
+
+
+def test_ranges_and_choices_are_described(make_node):
+    node = make_node()
+    declare(node)
+    bounds = node.describe_parameter('submap.resolution').floating_point_range[0]
+    assert (bounds.from_value, bounds.to_value) == (0.01, 1.0)
+    whole = node.describe_parameter('submap.size').integer_range[0]
+    assert (whole.from_value, whole.to_value) == (2, 10000)
+    assert node.describe_parameter('mode').additional_constraints == 'one of mapping, localization'
+
+
+def test_given_values_are_taken_and_whole_numbers_serve_as_fractions(make_node):
+    node = make_node(reflector__max_range=25, use_imu=False, map_start_pose=[1, 2, 3])
+    parameters = declare(node)
+    assert parameters.reflector.max_range == 25.0
+    assert parameters.node.use_imu is False
+    assert node.get_parameter('reflector.max_range').value == 25.0
+    assert parameters.node.map_start_pose == (1.0, 2.0, 3.0)
+
+
+def test_wrong_value_names_class_field_value_and_meaning(make_node):
+    with pytest.raises(ParameterError, match=r"Node\.mode = 'mopping' is none of .*\(mapping, or"):
+        declare(make_node(mode='mopping'))
+
+
+def test_unknown_name_is_warned_about_with_what_may_be_meant(make_node, monkeypatch):
+    node = make_node(scan_topik='x')
+    said = warnings_of(node, monkeypatch)
+    declare(node)
+    assert said == ["unknown parameter 'scan_topik' has no effect; is 'scan_topic' meant?"]
+
+
+def test_names_of_the_other_nodes_and_of_rclpy_are_no_mistakes(make_node, monkeypatch):
+    node = make_node(wheels__rate=20.0, use_sim_time=True)
+    said = warnings_of(node, monkeypatch)
+    assert declare(node) == Parameters()
+    assert said == []
