@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rlml_slam import params
 from rlml_slam.compiled import kernel
-from rlml_slam.matching import search, thinning
+from rlml_slam.matching import search, surfaces, thinning
 from rlml_slam.matching.submap import P_MIN, STEP, Submap
 from rlml_slam.se2 import Array, wrap
 
@@ -116,6 +116,7 @@ def accumulate(
     corner_i: float,
     scale: float,
     points: Array,
+    constraints: Array,
     pose: Array,
     out: Array,
 ) -> None:
@@ -132,7 +133,11 @@ def accumulate(
         # Geman-McClure: rho = e^2 / (1 + e^2/k^2), weight = (1 + e^2/k^2)^-2
         q = 1.0 / (1.0 + e * e / k2)
         w = q * q
-        jx, jy = -m_u * scale, -m_v * scale
+        # slope in the base frame, through the end point's constraint, and back
+        gx, gy = -(c * m_u + s * m_v) * scale, -(c * m_v - s * m_u) * scale
+        hx = constraints[k, 0] * gx + constraints[k, 1] * gy
+        hy = constraints[k, 1] * gx + constraints[k, 2] * gy
+        jx, jy = c * hx - s * hy, s * hx + c * hy
         jt = -ry * jx + rx * jy
         out[0] += 0.5 * e * e * q
         out[1] += w * jx * e
@@ -155,7 +160,7 @@ def linearize(submap: Submap, points: Array, pose: Array) -> ScanTerm:
     j, i = submap.corner
     accumulate(
         submap.values, float(j), float(i), 1.0 / submap.resolution, points,
-        np.ascontiguousarray(pose, dtype=np.float64), out,
+        surfaces.constraints(points), np.ascontiguousarray(pose, dtype=np.float64), out,
     )  # fmt: skip
     n = len(points)
     return ScanTerm(
@@ -177,15 +182,16 @@ def refine(
     corner_i: float,
     scale: float,
     points: Array,
+    constraints: Array,
     start: Array,
     prior: Array,
-    information: Array,
+    whitening: Array,
     prior_scale: float,
     sigma: float,
     max_iterations: int,
     out: Array,
 ) -> tuple[float, float, float, float, int, bool]:
-    """LM on scan term / sigma^2 + truncated prior; (x, y, theta, weight, iterations, converged).
+    """LM on scan term / sigma^2 + robust prior; (x, y, theta, weight, iterations, converged).
 
     ``out`` (12,) holds the scan term at the result.
     """
@@ -195,22 +201,18 @@ def refine(
     term = np.empty(12)
     A = np.empty((3, 3))
     b = np.empty(3)
-    d = np.empty(3)
-    accumulate(values, corner_j, corner_i, scale, points, pose, out)
-    cost, weight = prior_cost(pose, prior, information, prior_scale, d, b)
+    accumulate(values, corner_j, corner_i, scale, points, constraints, pose, out)
+    cost, weight = prior_term(pose, prior, whitening, prior_scale, A, b)
     cost += w * out[0]
     damping = 1e-4
     iterations = 0
     converged = False
     while iterations < max_iterations and not converged:
         iterations += 1
+        _, weight = prior_term(pose, prior, whitening, prior_scale, A, b)
         n = 4
         for r in range(3):
-            b[r] = w * out[1 + r]
-            for q in range(3):
-                A[r, q] = weight * information[r, q]
-                b[r] += weight * information[r, q] * d[q]
-        for r in range(3):
+            b[r] += w * out[1 + r]
             for q in range(r, 3):
                 A[r, q] += w * out[n]
                 A[q, r] = A[r, q]
@@ -219,43 +221,53 @@ def refine(
         step = solve3(A, b)
         for r in range(3):
             trial[r] = pose[r] - step[r]
-        accumulate(values, corner_j, corner_i, scale, points, trial, term)
-        trial_cost, trial_weight = prior_cost(trial, prior, information, prior_scale, d, b)
+        accumulate(values, corner_j, corner_i, scale, points, constraints, trial, term)
+        trial_cost, _ = prior_term(trial, prior, whitening, prior_scale, A, b)
         trial_cost += w * term[0]
-        small = abs(step[0]) < 1e-4 and abs(step[1]) < 1e-4 and abs(step[2]) < 1e-5
+        converged = abs(step[0]) < 1e-4 and abs(step[1]) < 1e-4 and abs(step[2]) < 1e-5
         if trial_cost <= cost:
-            converged = small
             pose[:] = trial
             out[:] = term
-            cost, weight = trial_cost, trial_weight
+            cost = trial_cost
             damping = max(damping * 0.1, 1e-7)
         else:
-            converged = small
-            prior_cost(pose, prior, information, prior_scale, d, b)
             damping = max(damping * 10.0, 1e-3)
-            if damping > 1e8:
-                break
     return pose[0], pose[1], pose[2], weight, iterations, converged
 
 
 @kernel
-def prior_cost(
-    pose: Array, prior: Array, information: Array, prior_scale: float, d: Array, work: Array
+def prior_term(
+    pose: Array, prior: Array, whitening: Array, prior_scale: float, A: Array, b: Array
 ) -> tuple[float, float]:
-    """Cost and weight of the prior at pose; ``d`` (3,) becomes pose - prior.
+    """Cost and smallest weight of the prior; its Hessian into A (3, 3), its gradient into b (3,).
 
-    Geman-McClure in the Mahalanobis distance: the prior is a Gaussian near its mean and has no
-    say far from it, so that odometry that is plainly wrong loses against the scan.
+    Each component of u = whitening (pose - prior) has a Geman-McClure loss of its own: it is a
+    Gaussian near the prior and has no say far from it, so a component of the odometry that is
+    plainly wrong loses against the scan, and the others stay.
     """
-    for r in range(3):
-        d[r] = pose[r] - prior[r]
-    d[2] = np.pi - np.mod(np.pi - d[2], 2.0 * np.pi)
-    d2 = 0.0
-    for r in range(3):
-        for q in range(3):
-            d2 += d[r] * information[r, q] * d[q]
-    k = 1.0 / (1.0 + d2 / (prior_scale * prior_scale))
-    return 0.5 * d2 * k, k * k
+    d0, d1 = pose[0] - prior[0], pose[1] - prior[1]
+    d2 = np.pi - np.mod(np.pi - (pose[2] - prior[2]), 2.0 * np.pi)
+    A[:] = 0.0
+    b[:] = 0.0
+    cost, weight = 0.0, 1.0
+    for h in range(3):
+        u = whitening[h, 0] * d0 + whitening[h, 1] * d1 + whitening[h, 2] * d2
+        k = 1.0 / (1.0 + u * u / (prior_scale * prior_scale))
+        cost += 0.5 * u * u * k
+        weight = min(weight, k * k)
+        for r in range(3):
+            b[r] += k * k * whitening[h, r] * u
+            for q in range(3):
+                A[r, q] += k * k * whitening[h, r] * whitening[h, q]
+    return cost, weight
+
+
+def whitening_of(information: Array, theta: float) -> Array:
+    """W (3, 3) with W^T W = information, its rows forward, sideways, turn of the base at theta."""
+    c, s = np.cos(theta), np.sin(theta)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    body: Array = np.linalg.cholesky(R.T @ information @ R).T @ R.T
+    return body
 
 
 @kernel
@@ -297,13 +309,24 @@ def match(
     if not len(points) or not submap.values.size:
         return ScanMatchResult(prior_pose.copy(), np.zeros((3, 3)), 0.0, 0, False, 1.0)
     start = prior_pose
+    W = whitening_of(information, float(prior_pose[2]))
     if searched:
-        start = search.window(submap, points, prior_pose, p.search_window, p.search_angle).pose
+        start = search.window(
+            submap,
+            points,
+            prior_pose,
+            p.search_window,
+            p.search_angle,
+            W,
+            p.prior_scale,
+            p.search_share,
+        ).pose  # fmt: skip
     out = np.empty(12)
     j, i = submap.corner
     x, y, theta, weight, iterations, converged = refine(
-        submap.values, float(j), float(i), 1.0 / submap.resolution, points, start, prior_pose,
-        information, p.prior_scale, p.sigma, p.max_iterations, out,
+        submap.values, float(j), float(i), 1.0 / submap.resolution, points,
+        surfaces.constraints(points), start, prior_pose, W, p.prior_scale, p.sigma,
+        p.max_iterations, out,
     )  # fmt: skip
     return ScanMatchResult(
         np.array([x, y, float(wrap(theta))]), symmetric(out[4:10]) / p.sigma**2,

@@ -24,9 +24,20 @@ class Candidate:
 
 
 def window(
-    submap: Submap, points: Array, pose: Array, half_width: float, half_angle: float
+    submap: Submap,
+    points: Array,
+    pose: Array,
+    half_width: float,
+    half_angle: float,
+    whitening: Array | None = None,
+    prior_scale: float = 3.0,
+    share: float = 0.05,
 ) -> Candidate:
     """The best pose on a lattice (cells, angles) around ``pose`` (3,), ties to the nearest.
+
+    The objective is the mean of M less share * rho(u_k / prior_scale) for each component of
+    u = whitening @ (pose - centre), rho(v) = v^2 / (1 + v^2): where the scan does not tell (along
+    a corridor), the prior does. Without ``whitening`` (3, 3) it is the scan alone.
 
     ``points`` (n, 2) in the base frame. The angular step moves the mean end point by a cell.
     """
@@ -37,7 +48,18 @@ def window(
     step = half_angle / m if m else 0.0
     j, i = submap.corner
     x, y, theta, score = search_window(
-        submap.values, float(j), float(i), 1.0 / submap.resolution, points, pose, n, m, step
+        submap.values,
+        float(j),
+        float(i),
+        1.0 / submap.resolution,
+        points,
+        pose,
+        n,
+        m,
+        step,
+        np.zeros((3, 3)) if whitening is None else whitening,
+        prior_scale,
+        share * len(points) * LEVELS / (P_MAX - P_MIN),
     )
     mean = score / max(len(points), 1)
     p = P_MIN + (P_MAX - P_MIN) * mean / LEVELS
@@ -55,13 +77,20 @@ def search_window(
     n: int,
     m: int,
     step: float,
+    whitening: Array,
+    prior_scale: float,
+    unit: float,
 ) -> tuple[float, float, float, int]:
-    """Exhaustive sum of cell values over (2 n + 1)^2 shifts and 2 m + 1 angles."""
+    """Exhaustive sum of cell values over (2 n + 1)^2 shifts and 2 m + 1 angles.
+
+    ``unit`` is the sum of cell values that a component far from the prior costs.
+    """
     rows, columns = values.shape
     width = 2 * n + 1
     sums = np.empty((width, width), dtype=np.int64)
-    best, best_distance = -1, 0.0
-    best_a = best_j = best_i = 0
+    best, best_distance = -np.inf, 0.0
+    best_a = best_j = best_i = best_sum = 0
+    k2 = prior_scale * prior_scale
     for a in range(-m, m + 1):
         theta = pose[2] + a * step
         c, s = np.cos(theta), np.sin(theta)
@@ -80,10 +109,19 @@ def search_window(
             for q in range(width):
                 di, dj = r - n, q - n
                 distance = di * di + dj * dj + a * a
-                if sums[r, q] > best or (sums[r, q] == best and distance < best_distance):
-                    best, best_distance = sums[r, q], distance
+                cost = 0.0
+                for h in range(3):
+                    u = (
+                        whitening[h, 0] * dj / scale
+                        + whitening[h, 1] * di / scale
+                        + whitening[h, 2] * a * step
+                    )
+                    cost += u * u / (k2 + u * u)
+                value = sums[r, q] - unit * cost
+                if value > best or (value == best and distance < best_distance):
+                    best, best_distance, best_sum = value, distance, sums[r, q]
                     best_a, best_j, best_i = a, dj, di
-    return pose[0] + best_j / scale, pose[1] + best_i / scale, pose[2] + best_a * step, best
+    return pose[0] + best_j / scale, pose[1] + best_i / scale, pose[2] + best_a * step, best_sum
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from rlml_slam import params
 from rlml_slam.compiled import kernel
 from rlml_slam.errors import InputError
+from rlml_slam.matching import surfaces
 from rlml_slam.se2 import Array
 
 P_MIN, P_MAX = 0.1, 0.9
@@ -85,7 +86,9 @@ class Submap:
         """Add one scan: ``points`` (n, 2) end points and ``origin`` (2,) sensor, submap frame.
 
         The cells between the sensor and an end point miss, the end point's cell is hit; within
-        one insertion a cell counts once, and hits win. Raises InputError for a non-finite value.
+        one insertion a cell counts once, and hits win. Points are in scan order: gaps between
+        neighbours on one surface are filled (:mod:`surfaces`). Raises InputError for a value
+        that is not finite.
         """
         points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
         origin = np.ascontiguousarray(origin, dtype=np.float64).reshape(2)
@@ -94,6 +97,7 @@ class Submap:
             raise InputError('scan for a submap has an end point or origin that is not finite')
         self._cover(x_min, y_min, x_max, y_max)
         j, i = self.corner
+        points = surfaces.fill(points, self.resolution)
         while True:
             used = carve(
                 self.values, points, origin, float(j), float(i), 1.0 / self.resolution,
@@ -157,8 +161,9 @@ def carve(
 ) -> int:
     """Apply one scan to ``values``; number of cells touched, or -1 if ``touched`` is too short.
 
-    Every touched cell is marked with the top bit and listed, and unmarked at the end; where the
-    list is too short, the scan is taken back by nobody: the size is checked first.
+    ``points`` (n, 3) are those of surfaces.fill(): end point, and share of the ray left out.
+    Every touched cell is marked with the top bit and listed, and unmarked at the end; the length
+    of the list is checked before anything is changed.
     """
     columns = values.shape[1]
     flat = values.reshape(-1)
@@ -167,7 +172,8 @@ def carve(
     bound = 0
     for k in range(len(points)):
         x1, y1 = points[k, 0] * scale - corner_j, points[k, 1] * scale - corner_i
-        bound += int(abs(x1 - x0)) + int(abs(y1 - y0)) + 4
+        share = 1.0 - points[k, 2]
+        bound += int(abs(x1 - x0) * share) + int(abs(y1 - y0) * share) + 4
     if min(bound, flat.size) > touched.size:
         return -1
     n = 0
@@ -181,7 +187,9 @@ def carve(
             n += 1
     for k in range(len(points)):
         x1, y1 = points[k, 0] * scale - corner_j, points[k, 1] * scale - corner_i
-        n = carve_ray(flat, columns, x0, y0, x1, y1, miss, touched, n)
+        f = points[k, 2]
+        sx, sy = x0 + f * (x1 - x0), y0 + f * (y1 - y0)
+        n = carve_ray(flat, columns, sx, sy, x1, y1, miss, touched, n)
     for m in range(n):
         flat[touched[m]] ^= TOUCHED
     return n
