@@ -110,6 +110,7 @@ class MotionBuffer:
         self._w: list[float] = [0.0]
         self._imu_stamps: list[int] = []
         self._rates: list[float] = []
+        self._parked: Odometry | None = None
         self.jumps = 0
 
     @property
@@ -118,22 +119,36 @@ class MotionBuffer:
         return self._stamps[-1] if self._stamps else None
 
     def add_odometry(self, sample: Odometry) -> None:
-        """Append a sample; its stamp must be later than the newest one's."""
+        """Append a sample; its stamp must be later than the newest one's.
+
+        One sample that jumps away and is not followed by another there is a fault and dropped;
+        two that agree are odometry that was reset, across which the motion is unknown.
+        """
         if self._stamps:
-            dt = (sample.stamp - self._stamps[-1]) / SECOND
-            step = se2.log(se2.between(self._poses[-1], sample.pose))
-            v, w = float(step[0]) / dt, float(step[2]) / dt
-            n = self._noise
-            # stamps of one burst are too close to divide by: a jump is judged over an interval
-            shrink = dt / max(dt, n.interval)
-            if abs(v) * shrink > n.max_speed or abs(w) * shrink > n.max_turn_rate:
+            step = self._step(self._stamps[-1], self._poses[-1], sample)
+            if step is None:
                 self.jumps += 1
-                v = w = math.nan
-            self._v.append(v)
-            self._w.append(w)
+                parked, self._parked = self._parked, sample
+                if parked is None or self._step(parked.stamp, parked.pose, sample) is None:
+                    return
+                step = (math.nan, math.nan)
+            self._v.append(step[0])
+            self._w.append(step[1])
+        self._parked = None
         self._stamps.append(sample.stamp)
         self._poses.append(np.array(sample.pose, dtype=np.float64))
         self._forget(self._stamps, sample.stamp, self._poses, self._v, self._w)
+
+    def _step(self, stamp: int, pose: Array, sample: Odometry) -> tuple[float, float] | None:
+        """Speed and turn rate since an earlier sample, None where no robot moves like that."""
+        dt = (sample.stamp - stamp) / SECOND
+        step = se2.log(se2.between(pose, sample.pose))
+        n = self._noise
+        # stamps of one burst are too close to divide by: a jump is judged over an interval
+        over = max(dt, n.interval)
+        if abs(step[0]) > n.max_speed * over or abs(step[2]) > n.max_turn_rate * over:
+            return None
+        return float(step[0]) / dt, float(step[2]) / dt
 
     def add_imu(self, sample: Imu) -> None:
         """Append a sample; its stamp must be later than the newest one's."""

@@ -167,7 +167,7 @@ class MotionNoise(Group):
     max_speed: float = param(
         5.0, 'a faster odometry step is a jump and is not used', 'm/s', 0.01, 100.0
     )
-    max_turn_rate: float = param(6.0, 'a faster odometry turn is a jump', 'rad/s', 0.01, 100.0)
+    max_turn_rate: float = param(15.0, 'a faster odometry turn is a jump', 'rad/s', 0.01, 100.0)
 
 
 @dataclass(frozen=True)
