@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot beside a moving, deforming carrier: odometry, reflector detections and the truth.
+
+Two carriers: a train, whose features stay together and turn with it, and a conveyor, whose
+features enter upstream and leave downstream. The robot follows the carrier's nominal motion.
+Everything is in the frame of the robot's first pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam.se2 import Array, compose, rotation
+from rlml_slam.types import ANONYMOUS, Detections, Motion
+
+
+@dataclass(frozen=True)
+class CarrierSettings:
+    """What is simulated; the noise is what it says, so an estimator can be consistent."""
+
+    kind: str = 'train'  # or 'conveyor'
+    features: int = 6
+    rate: float = 10.0  # Hz
+    speed: float = 1.0  # m/s
+    turn_rate: float = 0.1  # rad/s, amplitude of the train's swaying turn
+    drift: float = 0.05  # m/sqrt(s), each feature on its own
+    common_drift: float = 0.05  # m/sqrt(s), the whole carrier
+    odometry_sigma: tuple[float, float, float] = (0.01, 0.01, 0.004)  # per sqrt(s)
+    sigma: float = 0.02  # m, of a detection per axis
+    max_range: float = 8.0  # m
+    missing: float = 0.1  # share of detections that fail to appear
+    ghosts: float = 0.0  # mean number of false detections per step
+    with_ids: bool = True
+
+
+@dataclass(frozen=True)
+class CarrierStep:
+    """One step as measured, and the truth of it."""
+
+    stamp: int
+    motion: Motion  # since the step before, with its covariance
+    detections: Detections  # in the robot's frame
+    linear: Array  # (2,) nominal velocity of the carrier's features' centroid since then
+    angular: float
+    pose: Array  # (3,) true
+    ids: NDArray[np.int64]  # (m,) of the features that exist
+    points: Array  # (m, 2) true
+    seen: NDArray[np.int64]  # (k,) true id of each detection, ANONYMOUS for a ghost
+
+
+def simulate_carrier(settings: CarrierSettings, seed: int) -> Iterator[CarrierStep]:
+    """Steps without end; the same for the same settings and seed."""
+    generator = np.random.default_rng(seed)
+    dt = 1.0 / settings.rate
+    pose, time = np.zeros(3), 0.0
+    points = generator.uniform(-0.3, 0.3, (settings.features, 2))
+    points[:, 1] += 2.0
+    points[:, 0] += 1.2 * (np.arange(settings.features) - (settings.features - 1) / 2.0)
+    points[:, 1] += 0.8 * (-1.0) ** np.arange(settings.features)
+    ids = np.arange(settings.features, dtype=np.int64)
+    motion = Motion(np.zeros(3), np.diag(np.array(settings.odometry_sigma) ** 2 * dt))
+    linear, angular, k = np.zeros(2), 0.0, 0
+    while True:
+        detections, seen = _detect(settings, generator, k, dt, pose, ids, points)
+        stamp = round(1e9 * k * dt)
+        yield CarrierStep(stamp, motion, detections, linear, angular, pose, ids, points, seen)
+        k, time = k + 1, time + dt
+        angular = settings.turn_rate * np.sin(0.3 * time) if settings.kind == 'train' else 0.0
+        heading = settings.turn_rate / 0.3 * (1.0 - np.cos(0.3 * time))
+        direction = heading if settings.kind == 'train' else 0.0
+        speed = settings.speed * (1.0 + 0.3 * np.sin(0.2 * time))
+        linear = speed * np.array([np.cos(direction), np.sin(direction)])
+        pose, motion = _drive(settings, generator, dt, pose, points, linear, angular)
+        points = _carry(settings, generator, dt, points, linear, angular)
+        if settings.kind == 'conveyor':
+            ids, points = _feed(settings, pose, ids, points)
+
+
+def _drive(
+    settings: CarrierSettings, generator: np.random.Generator, dt: float, pose: Array,
+    points: Array, linear: Array, angular: float,
+) -> tuple[Array, Motion]:  # fmt: skip
+    """The robot stays beside the carrier, or lets a conveyor pass; true pose and odometry."""
+    along = linear / max(float(np.linalg.norm(linear)), 1e-9)
+    across = np.array([-along[1], along[0]])
+    gap = points.mean(axis=0) - pose[:2]
+    wanted = 0.5 * across * (across @ gap - 2.0)  # the carrier 2 m to the left
+    if settings.kind == 'train':
+        wanted += linear + 0.5 * along * (along @ gap)
+    else:
+        wanted += 0.6 * linear
+    turn = angular * dt
+    command = np.append(rotation(pose[2]).T @ (wanted * dt), turn)
+    sigma = np.array(settings.odometry_sigma) * np.sqrt(dt)
+    true = command + sigma * generator.standard_normal(3)
+    return compose(pose, true), Motion(command, np.diag(sigma**2))
+
+
+def _carry(
+    settings: CarrierSettings, generator: np.random.Generator, dt: float, points: Array,
+    linear: Array, angular: float,
+) -> Array:  # fmt: skip
+    """The features one step on: nominal motion about their centroid, and both random walks."""
+    center = points.mean(axis=0)
+    moved = center + (points - center) @ rotation(angular * dt).T + linear * dt
+    own = settings.drift * np.sqrt(dt) * generator.standard_normal(points.shape)
+    common = settings.common_drift * np.sqrt(dt) * generator.standard_normal(2)
+    carried: Array = moved + own + common
+    return carried
+
+
+def _feed(
+    settings: CarrierSettings, pose: Array, ids: NDArray[np.int64], points: Array
+) -> tuple[NDArray[np.int64], Array]:
+    """A conveyor's feature that is far downstream comes back upstream as a new one."""
+    ids, points = ids.copy(), points.copy()
+    for j in np.flatnonzero(points[:, 0] - pose[0] > settings.max_range + 1.0):
+        points[j] = (pose[0] - settings.max_range - 0.5, points[j, 1])
+        ids[j] = ids.max() + 1
+    return ids, points
+
+
+def _detect(
+    settings: CarrierSettings, generator: np.random.Generator, k: int, dt: float, pose: Array,
+    ids: NDArray[np.int64], points: Array,
+) -> tuple[Detections, NDArray[np.int64]]:  # fmt: skip
+    """Detections of what is in range, some missing, some ghosts, in random order."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    body = (points - pose[:2]) @ np.array([[c, -s], [s, c]])
+    noisy = body + settings.sigma * generator.standard_normal(body.shape)
+    kept = (np.linalg.norm(body, axis=-1) <= settings.max_range) & (
+        generator.random(len(body)) >= settings.missing
+    )
+    num = generator.poisson(settings.ghosts)
+    ghosts = generator.uniform(-settings.max_range, settings.max_range, (num, 2))
+    found = np.concatenate([noisy[kept], ghosts])
+    seen = np.concatenate([ids[kept], np.full(num, ANONYMOUS, dtype=np.int64)])
+    order = generator.permutation(len(found))
+    found, seen = found[order], seen[order]
+    told = seen if settings.with_ids else np.full(len(seen), ANONYMOUS, dtype=np.int64)
+    cov = np.broadcast_to(settings.sigma**2 * np.eye(2), (len(found), 2, 2)).copy()
+    stamp = round(1e9 * k * dt)
+    diameters = np.full(len(found), np.nan)
+    return Detections(stamp, 'base_link', found, cov, told, diameters), seen
+
+
+def true_features(step: CarrierStep) -> dict[int, Array]:
+    """True position (2,) of each feature by its id."""
+    return dict(zip(step.ids.tolist(), step.points, strict=True))
