@@ -72,8 +72,8 @@ def metrics(run: Run, judged: Judged | None = None) -> dict[str, Any]:
         'duration_s': round(duration, 3),
         'wall_s': round(wall, 3),
         'real_time_factor': round(duration / wall, 2) if wall > 0.0 else None,
-        'front_end_ms': _distribution(run.frames.wall_ms),
-        'back_end_ms': _distribution(run.back_end_ms),
+        'front_end_ms': distribution(run.frames.wall_ms),
+        'back_end_ms': distribution(run.back_end_ms),
         'keyframes': len(run.keyframes),
         'closures': {'accepted': len(run.closures), 'rejected': run.rejected},
         'reflectors': len(run.reflectors),
@@ -85,7 +85,7 @@ def metrics(run: Run, judged: Judged | None = None) -> dict[str, Any]:
     judged = judge(run) if judged is None else judged
     if judged is not None and run.truth is not None:
         out |= _truth_figures(run, judged)
-    return out
+    return out | dict(run.extra)
 
 
 def _truth_figures(run: Run, judged: Judged) -> dict[str, Any]:
@@ -141,7 +141,8 @@ def _match(
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
-def _distribution(values: Any) -> dict[str, float | None]:
+def distribution(values: Any) -> dict[str, float | None]:
+    """Median, 99th percentile and maximum, None of nothing."""
     v = np.asarray(values, dtype=np.float64)
     if not len(v):
         return {'median': None, 'p99': None, 'max': None}

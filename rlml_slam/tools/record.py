@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,7 +76,7 @@ class Run:
     ``trajectory`` is the optimised one; ``keyframes`` (k, 3) are poses in the map and
     ``closures`` (c, 2, 2) the ends of the accepted loop closures there. ``back_end_ms`` (k,)
     has the cost per keyframe. ``problem`` says in one line what ended the run early, empty if
-    nothing did.
+    nothing did. ``extra`` goes into metrics.json as it is.
     """
 
     name: str
@@ -91,6 +92,7 @@ class Run:
     truth: Truth | None = None
     wall_s: float = 0.0
     problem: str = ''
+    extra: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def duration_s(self) -> float:

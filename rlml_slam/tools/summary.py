@@ -9,7 +9,8 @@ from typing import Any
 
 def summary_rows(f: Mapping[str, Any]) -> list[tuple[str, str]]:
     """(what, figure) of the figures of metrics.json that a person looks at first."""
-    rows = [('scans', f'{f["scans"]} in {f["duration_s"]:.1f} s')]
+    sent = f' of {f["scans_published"]}' if 'scans_published' in f else ''
+    rows = [('scans', f'{f["scans"]}{sent} in {f["duration_s"]:.1f} s')]
     if f['real_time_factor']:
         rows.append(('speed', f'{f["real_time_factor"]:.1f} × real time ({f["wall_s"]:.1f} s)'))
     for name, key in (
@@ -21,6 +22,14 @@ def summary_rows(f: Mapping[str, Any]) -> list[tuple[str, str]]:
             rows.append(
                 (name, f'median {ms["median"]:.2f} ms, p99 {ms["p99"]:.1f}, max {ms["max"]:.1f}')
             )
+    if 'latency_ms' in f:
+        ms = f['latency_ms']
+        rows.append(
+            (
+                'scan to pose',
+                f'median {ms["median"]:.1f} ms, p99 {ms["p99"]:.1f}, max {ms["max"]:.1f}',
+            )
+        )
     c = f['closures']
     rows.append(('keyframes', f'{f["keyframes"]}'))
     rows.append(('loop closures', f'{c["accepted"]} accepted, {c["rejected"]} rejected'))
