@@ -6,7 +6,6 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from nav_msgs.msg import Odometry
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
@@ -17,70 +16,57 @@ from rlml_slam.params import Parameters
 from rlml_slam.ros import convert
 from rlml_slam.ros.associated import read_associated
 from rlml_slam.ros.declare import declare
+from rlml_slam.ros.frames import FrameJoin, Record, read_points, read_record
 from rlml_slam.ros.health import HealthPublisher
-from rlml_slam.ros.join import FrameJoin, follower, restarted
 from rlml_slam.ros.mapper import Mapper
 from rlml_slam.ros.run import run
-from rlml_slam.ros.sensors import Sensors, checked
+from rlml_slam.ros.sensors import checked
 from rlml_slam.ros.services import MapServices
-from rlml_slam.types import Frame, Observation
 
-STREAMS = ('scan', 'odom', 'imu')
 DEPTH = 200  # of the front end's answers: none may be lost while the map is drawn
 
 
 class BackEndNode(Node):
-    """Joins the sensors and the front end by stamp and hands the frames to the mapper."""
+    """Joins what the front end says by stamp and hands the frames to the mapper."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__('back_end', **options)
         self.params: Parameters = declare(self)
         self.mapper = Mapper(self, self.params)
         warm_up.compile_loaded()
-        self.join = FrameJoin(self.params)
-        self.sensors = Sensors(self, follower(self.params), STREAMS, self.observe, self.restart)
-        self.health = HealthPublisher(self, self.sensors, self.figures)
-        self.services_of_map = MapServices(self, self.params, self.mapper, self.join)
-        self._last: Frame | None = None
-        self.create_subscription(
-            PointCloud2, 'reflectors/associated', checked(self, self.on_associated), DEPTH
-        )
-        self.create_subscription(Odometry, 'odometry/filtered', checked(self, self.on_pose), DEPTH)
+        self.join = FrameJoin()
+        self.health = HealthPublisher(self, figures=self.figures)
+        self.map_services = MapServices(self, self.params, self.mapper, self.join)
+        for topic, callback in (
+            ('frames', self.on_frame),
+            ('deskewed_points', self.on_points),
+            ('reflectors/associated', self.on_associated),
+        ):
+            self.create_subscription(PointCloud2, topic, checked(self, callback), DEPTH)
         self.create_timer(
             self.params.node.transform_publish_period,
-            lambda: self.mapper.send_transform(self.sensors.sequencer.buffer.newest),
+            self.mapper.send_transform,
             clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
 
+    def on_frame(self, msg: PointCloud2) -> None:
+        """Every figure of one of the front end's frames."""
+        self.take(self.join.add_record(read_record(msg)))
+
+    def on_points(self, msg: PointCloud2) -> None:
+        """The end points of its scan."""
+        time = convert.stamp(msg, 'deskewed_points')
+        self.take(self.join.add_points(time, read_points(msg)))
+
     def on_associated(self, msg: PointCloud2) -> None:
-        """Detections with the front end's landmarks, in the base frame."""
-        associated = read_associated(msg)
-        self.join.add_associated(associated)
-        self.sensors.add_detections(associated.detections)
+        """Its detections with their landmarks."""
+        self.take(self.join.add_associated(read_associated(msg)))
 
-    def on_pose(self, msg: Odometry) -> None:
-        """The front end's pose in its local frame."""
-        self.take(self.join.add_pose(convert.pose_estimate(msg, 'odometry/filtered')))
-
-    def observe(self, observation: Observation) -> None:
-        """What the sensors said at one stamp."""
-        self.take(self.join.add_observation(observation))
-
-    def take(self, frames: list[Frame]) -> None:
+    def take(self, records: list[Record]) -> None:
         """Hand whole frames to the mapper."""
-        for frame in frames:
-            if self._last is not None and restarted(self._last, frame):
-                self.get_logger().warning('the front end began anew, and so does the map')
-                self.mapper.restart()
-            self._last = frame
-            self.mapper.add(frame)
-            self.health.update(frame)
-
-    def restart(self) -> None:
-        """Forget everything: the clock jumped back."""
-        self.join = FrameJoin(self.params)
-        self._last = None
-        self.mapper.restart()
+        for record in records:
+            self.mapper.add(record)
+            self.health.update(record.frame)
 
     def figures(self) -> dict[str, object]:
         """Figures for /diagnostics."""
@@ -89,7 +75,7 @@ class BackEndNode(Node):
             'keyframes': len(graph.poses),
             'edges': len(graph.edges),
             'frames waiting for the worker': self.mapper.worker.backlog,
-            'observations without an answer of the front end': self.join.unanswered,
+            'frames without their points or detections': self.join.incomplete,
         }
 
     def destroy_node(self) -> None:

@@ -71,9 +71,12 @@ def build_cloud(make: Make, header: Any, points: NDArray[np.void]) -> Any:
         fields.append(
             make(
                 'sensor_msgs/msg/PointField',
-                name=name, offset=int(offset), datatype=_NUMBERS[kind.str[1:]], count=1,
+                name=name,
+                offset=int(offset),
+                datatype=_NUMBERS[kind.base.str[1:]],
+                count=int(np.prod(kind.shape)),
             )
-        )  # fmt: skip
+        )
     return make(
         'sensor_msgs/msg/PointCloud2',
         header=header,

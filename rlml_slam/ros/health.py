@@ -21,7 +21,10 @@ class HealthPublisher:
     """Publishes the health of the newest frame; without new frames, that they are missing."""
 
     def __init__(
-        self, node: Any, sensors: Sensors, figures: Callable[[], dict[str, object]] = dict
+        self,
+        node: Any,
+        sensors: Sensors | None = None,
+        figures: Callable[[], dict[str, object]] = dict,
     ) -> None:
         self._name = node.get_fully_qualified_name().lstrip('/')
         self._sensors = sensors
@@ -35,19 +38,32 @@ class HealthPublisher:
         # steady: with simulated time, silence of /clock must be told as well
         node.create_timer(PERIOD, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
+    @property
+    def newest(self) -> int:
+        """Stamp of the newest frame, 0 before the first."""
+        return self._frame.stamp if self._frame is not None else 0
+
     def update(self, frame: Frame) -> None:
         """The newest frame."""
         self._frame = frame
         self._frames += 1
 
-    def publish(self) -> None:
-        """Send the status."""
+    def _inputs(self) -> dict[str, object]:
+        if self._sensors is None:
+            return {}
         inputs = self._sensors.sequencer.inputs
-        figures: dict[str, object] = {'frames': self._frames}
-        for stream, counts in inputs.totals().items():
-            figures |= {f'{stream} {what}': n for what, n in counts.items()}
+        figures: dict[str, object] = {
+            f'{stream} {what}': n
+            for stream, counts in inputs.totals().items()
+            for what, n in counts.items()
+        }
         if inputs.last_error:
             figures['last refused input'] = inputs.last_error
+        return figures
+
+    def publish(self) -> None:
+        """Send the status."""
+        figures: dict[str, object] = {'frames': self._frames, **self._inputs()}
         health, stamp = Health(Level.DEGRADED, ('no input yet',)), 0
         if self._frame is not None:
             health, stamp = self._frame.health, self._frame.stamp

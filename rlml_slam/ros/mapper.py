@@ -12,6 +12,7 @@ from rlml_slam.errors import MapError
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.ros import build
+from rlml_slam.ros.frames import Record
 from rlml_slam.ros.map_folder import MapFolder, SavedMap
 from rlml_slam.ros.messages import make_rclpy, rclpy_class
 from rlml_slam.ros.products import MapProducts
@@ -33,6 +34,7 @@ class Mapper:
 
     def __init__(self, node: Any, params: Parameters) -> None:
         self._p = params
+        self._logger = node.get_logger()
         self.folder = MapFolder(params.node.map_directory)
         self.saved: SavedMap | None = None
         if params.node.mode == 'localization':
@@ -42,7 +44,7 @@ class Mapper:
         self.products = MapProducts(node, params.node)
         self.T_map_odom: Array | None = None
         self._newest: Frame | None = None
-        self._resume = 0  # frames before this stamp are still the old front end's
+        self._session: int | None = None
         self._sent = 0
         self._tf = TransformPublisher(node)
         kind = rclpy_class('geometry_msgs/msg/PoseWithCovarianceStamped')
@@ -56,10 +58,13 @@ class Mapper:
         """Stamp of the newest frame, 1 before the first."""
         return self._newest.stamp if self._newest is not None else 1
 
-    def add(self, frame: Frame) -> None:
-        """Give one frame to the worker."""
-        if frame.stamp > self._resume:
-            self.worker.submit(lambda: self._add(frame))
+    def add(self, record: Record) -> None:
+        """Give one frame to the worker; another session of the front end begins another map."""
+        if self._session not in (None, record.session):
+            self._logger.warning('the front end began anew, and so does the map')
+            self.worker.submit(self._forget)
+        self._session = record.session
+        self.worker.submit(lambda: self._add(record.frame))
 
     def _add(self, frame: Frame) -> None:
         self._newest = frame
@@ -85,19 +90,14 @@ class Mapper:
         """In the worker: send map, trajectory, reflectors and graph now."""
         self.products.publish(self.back_end, self.saved, self.stamp)
 
-    def send_transform(self, stamp: int | None) -> None:
-        """Publish map to odom for a newer stamp than the last one."""
+    def send_transform(self) -> None:
+        """Publish map to odom at the newest stamp, if it is a new one."""
         self.worker.check()
-        stamp = max(self.stamp, stamp or 0)
-        if self.T_map_odom is not None and stamp > self._sent:
+        T, stamp = self.T_map_odom, self.stamp
+        if T is not None and stamp != self._sent:
             n = self._p.node
-            self._tf.publish(stamp, (n.map_frame, n.odom_frame), self.T_map_odom)
+            self._tf.publish(stamp, (n.map_frame, n.odom_frame), T)
             self._sent = stamp
-
-    def restart(self) -> None:
-        """Forget the graph: the front end began anew, or the clock jumped back."""
-        self._sent = 0
-        self.worker.submit(self._forget)
 
     def _forget(self) -> None:
         self.back_end.reset()
@@ -105,12 +105,10 @@ class Mapper:
         self._newest, self.T_map_odom = None, None
         self._send_correction()
 
-    def start_at(self, pose: Array, wait: int) -> None:
-        """In the worker: begin anew at a pose; frames of the next ``wait`` ns are old ones."""
-        stamp = self.stamp
-        self._resume = stamp + wait
+    def start_at(self, pose: Array) -> None:
+        """In the worker: begin anew at a pose of the map, the front end as well."""
+        stamp, frame = self.stamp, self._p.node.map_frame
         self._forget()
-        frame = self._p.node.map_frame
         self._initialpose.publish(
             build.pose_with_covariance(make_rclpy, stamp, frame, pose, CERTAIN)
         )

@@ -15,11 +15,9 @@ from rlml_slam.errors import RlmlError
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Parameters
 from rlml_slam.ros import build
-from rlml_slam.ros.join import FrameJoin
+from rlml_slam.ros.frames import FrameJoin
 from rlml_slam.ros.mapper import Mapper
 from rlml_slam.ros.messages import make_rclpy
-
-RESET_WAIT = 500_000_000  # [ns] in which the front end has surely got its new start
 
 
 class MapServices:
@@ -55,7 +53,7 @@ class MapServices:
 
     def reset(self, _request: Any, response: Any) -> None:
         """Forget the map and begin at map_start_pose; the front end does as well."""
-        self._mapper.start_at(np.array(self._p.node.map_start_pose), RESET_WAIT)
+        self._mapper.start_at(np.array(self._p.node.map_start_pose))
         response.success, response.message = True, 'the map begins anew'
 
     def pause(self, request: Any, response: Any) -> None:

@@ -63,13 +63,17 @@ class Live:
             assert time.monotonic() < end, f'{what or "waited in vain"}; heard {counts}'
             self.executor.spin_once(timeout_sec=0.05)
 
-    def drain(self):
-        """Spin until nothing is ready any more."""
+    def drain(self, rounds=10):
+        """Spin until nothing has been heard for some rounds."""
         quiet = 0
-        while quiet < 3:
-            before = time.monotonic()
+        while quiet < rounds:
+            before = self.count()
             self.executor.spin_once(timeout_sec=0.02)
-            quiet = quiet + 1 if time.monotonic() - before >= 0.02 else 0
+            quiet = quiet + 1 if self.count() == before else 0
+
+    def count(self):
+        """Messages heard so far."""
+        return sum(len(m) for m in self.heard.values())
 
     def call(self, kind, name, request):
         client = self.ear.create_client(kind, name)

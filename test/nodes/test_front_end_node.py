@@ -92,7 +92,7 @@ def test_correction_moves_the_map_pose_only(live, node):
     feed(node, 2.0)
     correction = np.array([1.0, -2.0, 0.5])
     node.correct(build.pose_with_covariance(make, SECOND, 'map', correction, np.eye(3)))
-    frame = node.front_end.process(node._last.observation)
+    frame = node.front_end.process(node.last.observation)
     from rlml_slam import se2
 
     np.testing.assert_allclose(
@@ -139,8 +139,8 @@ def test_ranges_that_are_no_ranges_cost_only_themselves(live, node):
 
     sent = feed(node, 3.0, spoil)
     assert used(node, 'scan') >= len(stamps(sent, 'scan')) - 1
-    assert np.isfinite(node._last.T_local_base).all()
-    assert node._last.health.reasons == ()
+    assert np.isfinite(node.last.T_local_base).all()
+    assert node.last.health.reasons == ()
 
 
 def test_empty_scan_is_counted_and_the_next_is_used(live, node):
@@ -201,12 +201,12 @@ def test_late_and_future_messages_are_counted_and_harmless(live, node):
     early = next(m for s, m in sent if s == 'scan')
     future = copy.deepcopy(early)
     future.header.stamp.sec += 1000
-    before = node._last
+    before = node.last
     node.sensors.add('scan', early)
     node.sensors.add('scan', future)
     assert used(node, 'scan', 'late') == 1
     assert used(node, 'scan', 'future') == 1
-    assert node._last is before
+    assert node.last is before
 
 
 @pytest.mark.parametrize('sec', [0, -5])
@@ -226,7 +226,7 @@ def test_odometry_that_is_not_finite_is_refused(live, node):
 
     feed(node, 3.0, spoil)
     assert used(node, 'odom', 'invalid') >= 2
-    assert np.isfinite(node._last.T_local_base).all()
+    assert np.isfinite(node.last.T_local_base).all()
 
 
 def test_clock_that_jumps_back_begins_anew(live, node):
@@ -260,14 +260,14 @@ def test_scans_wait_for_the_place_of_the_laser(live):
         node.sensors.add(stream, msg)
     n = len([1 for s, _ in scans if s == 'scan'])
     assert used(node, 'scan') >= n - 1
-    np.testing.assert_allclose(node._last.observation.origin, [0.3, 0.1], atol=1e-6)
+    np.testing.assert_allclose(node.last.observation.origin, [0.3, 0.1], atol=1e-6)
 
 
 def test_parameter_serves_where_nobody_tells_the_place_of_the_laser(live):
     node = live.start(FrontEndNode, laser_pose=[0.3, 0.1, 0.0])
     sent = feed(node, 4.0)
     assert used(node, 'scan') >= len(stamps(sent, 'scan')) - 1
-    np.testing.assert_allclose(node._last.observation.origin, [0.3, 0.1])
+    np.testing.assert_allclose(node.last.observation.origin, [0.3, 0.1])
 
 
 # --- parameters -----------------------------------------------------------------------------

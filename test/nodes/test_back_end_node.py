@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Front end and back end in one process over DDS, against the replay of the same bag."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from live import LATCHED, room
+from nav_msgs.srv import GetMap, LoadMap
+from std_srvs.srv import SetBool, Trigger
+
+from rlml_slam import se2
+from rlml_slam.maps import reflector_file
+from rlml_slam.nodes.back_end import BackEndNode
+from rlml_slam.nodes.front_end import FrontEndNode
+from rlml_slam.params import Parameters
+from rlml_slam.rlml.slam import Slam
+from rlml_slam.ros import build, convert
+from rlml_slam.ros.associated import read_reflector_map
+from rlml_slam.ros.feed import Feed
+from rlml_slam.ros.messages import make_rclpy as make
+from rlml_slam.ros.messages import rclpy_class
+
+SECOND = 1_000_000_000
+SECONDS = 8.0
+HAS_TF = rclpy_class('tf2_msgs/msg/TFMessage') is not None
+TF = ('/tf', 'tf2_msgs/msg/TFMessage')
+if not HAS_TF:
+    TF = ('/back_end/map_to_odom', 'geometry_msgs/msg/TransformStamped')
+MAP_TOPICS = {
+    'map': 'nav_msgs/msg/OccupancyGrid',
+    'map_metadata': 'nav_msgs/msg/MapMetaData',
+    'trajectory': 'nav_msgs/msg/Path',
+    'reflector_map': 'visualization_msgs/msg/MarkerArray',
+    'reflector_map_points': 'sensor_msgs/msg/PointCloud2',
+    'graph': 'visualization_msgs/msg/MarkerArray',
+    'correction': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+}
+
+
+def start(live, **values):
+    front = live.start(FrontEndNode, **values)
+    back = live.start(BackEndNode, **values)
+    front.sensors.stop_waiting()
+    live.listen('pose', 'geometry_msgs/msg/PoseWithCovarianceStamped')
+    for topic, kind in MAP_TOPICS.items():
+        live.listen(topic, kind, LATCHED)
+    live.listen(*TF)
+    talk = ('frames', 'deskewed_points', 'reflectors/associated', 'pose')
+    live.spin_until(
+        lambda: (
+            all(front.count_subscribers(topic) == 1 for topic in talk)
+            and front.count_publishers('correction') == 1
+        )
+    )
+    return front, back
+
+
+def drive(live, front, back, start=0.0, end=SECONDS):
+    """The front end gets the bag's messages; the spinning between them carries the nodes' talk."""
+    for stream, msg in room(seconds=end):
+        if convert.stamp(msg, '') < (1.0 + start) * SECOND:
+            continue
+        front.sensors.add(stream, msg)
+        live.executor.spin_once(timeout_sec=0.0)
+    live.spin_until(lambda: back.health.newest == front.last.stamp)
+    live.spin_until(lambda: back.mapper.worker.backlog == 0)
+    live.drain()
+
+
+def replayed(seconds=SECONDS):
+    slam = Slam(Parameters())
+    feed = Feed(Parameters(), slam, slam.sequencer.inputs)
+    for stream, msg in room(seconds=seconds):
+        feed.add(stream, msg)
+    return slam
+
+
+def test_live_nodes_end_where_the_replay_ends(live):
+    front, back = start(live)
+    drive(live, front, back)
+    slam = replayed()
+    stamps, poses = slam.trajectory()
+    live_stamps, live_poses = back.mapper.back_end.trajectory()
+    np.testing.assert_array_equal(live_stamps, stamps)
+    # points and detections travel as float32, whose rounding at 10 m is below 1e-6 m
+    np.testing.assert_allclose(se2.between(poses, live_poses), 0.0, atol=1e-5)
+    assert len(back.mapper.back_end.keyframes) == len(slam.back_end.keyframes)
+
+
+def test_everything_of_the_map_is_published(live):
+    front, back = start(live)
+    drive(live, front, back)
+    live.spin_until(lambda: all(live.heard[topic] for topic in MAP_TOPICS))
+    grid = live.heard['map'][-1]
+    assert grid.header.frame_id == 'map'
+    assert (np.array(grid.data) == 100).sum() > 100
+    assert live.heard['map_metadata'][-1] == grid.info
+    path = live.heard['trajectory'][-1].poses
+    assert len(path) > 50
+    assert path[0].header.stamp != path[-1].header.stamp
+    points = read_reflector_map(live.heard['reflector_map_points'][-1])
+    names = [m.ns for m in live.heard['reflector_map'][-1].markers]
+    assert names.count('reflectors') == names.count('ellipses') == len(points) >= 3
+    kinds = {m.ns for m in live.heard['graph'][-1].markers}
+    assert {'keyframes', 'odometry', 'scan', 'sightings'} <= kinds
+
+
+def test_map_to_odom_joins_the_two_estimates(live):
+    front, back = start(live)
+    drive(live, front, back, end=4.0)
+    newest = front.last
+
+    def is_sent():
+        sent = live.heard[TF[0]]
+        return (
+            sent
+            and convert.stamp(getattr(sent[-1], 'transforms', [sent[-1]])[0], '') == newest.stamp
+        )
+
+    live.spin_until(is_sent)
+    (got,) = convert.transforms(live.heard[TF[0]][-1])
+    assert (got.parent, got.child) == ('map', 'odom')
+    T = np.array([*got.t[:2], convert.yaw(got.R, '')])
+    want = se2.compose(back.mapper.back_end.T_map_local, newest.T_local_base)
+    np.testing.assert_allclose(se2.compose(T, newest.observation.odom_pose), want, atol=1e-9)
+
+
+def test_back_end_is_told_of_by_its_diagnostics(live):
+    front, back = start(live)
+    drive(live, front, back, end=3.0)
+    figures = back.figures()
+    assert figures['keyframes'] >= 2
+    assert figures['frames without their points or detections'] == 0
+
+
+def test_front_end_that_begins_anew_begins_a_new_map(live):
+    front, back = start(live)
+    drive(live, front, back, end=4.0)
+    there = np.array([50.0, 0.0, 0.0])
+    front.start_at(build.pose_with_covariance(make, SECOND, 'map', there, 1e-4 * np.eye(3)))
+    drive(live, front, back, start=4.0, end=5.0)
+    _, poses = back.mapper.back_end.trajectory()
+    assert 1 <= len(poses) <= 15
+    assert (poses[:, 0] > 45.0).all()
+
+
+# --- services -------------------------------------------------------------------------------
+
+
+def test_services_answer_in_words(live, tmp_path):
+    front, back = start(live, map_directory=str(tmp_path))
+    early = live.call(Trigger, 'back_end/save_map', Trigger.Request())
+    assert not early.success
+    assert early.message == 'there is no map yet'
+    drive(live, front, back, end=6.0)
+
+    saved = live.call(Trigger, 'back_end/save_map', Trigger.Request())
+    assert saved.success, saved.message
+    assert {p.name for p in tmp_path.iterdir()} == {'map.csv', 'map.pgm', 'map.yaml'}
+    assert len(reflector_file.load(tmp_path / 'map.csv')) >= 3
+
+    grid = live.call(GetMap, 'back_end/dynamic_map', GetMap.Request()).map
+    assert grid.info.width * grid.info.height == len(grid.data) > 0
+
+    refused = live.call(LoadMap, 'back_end/load_map', LoadMap.Request(map_url='map'))
+    assert refused.result != LoadMap.Response.RESULT_SUCCESS
+
+    keyframes = len(back.mapper.back_end.keyframes)
+    answer = live.call(SetBool, 'back_end/pause_new_measurements', SetBool.Request(data=True))
+    assert answer.success
+    assert back.join.paused
+    assert len(back.mapper.back_end.keyframes) == keyframes
+
+    reset = live.call(Trigger, 'back_end/reset', Trigger.Request())
+    assert reset.success
+    live.spin_until(lambda: np.abs(front.front_end.state.pose).max() < 1e-9)
+    assert back.mapper.back_end.keyframes == []
+
+
+@pytest.mark.parametrize('name', ['../map', '/etc/map', '.'])
+def test_maps_stay_inside_their_folder(live, tmp_path, name):
+    back = live.start(BackEndNode, map_directory=str(tmp_path / 'maps'), map_file_name=name)
+    answer = live.call(Trigger, 'back_end/save_map', Trigger.Request())
+    assert not answer.success
+    with pytest.raises(Exception, match='is not inside of map_directory'):
+        back.mapper.folder.path(name)
+
+
+def test_saved_map_serves_for_localization(live, tmp_path):
+    slam = replayed(20.0)
+    slam.finish()
+    reflectors = slam.reflectors()
+    reflector_file.save(reflectors, tmp_path / 'map.csv')
+    front, back = start(live, map_directory=str(tmp_path), mode='localization')
+    live.spin_until(lambda: front._map is not None)
+    assert len(front._map) == len(reflectors)
+    drive(live, front, back)
+    assert back.mapper.back_end.keyframes == []
+    stamps, poses = slam.trajectory()
+    got = convert.pose_estimate(live.heard['pose'][-1])
+    want = poses[np.flatnonzero(stamps == got.stamp)[0]]
+    # the map's reflectors are known to a few millimetres
+    np.testing.assert_allclose(se2.between(want, got.pose), 0.0, atol=0.03)
+    loaded = live.call(LoadMap, 'back_end/load_map', LoadMap.Request(map_url='map'))
+    assert loaded.result == LoadMap.Response.RESULT_SUCCESS
+    missing = live.call(LoadMap, 'back_end/load_map', LoadMap.Request(map_url='none'))
+    assert missing.result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
