@@ -123,24 +123,24 @@ def test_marginalised_window_gives_what_the_whole_history_gives():
 
 @pytest.mark.parametrize('kind', ['train', 'conveyor'])
 def test_covariances_account_for_the_errors(kind):
-    """24 runs of 15 s, scored at their end: independent samples."""
+    """16 runs of 10 s, scored at their end: independent samples."""
     pose, whole, degrees = [], [], 0
-    for seed in range(24):
-        run = steps(150, seed, kind=kind)
+    for seed in range(16):
+        run = steps(100, seed, kind=kind)
         estimates, owner, _ = follow(run)
         e, P = state_error(estimates[-1], run[-1], owner)
         pose.append(e[:3] @ np.linalg.solve(P[:3, :3], e[:3]))
         whole.append(e @ np.linalg.solve(P, e))
         degrees += len(e)
-    low, high = chi2_bounds(3, 24)
+    low, high = chi2_bounds(3, 16)
     assert low < np.mean(pose) < high
     low, high = chi2_bounds(degrees, 1)
     assert low < sum(whole) < high
 
 
 def test_cost_and_memory_stay_constant():
-    """Nothing grows over 100 s of a conveyor whose features come and go."""
-    run = steps(1000, kind='conveyor', with_ids=False, ghosts=0.05)
+    """Nothing grows over 60 s of a conveyor whose features come and go."""
+    run = steps(600, kind='conveyor', with_ids=False, ghosts=0.05)
     window = DeformableWindow(Deformable(), Reflector())
     sizes, seconds = [], []
     for s in run:
@@ -149,7 +149,7 @@ def test_cost_and_memory_stay_constant():
         seconds.append(time.process_time() - started)
         sizes.append(sum(a.nbytes for a in (*window._w, *window._prior, window._cov)))
     assert sizes[-1] == sizes[200]
-    early, late = np.median(seconds[100:400]), np.median(seconds[700:])
+    early, late = np.median(seconds[100:300]), np.median(seconds[400:])
     assert late < 1.5 * early + 1e-3
     assert np.percentile(seconds[100:], 99) < 0.01  # the issue's 10 ms; some 3 ms of CPU measured
 
