@@ -212,6 +212,7 @@ class Submap(Group):
 
     resolution: float = param(0.05, 'cell size', 'm', 0.01, 1.0)
     max_laser_range: float = param(30.0, 'beams longer than this are not used', 'm', 0.5, 300.0)
+    max_points: int = param(500, 'most end points of one scan that are inserted', '', 20, 100000)
     p_hit: float = param(0.65, 'occupancy probability that one hit adds', '', 0.5, 0.99)
     p_miss: float = param(0.49, 'occupancy probability that one miss leaves', '', 0.01, 0.5)
     bias2: tuple[float, ...] = param(
@@ -244,6 +245,9 @@ class ScanMatch(Group):
     )
     min_score: float = param(
         0.3, 'mean hit probability below which a match is not used', '', 0.0, 1.0
+    )
+    good_score: float = param(
+        0.55, 'mean hit probability below which the start is searched for', '', 0.0, 1.0
     )
     search_window: float = param(0.1, 'half width of the search', 'm', 0.0, 10.0)
     search_angle: float = param(0.35, 'half width of the search', 'rad', 0.0, 3.2)

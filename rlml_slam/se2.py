@@ -22,22 +22,22 @@ def wrap(angle: ArrayLike) -> Array:
 def rotation(theta: ArrayLike) -> Array:
     """R(theta) ``(..., 2, 2)``, which rotates body coordinates into the parent frame."""
     theta = np.asarray(theta, dtype=np.float64)
-    c, s = np.cos(theta), np.sin(theta)
-    return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+    R = np.empty((*theta.shape, 2, 2))
+    R[..., 0, 0] = R[..., 1, 1] = np.cos(theta)
+    R[..., 1, 0] = np.sin(theta)
+    R[..., 0, 1] = -R[..., 1, 0]
+    return R
 
 
 def compose(T_a_b: ArrayLike, T_b_c: ArrayLike) -> Array:
     """T_a_c = T_a_b T_b_c."""
     a, b = np.asarray(T_a_b, dtype=np.float64), np.asarray(T_b_c, dtype=np.float64)
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
-    return np.stack(
-        [
-            a[..., 0] + c * b[..., 0] - s * b[..., 1],
-            a[..., 1] + s * b[..., 0] + c * b[..., 1],
-            wrap(a[..., 2] + b[..., 2]),
-        ],
-        -1,
-    )
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    out[..., 0] = a[..., 0] + c * b[..., 0] - s * b[..., 1]
+    out[..., 1] = a[..., 1] + s * b[..., 0] + c * b[..., 1]
+    out[..., 2] = wrap(a[..., 2] + b[..., 2])
+    return out
 
 
 def inverse(T_a_b: ArrayLike) -> Array:
@@ -54,20 +54,22 @@ def between(T_a_b: ArrayLike, T_a_c: ArrayLike) -> Array:
     a, b = np.asarray(T_a_b, dtype=np.float64), np.asarray(T_a_c, dtype=np.float64)
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
-    return np.stack([c * dx + s * dy, -s * dx + c * dy, wrap(b[..., 2] - a[..., 2])], -1)
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    out[..., 0] = c * dx + s * dy
+    out[..., 1] = c * dy - s * dx
+    out[..., 2] = wrap(b[..., 2] - a[..., 2])
+    return out
 
 
 def transform(T_a_b: ArrayLike, p_b: ArrayLike) -> Array:
     """Points ``(..., n, 2)`` of frame b, by poses ``(..., 3)``, in frame a."""
     a, p = np.asarray(T_a_b, dtype=np.float64), np.asarray(p_b, dtype=np.float64)
     c, s = np.cos(a[..., 2])[..., None], np.sin(a[..., 2])[..., None]
-    return np.stack(
-        [
-            a[..., 0, None] + c * p[..., 0] - s * p[..., 1],
-            a[..., 1, None] + s * p[..., 0] + c * p[..., 1],
-        ],
-        -1,
-    )
+    x = a[..., 0, None] + c * p[..., 0] - s * p[..., 1]
+    out = np.empty((*x.shape, 2))
+    out[..., 0] = x
+    out[..., 1] = a[..., 1, None] + s * p[..., 0] + c * p[..., 1]
+    return out
 
 
 def compose_jacobians(T_a_b: ArrayLike, T_b_c: ArrayLike) -> tuple[Array, Array]:

@@ -204,7 +204,11 @@ class FrontEnd:
         prior = se2.between(anchor, self.state.x[:3])
         floor = np.zeros((3, 3))
         floor[[0, 1, 2], [0, 1, 2]] = p.floor2
-        found = match(submap, points, prior, np.linalg.inv(cov + floor), p)
+        strength = np.linalg.inv(cov + floor)
+        found = match(submap, points, prior, strength, p, searched=False)
+        if found.score < p.good_score or found.prior_weight < 0.5:
+            searched = match(submap, points, prior, strength, p)
+            found = searched if searched.score > found.score else found
         if found.score < p.min_score:
             return Evidence(scan=True, beams=len(points), score=found.score)
         information = observability.information(submap, points, found.pose, p)

@@ -80,9 +80,10 @@ class ScanGraph:
         if len(key.points) < self._p.scan_match.min_points:
             return ()
         points = thinning.thin(key.points, self._p.scan_match.voxel, self._p.scan_match.max_points)
+        p = self._p.submap
         for m in self._active:
             self._tie(m, key, points)
-        self._insert(key)
+        self._insert(key, thinning.thin(key.points, p.resolution, p.max_points))
         self._count += 1
         if not self._p.loop_closure.enabled or self._count % self._p.loop_closure.every:
             return ()
@@ -115,7 +116,7 @@ class ScanGraph:
         self.changed |= closure
         return self._graph.add_edge(kind, i, j, delta, relative_information(delta, cov))
 
-    def _insert(self, key: Keyframe) -> None:
+    def _insert(self, key: Keyframe, points: Array) -> None:
         size = self._p.back_end.submap_size
         if self._active and len(self._active[0].members) >= size and len(self._active) > 1:
             done = self._active.pop(0)
@@ -127,9 +128,8 @@ class ScanGraph:
         for m in self._active:
             # inside one submap the front end's path is smoother than the graph's
             T = se2.between(se2.compose(m.anchor.T_local, TURN), key.T_local)
-            assert key.points is not None
             assert key.origin is not None
-            m.submap.insert(se2.transform(T, key.points), se2.transform(T, key.origin[None])[0])
+            m.submap.insert(se2.transform(T, points), se2.transform(T, key.origin[None])[0])
             m.members.add(key.index)
             m.centre = m.centre + (T[:2] - m.centre) / len(m.members)
 

@@ -8,6 +8,7 @@ import math
 import numpy as np
 
 from rlml_slam import params, se2
+from rlml_slam.matching import thinning
 from rlml_slam.matching.submap import Submap
 from rlml_slam.rlml.joint_state import JointState
 from rlml_slam.se2 import Array
@@ -44,6 +45,7 @@ class Submaps:
                 return False
         self._last = pose
         self._turn_over(state)
+        points = thinning.thin(points, self._p.resolution, self._p.max_points)
         for slot, submap in enumerate(self._maps):
             T = se2.between(state.anchor(slot), pose)
             submap.insert(se2.transform(T, points), se2.transform(T, origin[None])[0])
