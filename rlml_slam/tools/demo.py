@@ -35,7 +35,7 @@ RATE = 2.5  # simulated seconds per second: two cores keep up with three process
 STILL = 3.0  # [s] simulated: standing at the end, in which the last map is published
 START_TIMEOUT = 60.0  # [s] for three processes to start and to find each other
 SILENCE = 15.0  # [s] without a pose while the simulator runs: something is broken
-LISTENERS = 3  # of the scan: front end, back end and recorder
+LISTENERS = 2  # of the scan: front end and recorder
 
 
 def add_parser(subparsers: Any) -> None:
@@ -152,6 +152,7 @@ def listen(
     with Progress('driving', length, quiet) as progress:
         while finished is None or not recorder.has_caught_up(finished):
             executor.spin_once(timeout_sec=0.1)
+            recorder.is_ready()
             now = time.monotonic()
             processes.check('front_end', 'back_end')
             if finished is None and processes.has_ended('simulator'):

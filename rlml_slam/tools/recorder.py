@@ -59,9 +59,8 @@ class Recorder(Node):
         self._true_reflectors: Detections | None = None
         self._keyframes, self._closures = np.zeros((0, 3)), np.zeros((0, 2, 2))
         self._last_true: Array | None = None
+        self._scan: Any = None
         listen = self.create_subscription
-        # bytes: the stamp is all that is wanted of a scan
-        listen(LaserScan, 'scan', self.on_scan, SENSOR, raw=True)
         listen(PoseWithCovarianceStamped, 'pose', self.on_pose, DEEP)
         listen(Odometry, 'ground_truth', self.on_truth, DEEP)
         listen(PointCloud2, TRUE_REFLECTORS, self.on_true_reflectors, LATCHED)
@@ -70,6 +69,18 @@ class Recorder(Node):
         listen(PointCloud2, 'reflector_map_points', self.on_reflectors, LATCHED)
         listen(MarkerArray, 'graph', self.on_graph, LATCHED)
         listen(DiagnosticArray, '/diagnostics', self.on_diagnostics, DEEP)
+
+    def is_ready(self) -> bool:
+        """Whether front end and back end are there; from then on scans are listened to.
+
+        The simulator waits for this listener, so that nobody misses the beginning.
+        """
+        if self._scan is None and self.count_publishers('pose') and self.count_publishers('graph'):
+            # bytes: the stamp is all that is wanted of a scan
+            self._scan = self.create_subscription(
+                LaserScan, 'scan', self.on_scan, SENSOR, raw=True
+            )
+        return self._scan is not None
 
     def on_scan(self, data: bytes) -> None:
         """One serialized LaserScan: note when it came."""

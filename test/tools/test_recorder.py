@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the recorder hears becomes a run."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+from made_runs import reflectors
+from numpy.testing import assert_allclose, assert_array_equal
+
+rclpy = pytest.importorskip('rclpy', reason='needs ROS 2 or its wheels')
+
+from rclpy.serialization import serialize_message  # noqa: E402
+
+from rlml_slam.maps.occupancy import OccupancyGrid  # noqa: E402
+from rlml_slam.ros import build  # noqa: E402
+from rlml_slam.ros.associated import build_reflector_map  # noqa: E402
+from rlml_slam.ros.messages import make_rclpy as make  # noqa: E402
+from rlml_slam.tools.recorder import Recorder  # noqa: E402
+from rlml_slam.types import Detections, Health, Level, Scan  # noqa: E402
+
+SECOND = 1_000_000_000
+
+
+@pytest.fixture
+def recorder(monkeypatch):
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    rclpy.init(args=[], domain_id=10 + os.getpid() % 90)
+    node = Recorder()
+    yield node
+    node.destroy_node()
+    rclpy.utilities.try_shutdown()
+
+
+def pose(k, x):
+    cov = np.diag([1e-4, 1e-4, 1e-6])
+    return build.pose_with_covariance(make, k * SECOND, 'map', np.array([x, 0.0, 0.1]), cov)
+
+
+def truth(k, x):
+    frames, none = ('map', 'base_link'), np.zeros((3, 3))
+    return build.odometry(make, k * SECOND, frames, np.array([x, 0.0, 0.1]), none)
+
+
+def scan(k):
+    ranges = np.ones(10, np.float32)
+    none = np.zeros(0, np.float32)
+    s = Scan(k * SECOND + 7, 'laser', 0.0, 0.1, 0.0, 0.1, 30.0, ranges, none)
+    return serialize_message(build.laser_scan(make, s))
+
+
+def test_poses_and_truth_become_errors(recorder):
+    for k in range(1, 5):
+        recorder.on_truth(truth(k, 0.5 * k))
+        recorder.on_pose(pose(k, 0.5 * k + 0.02))
+    assert recorder.distance == pytest.approx(1.5)
+    assert recorder.error() == pytest.approx(0.02)
+    assert 'error 2.0 cm' in recorder.note()
+    run = recorder.run('drive')
+    assert_array_equal(run.frames.stamps, [k * SECOND for k in range(1, 5)])
+    assert run.truth.is_map
+    assert_allclose(run.truth.trajectory.poses[:, 0], [0.5, 1.0, 1.5, 2.0])
+
+
+def test_scan_is_paired_with_its_pose_by_stamp(recorder):
+    recorder.on_scan(scan(3))
+    assert recorder.scans == 1
+    answer = pose(3, 0.0)
+    recorder.on_pose(answer)
+    assert recorder.latency_ms == []  # 7 ns off: another stamp
+    answer.header.stamp.nanosec = 7
+    recorder.on_pose(answer)
+    assert len(recorder.latency_ms) == 1
+
+
+def test_scans_after_the_last_trajectory_have_their_live_poses(recorder):
+    for k in range(1, 5):
+        recorder.on_pose(pose(k, 10.0 * k))
+    path = build.path(make, 1, 'map', [SECOND, 2 * SECOND], np.array([[1.0, 0, 0], [2.0, 0, 0]]))
+    recorder.on_trajectory(path)
+    t = recorder.trajectory()
+    assert_array_equal(t.stamps, SECOND * np.arange(1, 5))
+    assert_allclose(t.poses[:, 0], [1.0, 2.0, 30.0, 40.0])
+
+
+def test_products_of_the_back_end_are_kept(recorder):
+    cells = np.array([[-1, 0, 100], [0, 0, 0]], dtype=np.int8)
+    grid = OccupancyGrid(0.05, (-1.0, 2.0), cells)
+    recorder.on_map(build.occupancy_grid(make, 1, 'map', grid))
+    known = reflectors([[1.0, 2.0], [3.0, 4.0]])
+    recorder.on_reflectors(build_reflector_map(make, 1, 'map', known))
+    points = np.array([[1.0, 2.0]])
+    true = Detections(
+        SECOND, 'map', points, np.zeros((1, 2, 2)), np.array([7]), np.array([np.nan])
+    )
+    recorder.on_true_reflectors(build.detections(make, true))
+    recorder.on_truth(truth(1, 0.0))
+    run = recorder.run('drive')
+    assert_array_equal(run.grid.cells, cells)
+    assert (run.grid.resolution, run.grid.origin) == (0.05, (-1.0, 2.0))
+    assert_allclose(run.reflectors.points, known.points)
+    assert_array_equal(run.truth.reflector_ids, [7])
+
+
+def test_health_and_inputs_are_those_of_the_diagnostics(recorder):
+    figures = {'frames': 3, 'scan used': 12, 'scan late': 1, 'odom used': 40}
+    bad = Health(Level.DEGRADED, ('saw 0 of 4', 'no odometry'))
+    recorder.on_diagnostics(build.diagnostics(make, SECOND, 'front_end', bad, figures))
+    recorder.on_pose(pose(1, 0.0))
+    run = recorder.run('drive')
+    assert run.frames.levels == [1]
+    assert run.frames.reasons == [('saw 0 of 4', 'no odometry')]
+    assert run.inputs == {
+        'scan': {'used': 12, 'late': 1, 'invalid': 0},
+        'odom': {'used': 40, 'late': 0, 'invalid': 0},
+    }

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``rlml replay`` over the sample bags and over damaged and useless ones."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rlml_slam.params import Parameters
+from rlml_slam.ros import build
+from rlml_slam.ros.bag import BagWriter
+from rlml_slam.ros.messages import make_bag
+from rlml_slam.tools.main import main
+from rlml_slam.tools.replay import fates, replay
+from rlml_slam.tools.tum import Trajectory, read_tum, write_tum
+from rlml_slam.types import Detections, Scan
+
+BAGS = Path(__file__).resolve().parents[2] / 'bags'
+SECOND = 1_000_000_000
+
+
+@pytest.fixture(scope='module')
+def replayed(tmp_path_factory):
+    """Two replays of one bag."""
+    folder = tmp_path_factory.mktemp('replay')
+    codes = [main(['replay', str(BAGS / 'room'), '--out', str(folder / n)]) for n in ('a', 'b')]
+    assert codes == [0, 0]
+    return folder
+
+
+def test_two_replays_are_byte_identical(replayed):
+    for name in ('trajectory.tum', 'front_end.tum', 'map.pgm', 'map.yaml', 'reflectors.csv'):
+        assert (replayed / 'a' / name).read_bytes() == (replayed / 'b' / name).read_bytes()
+
+
+def test_room_is_mapped(replayed):
+    f = json.loads((replayed / 'a' / 'metrics.json').read_text())
+    assert f['alignment'] == 'none'
+    # a room of a few metres, 2 cm range noise; the bound is a few times what is reached
+    assert f['live_ate_rmse_m'] < 0.03
+    assert f['heading_rmse_deg'] < 0.3
+    assert f['reflectors_found'] == f['reflectors_true']
+    assert f['reflectors_spurious'] == 0
+    assert f['inputs']['scan']['invalid'] == 0
+    assert len(read_tum(replayed / 'a' / 'trajectory.tum')) == f['scans']
+
+
+def test_given_truth_is_aligned(replayed, tmp_path, capsys):
+    path = read_tum(replayed / 'a' / 'trajectory.tum')
+    moved = Trajectory(path.stamps, path.poses + np.array([1.0, 2.0, 0.0]))
+    write_tum(tmp_path / 'truth.tum', moved)
+    arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out'), '--json']
+    assert main([*arguments, '--truth', str(tmp_path / 'truth.tum')]) == 0
+    f = json.loads(capsys.readouterr().out)
+    assert f['alignment'] == 'se2'
+    assert f['ate_rmse_m'] < 1e-6
+
+
+def test_configuration_is_used(tmp_path, capsys):
+    config = tmp_path / 'c.yaml'
+    config.write_text('/**:\n  ros__parameters:\n    use_scan: false\n')
+    arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out')]
+    assert main([*arguments, '--config', str(config)]) == 0
+    assert 'scan' not in json.loads((tmp_path / 'out' / 'metrics.json').read_text())['inputs']
+    config.write_text('/**:\n  ros__parameters:\n    use_scam: false\n')
+    assert main([*arguments, '--config', str(config)]) == 1
+    assert "unknown parameter 'use_scam'" in capsys.readouterr().err
+
+
+def test_no_such_bag_is_one_line(tmp_path, capsys):
+    assert main(['replay', str(tmp_path / 'gone'), '--out', str(tmp_path / 'out')]) == 1
+    assert capsys.readouterr().err.endswith('gone: no such bag\n')
+
+
+def made_scan(stamp):
+    ranges = np.full(90, 2.0, dtype=np.float32)
+    none = np.zeros(0, np.float32)
+    return Scan(stamp, 'laser', -1.57, 0.035, 0.0, 0.1, 30.0, ranges, none)
+
+
+def write_scans(path, stamps):
+    with BagWriter(path) as bag:
+        for k, stamp in enumerate(stamps):
+            bag.write('/scan', build.laser_scan(make_bag, made_scan(stamp)), (k + 1) * SECOND)
+
+
+def test_bag_without_anything_usable_says_why(tmp_path, capsys):
+    with BagWriter(tmp_path / 'bag') as bag:
+        pose = np.zeros(3)
+        message = build.odometry(make_bag, SECOND, ('odom', 'base_link'), pose, np.eye(3))
+        bag.write('/odom', message, SECOND)
+    assert main(['replay', str(tmp_path / 'bag'), '--out', str(tmp_path / 'out')]) == 1
+    assert 'no scan and no reflectors in the bag' in capsys.readouterr().err
+
+
+def test_clock_that_jumps_back_gives_what_came_before(tmp_path, capsys):
+    first = [(100 + k) * SECOND for k in range(20)]
+    write_scans(tmp_path / 'bag', first + [k * SECOND for k in range(1, 20)])
+    assert main(['replay', str(tmp_path / 'bag'), '--out', str(tmp_path / 'out')]) == 1
+    assert 'jumped back' in capsys.readouterr().err
+    assert len(read_tum(tmp_path / 'out' / 'trajectory.tum')) == 20
+    assert 'jumped back' in json.loads((tmp_path / 'out' / 'metrics.json').read_text())['problem']
+
+
+def test_damaged_bag_gives_what_came_before(tmp_path, monkeypatch, capsys):
+    from rlml_slam.errors import BagError
+    from rlml_slam.ros.bag import BagReader
+
+    sound = BagReader.messages
+
+    def damaged(self, topics=None):
+        for k, message in enumerate(sound(self, topics)):
+            if k == 600:
+                raise BagError(f'{self.path}: damaged after {k} messages: cut')
+            yield message
+
+    monkeypatch.setattr(BagReader, 'messages', damaged)
+    assert main(['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out')]) == 1
+    err = capsys.readouterr().err
+    assert 'damaged after 600 messages: cut; the results hold what came before' in err
+    assert len(read_tum(tmp_path / 'out' / 'trajectory.tum')) > 50
+    assert 'damaged' in (tmp_path / 'out' / 'report.html').read_text()
+
+
+def test_file_cut_short_fails_in_one_line(tmp_path, capsys):
+    shutil.copytree(BAGS / 'room', tmp_path / 'bag')
+    (file,) = (tmp_path / 'bag').glob('*.mcap')
+    file.write_bytes(file.read_bytes()[:100_000])
+    assert main(['replay', str(tmp_path / 'bag'), '--out', str(tmp_path / 'out')]) == 1
+    err = capsys.readouterr().err
+    assert err.count('\n') == 1
+    assert str(tmp_path / 'bag') in err
+
+
+def test_reflectors_alone_are_enough(tmp_path):
+    with BagWriter(tmp_path / 'bag') as bag:
+        for k in range(30):
+            stamp = (k + 1) * SECOND // 10
+            points = np.array([[2.0, 1.0], [3.0, -1.0], [-1.0, 2.0]])
+            seen = Detections(
+                stamp, 'base_link', points, np.broadcast_to(4e-4 * np.eye(2), (3, 2, 2)),
+                np.full(3, -1), np.full(3, np.nan),
+            )  # fmt: skip
+            bag.write('/reflectors', build.detections(make_bag, seen), stamp)
+    run = replay(tmp_path / 'bag', Parameters())
+    assert len(run.reflectors) == 3
+    assert run.grid is None
+    assert np.abs(run.trajectory.poses).max() < 0.02
+
+
+def test_fates_name_what_could_not_be_read():
+    counts = {'scan': {'used': 5, 'waited_out': 1}, 'reflectors': {'used': 2}}
+    topics = {'scan': '/scan', 'reflector_poses': '/poses', 'imu': '/imu'}
+    assert fates(counts, {'/scan': 2, '/poses': 1}, topics) == {
+        'scan': {'used': 5, 'late': 0, 'invalid': 2, 'waited_out': 1},
+        'reflectors': {'used': 2, 'late': 0, 'invalid': 1},
+        'imu': {'used': 0, 'late': 0, 'invalid': 0},
+    }
