@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from rlml_slam.errors import SolverError
 from rlml_slam.graph import factors
 from rlml_slam.graph.robust import Losses
+from rlml_slam.graph.system import Tables
 from rlml_slam.graph.table import Column, FactorKind, FactorTable
 from rlml_slam.se2 import Array, wrap
 from rlml_slam.types import EdgeKind
@@ -141,6 +142,15 @@ class Graph:
         """Add a prior on landmark k (a survey); information (2, 2) in the map's axes."""
         kind, sizes = FactorKind.LANDMARK_PRIOR, (len(self._landmarks),)
         return int(self.landmark_priors.append(kind, [[k]], point, information, sizes)[0])
+
+    def tables(self) -> Tables:
+        """The buffers themselves, as the kernels take them; valid until the next add."""
+        losses = np.array([(one.kind, one.scale) for one in self.losses.in_order()])
+        return Tables(
+            self.fixed_poses, self.fixed_landmarks, self.edges.factors(),
+            self.sightings.factors(), self.pose_priors.factors(), self.landmark_priors.factors(),
+            losses,
+        )  # fmt: skip
 
     def residuals(self) -> Residuals:
         """Squared Mahalanobis norms of all factors at the current estimate."""

@@ -1,43 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Starts for a solve when the estimate at hand is bad: spanning tree and chordal relaxation."""
+"""Starts from the factors alone: plain odometry, spanning tree, chordal relaxation."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from rlml_slam.errors import SolverError
+from rlml_slam.graph.chordal import relax
+from rlml_slam.graph.equations import system_of
 from rlml_slam.graph.graph import Graph
-from rlml_slam.se2 import Array, compose, inverse, rotation, transform, wrap
+from rlml_slam.se2 import Array, compose, inverse, transform
 
-METHODS = ('none', 'auto', 'odometry', 'spanning_tree', 'chordal')
+METHODS = ('none', 'odometry', 'spanning_tree', 'chordal')
 
 
 def initialize(graph: Graph, method: str) -> None:
-    """Overwrite the free nodes by ``method``; 'auto' keeps the start if chordal is not better."""
+    """Overwrite the free nodes by ``method``; SolverError if there is no such method."""
     if method not in METHODS:
         raise SolverError(f'initialization {method!r} is none of {", ".join(METHODS)}')
-    if method == 'none' or not len(graph.poses):
-        return
-    if method == 'odometry':
-        spanning_tree(graph, consecutive_first=True)
-    elif method == 'spanning_tree':
-        spanning_tree(graph)
-    elif method == 'chordal':
-        chordal(graph)
-    else:
-        dof = 3 * len(graph.edges) + 2 * len(graph.sightings)
-        best = graph.chi2(), graph.poses.copy(), graph.landmarks.copy()
-        if best[0] <= 2.0 * dof:
-            return
-        for candidate in (spanning_tree, chordal):
-            candidate(graph)
-            value = graph.chi2()
-            if value < best[0]:
-                best = value, graph.poses.copy(), graph.landmarks.copy()
-        graph.poses[:], graph.landmarks[:] = best[1:]
+    if method == 'chordal':
+        relax(system_of(graph), graph.poses, graph.landmarks)
+    elif method != 'none' and len(graph.poses):
+        spanning_tree(graph, consecutive_first=method == 'odometry')
 
 
 def _roots(graph: Graph) -> NDArray[np.int64]:
@@ -108,62 +94,3 @@ def place_landmarks(graph: Graph) -> None:
     count = np.bincount(k, minlength=len(graph.landmarks))
     move = (count > 0) & ~graph.fixed_landmarks
     graph.landmarks[move] = total[move] / count[move, None]
-
-
-def chordal(graph: Graph) -> None:
-    """Rotations from the chordal relaxation, then positions with these rotations held.
-
-    Minimises the sum of w |r_j - R(delta) r_i|^2 over unconstrained 2-vectors r = (cos, sin) with
-    the fixed poses' r given, and projects on the circle (Martinec & Pajdla 2007; Carlone et al.
-    2015); w is the edge's information of the angle. Poses that no edge connects to a fixed one
-    start from the spanning tree.
-    """
-    spanning_tree(graph)
-    e = graph.edges
-    use = np.flatnonzero(e.enabled)
-    roots = _roots(graph)
-    free = np.ones(len(graph.poses), dtype=np.bool_)
-    free[roots] = False
-    i, j = e.nodes[use].T
-    touched = np.zeros(len(graph.poses), dtype=np.bool_)
-    touched[i] = touched[j] = True
-    free &= touched
-    column = np.where(free, np.cumsum(free) - 1, -1)
-    w = e.information[use][:, 2, 2]
-    turn = np.exp(1j * e.measured[use][:, 2])
-    z = np.exp(1j * graph.poses[:, 2])
-    z[free] = _complex_solve(column, i, j, w, turn, z)
-    graph.poses[:, 2] = wrap(np.where(free & (np.abs(z) > 1e-9), np.angle(z), graph.poses[:, 2]))
-    # positions: t_j - t_i = R_i t_delta, the same kind of problem with turn = 1
-    R = rotation(graph.poses[:, 2])
-    step = (R[i] @ e.measured[use][:, :2, None])[..., 0] @ np.array([1.0, 1j])
-    t = graph.poses[:, 0] + 1j * graph.poses[:, 1]
-    weight = 0.5 * (e.information[use][:, 0, 0] + e.information[use][:, 1, 1])
-    t[free] = _complex_solve(column, i, j, weight, np.ones(len(use), np.complex128), t, step)
-    graph.poses[free, 0], graph.poses[free, 1] = t.real[free], t.imag[free]
-    place_landmarks(graph)
-
-
-def _complex_solve(
-    column: NDArray[np.int64], i: NDArray[np.int64], j: NDArray[np.int64], w: Array,
-    turn: NDArray[np.complex128], given: NDArray[np.complex128],
-    step: NDArray[np.complex128] | float = 0.0,
-) -> NDArray[np.complex128]:  # fmt: skip
-    """Minimise the sum of w |x_j - turn x_i - step|^2 over the x with a column."""
-    size = int(column.max(initial=-1)) + 1
-    ci, cj = column[i], column[j]
-    fi, fj = ci >= 0, cj >= 0
-    both = fi & fj
-    rows = np.concatenate([ci[fi], cj[fj], ci[both], cj[both]])
-    cols = np.concatenate([ci[fi], cj[fj], cj[both], ci[both]])
-    off = -w[both] * np.conj(turn[both])
-    values = np.concatenate([w[fi], w[fj], off, np.conj(off)]).astype(np.complex128)
-    b = np.zeros(size, dtype=np.complex128)
-    step = np.broadcast_to(step, w.shape)
-    np.add.at(b, cj[fj], (w * step)[fj])
-    np.add.at(b, ci[fi], -(w * np.conj(turn) * step)[fi])
-    only_i, only_j = fi & ~fj, fj & ~fi
-    np.add.at(b, cj[only_j], (w * turn * given[i])[only_j])
-    np.add.at(b, ci[only_i], (w * np.conj(turn) * given[j])[only_i])
-    H = sparse.coo_matrix((values, (rows, cols)), (size, size)).tocsc()
-    return np.asarray(splu(H, permc_spec='MMD_AT_PLUS_A').solve(b)) if size else b

@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse.linalg import splu
 
 from rlml_slam.errors import SolverError
+from rlml_slam.graph.equations import system_of
+from rlml_slam.graph.fronts import factorise
 from rlml_slam.graph.graph import Graph
-from rlml_slam.graph.normal_equations import check_finite, normal_equations, unknowns
+from rlml_slam.graph.inverse import columns, diagonal_blocks
+from rlml_slam.graph.linearize import linearize
 from rlml_slam.se2 import Array
 
 
@@ -17,55 +21,70 @@ class Marginals:
     """Covariances at the current estimate of ``graph``, in the axes of the map.
 
     Robust weights count as information. A fixed node, and one that no enabled factor touches, has
-    covariance zero. Raises SolverError if the normal equations are singular.
+    covariance zero. Raises SolverError if the normal equations are singular, naming a node.
     """
 
     def __init__(self, graph: Graph) -> None:
-        check_finite(graph)
-        self._columns = unknowns(graph)
-        try:
-            self._factor = splu(
-                normal_equations(graph, self._columns).H, permc_spec='MMD_AT_PLUS_A',
-                diag_pivot_thresh=0.0, options={'SymmetricMode': True},
-            )  # fmt: skip
-        except RuntimeError as error:
-            raise SolverError(f'normal equations cannot be solved: {error}') from None
+        self._system = system = system_of(graph)
+        linearize(system, graph.poses, graph.landmarks, True)
+        failed = factorise(system.fronts, system.entries, system.values, system.stack)
+        num_poses = len(graph.poses)
+        if failed >= 0:
+            node = int(system.variables[system.structure.order[system.fronts[failed]['first']]][0])
+            name = f'pose {node}' if node < num_poses else f'landmark {node - num_poses}'
+            raise SolverError(f'normal equations are singular near {name}: too few measurements')
+        nodes = num_poses + len(graph.landmarks)
+        self._variable = np.full(nodes, -1, dtype=np.int64)
+        self._variable[system.variables['node']] = np.arange(len(system.variables))
+        self._landmark = num_poses
+
+    @cached_property
+    def _blocks(self) -> Array:
+        return diagonal_blocks(self._system)
 
     def poses(self, indices: ArrayLike) -> Array:
         """Covariances (k, 3, 3) of the poses ``indices`` (k,)."""
-        at = self._columns.poses[np.asarray(indices, dtype=np.int64)]
-        return self._blocks(at, 3, at, 3)
+        return self._pick(self._variable[: self._landmark][_indices(indices)])
 
     def landmarks(self, indices: ArrayLike) -> Array:
         """Covariances (k, 2, 2) of the landmarks ``indices`` (k,)."""
-        at = self._columns.landmarks[np.asarray(indices, dtype=np.int64)]
-        return self._blocks(at, 2, at, 2)
+        return self._pick(self._variable[self._landmark :][_indices(indices)])[:, :2, :2]
 
     def cross(self, pose: int, landmarks: ArrayLike) -> Array:
         """Covariances (k, 3, 2) between one pose and the landmarks (k,)."""
-        joint = self.joint([pose], landmarks)
-        k = len(np.asarray(landmarks, dtype=np.int64))
-        return np.swapaxes(joint[:3, 3:].reshape(3, k, 2), 0, 1)
+        p = self._rows([pose], ())
+        q = self._rows((), landmarks)
+        out = np.zeros((3, len(q)))
+        if p[0] >= 0:
+            free = q >= 0
+            out[:, free] = columns(self._system, p)[:, q[free]]
+        return np.swapaxes(out.reshape(3, -1, 2), 0, 1)
 
     def joint(self, poses: ArrayLike, landmarks: ArrayLike = ()) -> Array:
         """Joint covariance (3k + 2l, 3k + 2l) of the poses (k,), then the landmarks (l,)."""
-        p = self._columns.poses[np.asarray(poses, dtype=np.int64).reshape(-1)]
-        q = self._columns.landmarks[np.asarray(landmarks, dtype=np.int64).reshape(-1)]
-        at = np.concatenate([
-            np.where(p[:, None] < 0, -1, p[:, None] + np.arange(3)).ravel(),
-            np.where(q[:, None] < 0, -1, q[:, None] + np.arange(2)).ravel(),
-        ])  # fmt: skip
+        at = self._rows(poses, landmarks)
         free = np.flatnonzero(at >= 0)
-        unit = np.zeros((self._columns.size, len(free)))
-        unit[at[free], np.arange(len(free))] = 1.0
         out = np.zeros((len(at), len(at)))
-        out[np.ix_(free, free)] = self._factor.solve(unit)[at[free]]
+        out[np.ix_(free, free)] = columns(self._system, at[free])[:, at[free]]
         return 0.5 * (out + out.T)
 
-    def _blocks(self, at: NDArray[np.int64], d: int, to: NDArray[np.int64], e: int) -> Array:
-        out = np.zeros((len(at), d, e))
-        for k in np.flatnonzero((at >= 0) & (to >= 0)):
-            unit = np.zeros((self._columns.size, e))
-            unit[to[k] + np.arange(e), np.arange(e)] = 1.0
-            out[k] = self._factor.solve(unit)[at[k] : at[k] + d]
+    def _pick(self, variables: NDArray[np.int64]) -> Array:
+        out = np.zeros((len(variables), 3, 3))
+        out[variables >= 0] = self._blocks[variables[variables >= 0]]
         return out
+
+    def _rows(self, poses: ArrayLike, landmarks: ArrayLike) -> NDArray[np.int64]:
+        """Rows of the system that belong to the poses (3 each) and landmarks (2 each), or -1."""
+        rows = []
+        for variables, size in (
+            (self._variable[: self._landmark][_indices(poses)], 3),
+            (self._variable[self._landmark :][_indices(landmarks)], 2),
+        ):
+            first = self._system.variables['scalar'][np.maximum(variables, 0)]
+            each = first[:, None] + np.arange(size)
+            rows.append(np.where(variables[:, None] < 0, -1, each).ravel())
+        return np.concatenate(rows)
+
+
+def _indices(indices: ArrayLike) -> NDArray[np.int64]:
+    return np.asarray(indices, dtype=np.int64).reshape(-1)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rlml_slam.errors import SolverError
+from rlml_slam.graph.system import Factors
 from rlml_slam.se2 import Array
 
 
@@ -102,6 +103,13 @@ class FactorTable:
     def enabled(self) -> NDArray[np.bool_]:
         """Whether each factor takes part; writable."""
         return self._enabled.view
+
+    def factors(self) -> Factors:
+        """The buffers themselves, as the kernels take them."""
+        return Factors(
+            self._nodes.view, self._measured.view, self._information.view, self._kinds.view,
+            self._enabled.view,
+        )  # fmt: skip
 
     def describe(self, index: int) -> str:
         """Like 'factor 17 (closure, pose 3 to pose 9)', for messages."""

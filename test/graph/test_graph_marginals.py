@@ -2,10 +2,10 @@
 import numpy as np
 import pytest
 from made_graphs import loop_graph
+from normal_equations import normal_equations, unknowns
 
 from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.marginals import Marginals
-from rlml_slam.graph.normal_equations import normal_equations, unknowns
 from rlml_slam.graph.solver import optimize
 from rlml_slam.types import EdgeKind
 

@@ -14,7 +14,7 @@ from rlml_slam.graph.solver import optimize
 from rlml_slam.types import EdgeKind
 
 TIGHT = params.Solver(relative_tolerance=1e-12, initialization='none')
-METHODS = ('gauss_newton', 'levenberg_marquardt', 'dog_leg')
+METHODS = ('auto', 'gauss_newton', 'levenberg_marquardt', 'dog_leg')
 
 
 def test_hand_solved_graph():
@@ -200,6 +200,7 @@ def test_normalised_error_is_chi2_distributed():
         ('m3500/manhattanOlson3500.g2o', 146.08),
         ('m3500/manhattanOlson3500-olson.g2o', 146.08),
         ('m3500/sesync-manhattan.g2o', 3549.0),
+        ('intel/input_INTEL_g2o.g2o', 215.83),
         ('intel/vertigo-intel.g2o', 546.46),
         ('intel/sesync-intel.g2o', 45.00),
         ('small/simulation-pose-landmark.g2o', 474.1),

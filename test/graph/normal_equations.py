@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Normal equations of a graph with NumPy and SciPy: H dx = -g, H = J^T W J sparse.
 
-The readable form of what the compiled solver does, from the batched factors.
+From the batched factors: the oracle that the compiled solver is held against.
 """
 
 from __future__ import annotations

@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Chordal relaxation: a start for bad estimates, from linear least squares alone.
+
+With r = (cos, sin) of a pose's heading taken as any complex number, t its position and m a
+landmark as complex numbers, the residuals
+
+    edge       r_j - e^(i theta_delta) r_i   and   t_j - t_i - r_i t_delta
+    sighting   m - t - r z
+
+are linear (Martinec & Pajdla 2007; Carlone, Tron, Daniilidis & Dellaert 2015). Weights are the
+information of the angle and the mean information of the position, because the axes of the
+residual are not known yet. Every block of the normal matrix is a complex number w conj(c_p) c_q,
+so the same fronts serve with two rows per unknown. Without sightings the headings are solved
+first and the positions after them; with sightings all at once, because then the landmarks are
+what ties the headings together, and the positions again with the headings on the unit circle.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rlml_slam.compiled import kernel, part
+from rlml_slam.graph.fronts import factorise, lay_out, solve_lower, solve_upper
+from rlml_slam.graph.structure import Records
+from rlml_slam.graph.system import System, place
+from rlml_slam.se2 import Array
+
+
+@kernel
+def relax(system: System, poses: Array, landmarks: Array) -> bool:
+    """Overwrite the free nodes by the relaxed solution; False if it cannot be solved."""
+    n = len(poses)
+    state = np.empty((n, 4))  # r and t
+    for i in range(n):
+        state[i, 0], state[i, 1] = math.cos(poses[i, 2]), math.sin(poses[i, 2])
+        state[i, 2], state[i, 3] = poses[i, 0], poses[i, 1]
+    together = len(system.sightings) > 0
+    good = _stage(system, state, landmarks, True, together)
+    variables = system.variables
+    if good:
+        for a in range(len(variables)):
+            i = variables[a]['node']
+            if i < n:
+                length = math.hypot(state[i, 0], state[i, 1])
+                if not length > 1e-9:
+                    state[i, 0], state[i, 1], length = 1.0, 0.0, 1.0
+                state[i, 0] /= length
+                state[i, 1] /= length
+        good = _stage(system, state, landmarks, False, True)
+    if good:
+        for a in range(len(variables)):
+            i = variables[a]['node']
+            if i < n:
+                poses[i, 0], poses[i, 1] = state[i, 2], state[i, 3]
+                poses[i, 2] = math.atan2(state[i, 1], state[i, 0])
+    place(system.structure, system.fronts, system.entries, variables, system.edges,
+          system.sightings)  # fmt: skip
+    return good
+
+
+@part
+def _stage(system: System, state: Array, landmarks: Array, turn: bool, shift: bool) -> bool:
+    """Solve for the headings (``turn``), the positions and landmarks (``shift``), or both."""
+    variables, edges, sightings = system.variables, system.edges, system.sightings
+    n = len(state)
+    dims = np.empty(len(variables), np.int64)
+    rows = 0
+    for a in range(len(variables)):
+        is_pose = variables[a]['node'] < n
+        dims[a] = (2 if turn and is_pose else 0) + (2 if shift else 0)
+        rows += dims[a]
+    fronts, entries, size = lay_out(system.structure, dims)
+    place(system.structure, fronts, entries, variables, edges, sightings)
+    values = np.empty(fronts[len(fronts) - 1]['panel'])
+    for i in range(len(values)):
+        values[i] = 0.0
+    g = np.empty(rows)
+    for i in range(rows):
+        g[i] = 0.0
+    _edges(edges, variables, state, values, g, turn, shift)
+    if shift:
+        _sightings(sightings, variables, state, landmarks, values, g, turn)
+    _priors(system.priors, variables, state, landmarks, values, g, turn, shift)
+    if factorise(fronts, entries, values, np.empty(size)) >= 0:
+        return False
+    solve_lower(fronts, entries, values, g)
+    solve_upper(fronts, entries, values, g)
+    for a in range(len(variables)):
+        i, k = variables[a]['node'], variables[a]['scalar']
+        if i >= n:
+            if shift:
+                landmarks[i - n, 0] -= g[k]
+                landmarks[i - n, 1] -= g[k + 1]
+            continue
+        if turn:
+            state[i, 0] -= g[k]
+            state[i, 1] -= g[k + 1]
+            k += 2
+        if shift:
+            state[i, 2] -= g[k]
+            state[i, 3] -= g[k + 1]
+    return True
+
+
+@part
+def _add(v: Array, k: int, ld: int, re: float, im: float) -> None:
+    """Add a complex number to a 2 by 2 block."""
+    v[k] += re
+    v[k + 1] += im
+    v[k + ld] -= im
+    v[k + ld + 1] += re
+
+
+@part
+def _edges(
+    edges: Records, variables: Records, state: Array, v: Array, g: Array, turn: bool, shift: bool
+) -> None:
+    t = 2 if turn else 0  # first row of the position
+    for f in range(len(edges)):
+        z = edges[f]
+        i, j, a, b = z['i'], z['j'], z['a'], z['b']
+        block = z['block']
+        ga, ka, la = 0, 0, 0
+        gb, kb, lb = 0, 0, 0
+        if a >= 0:
+            ga, ka, la = variables[a]['scalar'], variables[a]['address'], variables[a]['stride']
+        if b >= 0:
+            gb, kb, lb = variables[b]['scalar'], variables[b]['address'], variables[b]['stride']
+        first = ga < gb  # the columns are those of a
+        ld = la if first else lb
+        if turn:
+            w, c, s = z['I22'], z['c'], z['s']
+            e0 = w * (state[j, 0] - c * state[i, 0] + s * state[i, 1])
+            e1 = w * (state[j, 1] - s * state[i, 0] - c * state[i, 1])
+            if a >= 0:
+                g[ga] -= c * e0 + s * e1
+                g[ga + 1] -= c * e1 - s * e0
+                _add(v, ka, la, w, 0.0)
+            if b >= 0:
+                g[gb] += e0
+                g[gb + 1] += e1
+                _add(v, kb, lb, w, 0.0)
+            if block >= 0:
+                _add(v, block, ld, -w * c, -w * s if first else w * s)
+        if shift:
+            w = 0.5 * (z['I00'] + z['I11'])
+            # the record holds R_delta^T t_delta
+            dx, dy = z['c'] * z['x'] - z['s'] * z['y'], z['s'] * z['x'] + z['c'] * z['y']
+            e0 = w * (state[j, 2] - state[i, 2] - dx * state[i, 0] + dy * state[i, 1])
+            e1 = w * (state[j, 3] - state[i, 3] - dy * state[i, 0] - dx * state[i, 1])
+            if a >= 0:
+                g[ga + t] -= e0
+                g[ga + t + 1] -= e1
+                _add(v, ka + t * la + t, la, w, 0.0)
+                if turn:
+                    g[ga] -= dx * e0 + dy * e1
+                    g[ga + 1] -= dx * e1 - dy * e0
+                    _add(v, ka, la, w * (dx * dx + dy * dy), 0.0)
+                    _add(v, ka + t, la, w * dx, w * dy)
+            if b >= 0:
+                g[gb + t] += e0
+                g[gb + t + 1] += e1
+                _add(v, kb + t * lb + t, lb, w, 0.0)
+            if block >= 0:
+                _add(v, block + t * ld + t, ld, -w, 0.0)
+                if turn and first:
+                    _add(v, block + t, ld, -w * dx, -w * dy)
+                elif turn:
+                    _add(v, block + t * ld, ld, -w * dx, w * dy)
+
+
+@part
+def _sightings(
+    sightings: Records, variables: Records, state: Array, landmarks: Array, v: Array, g: Array,
+    turn: bool,
+) -> None:  # fmt: skip
+    t = 2 if turn else 0
+    for f in range(len(sightings)):
+        z = sightings[f]
+        i, j, a, b = z['i'], z['j'], z['a'], z['b']
+        w, x, y = 0.5 * (z['I00'] + z['I11']), z['x'], z['y']
+        e0 = w * (landmarks[j, 0] - state[i, 2] - x * state[i, 0] + y * state[i, 1])
+        e1 = w * (landmarks[j, 1] - state[i, 3] - y * state[i, 0] - x * state[i, 1])
+        ga, gb, ld = 0, 0, 0
+        if b >= 0:
+            gb, ld = variables[b]['scalar'], variables[b]['stride']
+            g[gb] += e0
+            g[gb + 1] += e1
+            _add(v, variables[b]['address'], ld, w, 0.0)
+        if a >= 0:
+            ga, k, la = variables[a]['scalar'], variables[a]['address'], variables[a]['stride']
+            g[ga + t] -= e0
+            g[ga + t + 1] -= e1
+            _add(v, k + t * la + t, la, w, 0.0)
+            if turn:
+                g[ga] -= x * e0 + y * e1
+                g[ga + 1] -= x * e1 - y * e0
+                _add(v, k, la, w * (x * x + y * y), 0.0)
+                _add(v, k + t, la, w * x, w * y)
+            if ga < gb:
+                ld = la
+        k = z['block']
+        if k >= 0 and ga < gb:  # rows of the landmark, columns of the pose
+            _add(v, k + t * ld, ld, -w, 0.0)
+            if turn:
+                _add(v, k, ld, -w * x, -w * y)
+        elif k >= 0:
+            _add(v, k + t, ld, -w, 0.0)
+            if turn:
+                _add(v, k, ld, -w * x, w * y)
+
+
+@part
+def _priors(
+    priors: Records, variables: Records, state: Array, landmarks: Array, v: Array, g: Array,
+    turn: bool, shift: bool,
+) -> None:  # fmt: skip
+    n = len(state)
+    for f in range(len(priors)):
+        z = priors[f]
+        i, a = z['i'], z['a']
+        if a < 0:
+            continue
+        k, ld, gk = variables[a]['address'], variables[a]['stride'], variables[a]['scalar']
+        if turn and i < n:
+            w = z['I22']
+            g[gk] += w * (state[i, 0] - math.cos(z['theta']))
+            g[gk + 1] += w * (state[i, 1] - math.sin(z['theta']))
+            _add(v, k, ld, w, 0.0)
+            k += 2 * ld + 2
+            gk += 2
+        if shift:
+            w = 0.5 * (z['I00'] + z['I11'])
+            x, y = (state[i, 2], state[i, 3]) if i < n else (
+                landmarks[i - n, 0], landmarks[i - n, 1])  # fmt: skip
+            g[gk] += w * (x - z['x'])
+            g[gk + 1] += w * (y - z['y'])
+            _add(v, k, ld, w, 0.0)
