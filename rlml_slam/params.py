@@ -335,11 +335,11 @@ class Solver(Group):
 
     max_iterations: int = param(50, 'iterations at most', '', 1, 10000)
     relative_tolerance: float = param(
-        1e-6, 'stop when the cost falls by less than this share', '', 0.0, 1.0
+        1e-5, 'stop when the cost falls by less than this share', '', 0.0, 1.0
     )
     method: str = param(
-        'dog_leg', 'how a step is chosen',
-        choices=('gauss_newton', 'levenberg_marquardt', 'dog_leg'),
+        'auto', 'how a step is chosen; auto is Gauss-Newton, and dog-leg where that fails',
+        choices=('auto', 'gauss_newton', 'levenberg_marquardt', 'dog_leg'),
     )  # fmt: skip
     initialization: str = param(
         'auto', 'start of a solve: the estimate at hand, or one computed from the edges; auto '
