@@ -26,6 +26,7 @@ help:  ## this list
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile | expand -t 16
 
 env: $(MADE)  ## make .venv, in which .venv/bin/rlml is the command
+	@echo "== $(VENV) is ready"
 
 $(MADE): setup.py $(wildcard requirements/*.txt) requirements/install
 	@PYTHON='$(PYTHON)' requirements/install $(VENV) $(ROS)

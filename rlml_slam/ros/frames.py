@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from rlml_slam.errors import InputError
-from rlml_slam.motion import STILL, compose_motion
+from rlml_slam.motion import compose_motion
 from rlml_slam.ros import build
 from rlml_slam.ros.associated import Associated
 from rlml_slam.ros.cloud import build_cloud, read_cloud
@@ -144,7 +144,7 @@ class FrameJoin:
         self._records: deque[Record] = deque()
         self._points: dict[int, Array] = {}
         self._associated: dict[int, Associated] = {}
-        self._pending = STILL
+        self._pending: Motion | None = None
         self.paused = False
         self.incomplete = 0
 
@@ -179,14 +179,15 @@ class FrameJoin:
             if self.paused:
                 self._pending = frame.observation.motion
             else:
-                self._pending = STILL
+                self._pending = None
                 out.append(replace(head, frame=frame))
         return out
 
     def _whole(self, frame: Frame, points: Array | None, seen: Associated | None) -> Frame:
+        motion = frame.observation.motion
         observation = replace(
             frame.observation,
-            motion=compose_motion(self._pending, frame.observation.motion),
+            motion=motion if self._pending is None else compose_motion(self._pending, motion),
             points=points,
             detections=None if seen is None else seen.detections,
         )

@@ -18,7 +18,7 @@ from rlml_slam.types import Reflectors
 
 # visualization_msgs/Marker
 CYLINDER, LINE_LIST, SPHERE_LIST, TEXT, DELETEALL = 3, 5, 7, 9, 3
-SCALE_95 = math.sqrt(5.991)  # chi^2 with 2 degrees of freedom at 95 %
+SCALE_95 = math.sqrt(-2.0 * math.log(0.05))  # of chi^2 with 2 degrees of freedom
 HEIGHT = 1.5  # [m] of the cylinder drawn for a reflector
 
 ORANGE = (1.0, 0.55, 0.1, 1.0)

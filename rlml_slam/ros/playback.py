@@ -14,7 +14,7 @@ from rlml_slam.errors import BagError
 from rlml_slam.ros.bag import BagReader
 from rlml_slam.ros.messages import rclpy_class
 
-DEPTH = 100
+DEPTH = 1000  # a subscriber that pauses gets all the same what it missed
 
 
 class Playback:

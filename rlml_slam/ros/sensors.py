@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -20,7 +21,8 @@ from rlml_slam.types import Detections, Observation
 TF_PATIENCE = 1_000_000_000  # [ns] of stamps that a sensor's place on /tf_static is waited for
 RELIABLE = QoSProfile(depth=10)
 # deeper than sensor data's 5: a pause of the interpreter must not cost a scan
-SENSOR = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+DEPTH = 200
+SENSOR = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -47,13 +49,14 @@ class Sensors:
         self._begin(Extrinsics())
         self._waits = subscribe_static(node, self._feed.extrinsics)
         self._held: list[tuple[str, Any]] = []
+        self._subscriptions: dict[str, Any] = {}
         for stream in streams:
             parameter, msgtype, _ = STREAMS[stream]
             # without scan matching, a scan still asks for a pose at its stamp
             if getattr(params.node, USED_BY[stream]) or stream == 'scan':
-                node.create_subscription(
+                self._subscriptions[stream] = node.create_subscription(
                     rclpy_class(msgtype), getattr(params.node, parameter),
-                    lambda msg, stream=stream: self.add(stream, msg), SENSOR,
+                    lambda msg, stream=stream: self.receive(stream, msg), SENSOR,
                 )  # fmt: skip
 
     def _begin(self, extrinsics: Extrinsics) -> None:
@@ -65,6 +68,31 @@ class Sensors:
     def extrinsics(self) -> Extrinsics:
         """Where the sensors sit, as far as /tf_static has told."""
         return self._feed.extrinsics
+
+    def receive(self, stream: str, msg: Any) -> None:
+        """One message, and all of the other streams that have arrived as well, by stamp.
+
+        The executor serves the queues in turn. After a pause, scans would overtake the odometry
+        that is more frequent and lies in the queue beside theirs.
+        """
+        queues = [
+            [(s, msg), *self._taken(s)] if s == stream else self._taken(s)
+            for s in self._subscriptions
+        ]
+        for item in heapq.merge(*queues, key=lambda item: _stamp(item[1])):
+            self.add(*item)
+
+    def _taken(self, stream: str) -> list[tuple[str, Any]]:
+        """Everything in the queue of a stream, in order of arrival."""
+        subscription = self._subscriptions[stream]
+        out: list[tuple[str, Any]] = []
+        with subscription.handle:
+            while len(out) < DEPTH:
+                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+                if taken is None:
+                    break
+                out.append((stream, taken[0]))
+        return out
 
     def add(self, stream: str, msg: Any) -> None:
         """One message of a stream."""

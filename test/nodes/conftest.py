@@ -20,3 +20,19 @@ def live(monkeypatch):
     context = Live()
     yield context
     context.close()
+
+
+@pytest.fixture
+def start():
+    """Starts executables, and ends them with the test."""
+    from live import Process
+
+    processes = []
+
+    def run(name, *args):
+        processes.append(Process(name, *args))
+        return processes[-1]
+
+    yield run
+    for process in processes:
+        process.close()

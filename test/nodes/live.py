@@ -123,3 +123,9 @@ class Process:
             out, _ = self._process.communicate()
             raise AssertionError(f'did not end: {out}') from None
         return self._process.returncode, out
+
+    def close(self):
+        """End it, whatever happened before."""
+        self._process.kill()
+        if not self._process.stdout.closed:
+            self._process.communicate()

@@ -282,3 +282,21 @@ def test_topics_are_relative_and_named_by_parameters(live):
     node = live.start(FrontEndNode, scan_topic='front/scan')
     assert node.count_subscribers('front/scan') == 1
     assert node.count_subscribers('scan') == 0
+
+
+def test_scans_do_not_overtake_odometry_after_a_pause(live, node):
+    publishers = {}
+    for stream, msg in room(seconds=4.0):
+        if stream not in publishers:
+            publishers[stream] = live.ear.create_publisher(type(msg), stream, 1000)
+    live.spin_until(
+        lambda: all(p.get_subscription_count() == 1 for p in publishers.values()),
+        what='no connection to the node',
+    )
+    sent = 0
+    for stream, msg in room(seconds=4.0):
+        publishers[stream].publish(msg)
+        sent += stream == 'scan'
+    live.spin_until(lambda: used(node, 'scan') >= sent - 1)
+    assert used(node, 'scan', 'waited_out') == used(node, 'scan', 'late') == 0
+    assert node.last.observation.motion.known

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The executables as processes over DDS: start, work, stop, and what a user's mistake gives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from live import LATCHED, ROOM, ROOT
+from rclpy.qos import QoSProfile
+
+from rlml_slam import se2
+from rlml_slam.ros import convert
+from rlml_slam.ros.bag import BagReader
+
+DEEP = QoSProfile(depth=2000)
+SECOND = 1_000_000_000
+PLAY = ('-p', 'rate:=10.0', '-p', 'clock_rate:=10.0', '-p', 'wait_for_subscribers:=1')
+POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+
+
+def ended(process):
+    code, out = process.finish()
+    assert 'Traceback' not in out, out
+    return code, out
+
+
+def test_bag_player_publishes_all_of_a_bag_with_a_clock_and_ends(live, start):
+    with BagReader(ROOM) as bag:
+        want = {t.name: t.count for t in bag.topics.values()}
+        kinds = {t.name: t.msgtype for t in bag.topics.values()}
+        last = bag.end
+    topics = ['/scan', '/reflectors', '/clock']
+    for topic in topics:
+        live.listen(topic, kinds.get(topic, 'rosgraph_msgs/msg/Clock'), DEEP)
+    live.listen('/ground_truth_reflectors', kinds['/ground_truth_reflectors'], LATCHED)
+    player = start('bag_player', '--ros-args', '-p', f'bag:={ROOM}', *PLAY)
+    live.spin_until(lambda: len(live.heard['/scan']) == want['/scan'], timeout=60.0)
+    live.drain()
+    assert ended(player)[0] == 0
+    for topic in topics[:-1]:
+        assert len(live.heard[topic]) == want[topic], topic
+    assert len(live.heard['/ground_truth_reflectors']) == 1
+    ticks = [m.clock.sec * SECOND + m.clock.nanosec for m in live.heard['/clock']]
+    assert ticks == sorted(ticks)
+    # the clock goes on to the end, at 10 Hz
+    assert last - ticks[-1] < SECOND // 5
+    assert set(np.diff(ticks)) == {SECOND // 10}
+
+
+def test_processes_map_a_recording_and_stop_cleanly(live, start):
+    """Front end, back end and player over DDS; the reflectors hold the robot to the truth."""
+    live.listen('pose', POSE, DEEP)
+    live.listen('map', 'nav_msgs/msg/OccupancyGrid', LATCHED)
+    live.listen('/ground_truth', 'nav_msgs/msg/Odometry', DEEP)
+    nodes = [
+        start(name, '--ros-args', '-p', 'laser_pose:=[0.2, 0.0, 0.0]', '-p', 'use_sim_time:=true')
+        for name in ('front_end', 'back_end')
+    ]
+    live.spin_until(
+        lambda: live.ear.count_publishers('pose') == 1 and live.ear.count_publishers('map') == 1,
+        timeout=60.0,
+    )
+    player = start(
+        'bag_player', '--ros-args', '-p', f'bag:={ROOM}', '-p', 'rate:=4.0',
+        '-p', 'wait_for_subscribers:=1',
+    )  # fmt: skip
+    live.spin_until(lambda: len(live.heard['pose']) > 250 and live.heard['map'], timeout=60.0)
+    assert ended(player)[0] == 0
+    for node in nodes:
+        node.interrupt()
+    for node in nodes:
+        code, out = ended(node)
+        assert code == 0, out
+    truth = [convert.pose_estimate(m) for m in live.heard['/ground_truth']]
+    stamps = np.array([t.stamp for t in truth])
+    got = convert.pose_estimate(live.heard['pose'][250])
+    k = int(np.argmin(np.abs(stamps - got.stamp)))
+    assert abs(stamps[k] - got.stamp) < SECOND // 10
+    error = se2.between(truth[k].pose, got.pose)
+    # the truth may be half its period, 0.05 s, away: 0.03 m at 0.6 m/s
+    assert np.hypot(*error[:2]) < 0.06
+
+
+def test_both_in_one_process_stop_cleanly(live, start):
+    live.listen('pose', POSE)
+    both = start('slam')
+    live.spin_until(lambda: live.ear.count_publishers('frames') == 1, timeout=60.0)
+    live.spin_until(lambda: live.ear.count_subscribers('frames') == 1)
+    both.interrupt()
+    assert ended(both)[0] == 0
+
+
+@pytest.mark.parametrize('node', ['front_end', 'back_end', 'slam', 'simulator', 'bag_player'])
+def test_wrong_parameter_is_one_line_and_exit_code_1(start, node):
+    name, value = {
+        'simulator': ('rate', '-1.0'), 'bag_player': ('rate', '-1.0')
+    }.get(node, ('mode', 'mopping'))  # fmt: skip
+    code, out = ended(start(node, '--ros-args', '-p', f'{name}:={value}'))
+    assert code == 1
+    lines = [line for line in out.splitlines() if line]
+    assert len(lines) == 1, out
+    assert f'.{name} = ' in lines[0]
+
+
+@pytest.mark.parametrize(
+    ('args', 'message'),
+    [
+        ([], 'no bag given'),
+        (['-p', 'bag:=absent'], 'absent: no such bag'),
+        (['-p', f'bag:={ROOT}/setup.py'], 'not a readable bag'),
+        (['--params-file', 'absent.yaml'], 'absent.yaml'),
+        (['-r', 'broken'], 'broken'),
+    ],
+)
+def test_user_mistake_of_the_player_is_told_without_a_traceback(start, args, message):
+    code, out = ended(start('bag_player', '--ros-args', *args))
+    assert code == 1
+    assert message in out
+
+
+def test_missing_map_refuses_to_localize(start, tmp_path):
+    args = ['-p', 'mode:=localization', '-p', f'map_directory:={tmp_path}']
+    code, out = ended(start('back_end', '--ros-args', *args))
+    assert code == 1
+    assert 'map.csv: cannot be read' in out

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Imports point one way, and the core needs no ROS."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / 'rlml_slam'
+# what a tier may import of the package; `nodes` and `tools` are shells over the other two
+ALLOWED = {
+    'core': {'core'},
+    'ros': {'core', 'ros'},
+    'nodes': {'core', 'ros', 'nodes'},
+    'tools': {'core', 'ros', 'tools'},
+}
+# third-party modules of the core: numbers, and YAML for parameters, worlds and maps
+CORE_NEEDS = {'numba', 'numpy', 'scipy', 'yaml'}
+# what an offline command must work without
+ROS_MODULES = ('rclpy', 'tf2_msgs', 'sensor_msgs', 'nav_msgs', 'geometry_msgs', 'std_msgs')
+MODULES = sorted(PACKAGE.rglob('*.py'))
+
+
+def tier(module: str) -> str:
+    part = module.split('.')[1] if '.' in module else ''
+    return part if part in ('ros', 'nodes', 'tools') else 'core'
+
+
+def name_of(path: Path) -> str:
+    return '.'.join(path.relative_to(ROOT).with_suffix('').parts)
+
+
+def imports(path: Path) -> set[str]:
+    """Every module that a file imports, at its top or inside of a function."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f'{path}: relative import'
+            assert node.module is not None
+            found.add(node.module)
+            # `from rlml_slam.ros import convert` imports a module as well
+            if (ROOT / node.module.replace('.', '/')).is_dir():
+                found |= {f'{node.module}.{alias.name}' for alias in node.names}
+    return found
+
+
+@pytest.mark.parametrize('path', MODULES, ids=name_of)
+def test_imports_point_one_way(path):
+    if path == PACKAGE / '__main__.py':
+        pytest.skip('the entry point of python -m rlml_slam is a shell over tools')
+    name = name_of(path)
+    for imported in imports(path):
+        if imported == 'rlml_slam' or not imported.startswith('rlml_slam.'):
+            continue
+        assert tier(imported) in ALLOWED[tier(name)], f'{name} imports {imported}'
+
+
+@pytest.mark.parametrize(
+    'path', [p for p in MODULES if tier(name_of(p)) == 'core' and p.name != '__main__.py'],
+    ids=name_of,
+)  # fmt: skip
+def test_core_needs_only_numbers(path):
+    needs = {m.split('.')[0] for m in imports(path)} - {'rlml_slam'} - sys.stdlib_module_names
+    assert needs <= CORE_NEEDS
+
+
+@pytest.mark.parametrize(
+    'path', [p for p in MODULES if tier(name_of(p)) == 'core'], ids=name_of
+)  # fmt: skip
+def test_core_neither_prints_nor_logs(path):
+    tree = ast.parse(path.read_text(encoding='utf-8'))
+    calls = {n.func.id for n in ast.walk(tree) if isinstance(n, ast.Call)
+             and isinstance(n.func, ast.Name)}  # fmt: skip
+    assert 'print' not in calls
+    assert 'logging' not in imports(path)
+
+
+@pytest.mark.parametrize('path', [p for p in MODULES if tier(name_of(p)) == 'ros'], ids=name_of)
+def test_tf2_msgs_is_known_in_one_place(path):
+    if path.name != 'tf.py':
+        assert not any(m.startswith('tf2_msgs') for m in imports(path))
+
+
+@pytest.mark.parametrize('path', sorted((PACKAGE / 'nodes').glob('*.py')), ids=name_of)
+def test_nodes_are_thin(path):
+    assert len(path.read_text(encoding='utf-8').splitlines()) <= 100
+
+
+@pytest.mark.parametrize('path', MODULES, ids=name_of)
+def test_every_file_names_its_licence(path):
+    assert path.read_text(encoding='utf-8').startswith('# SPDX-License-Identifier: Apache-2.0\n')
+
+
+def test_core_and_commands_import_without_ros():
+    """A process in which every ROS module is missing can still do all that is offline."""
+    code = f"""
+import sys
+for name in {ROS_MODULES!r}:
+    sys.modules[name] = None
+from rlml_slam import warm_up
+warm_up.import_core()
+import rlml_slam.ros.bag, rlml_slam.ros.convert, rlml_slam.ros.feed, rlml_slam.ros.frames
+from rlml_slam.tools.main import main
+sys.exit(main(['replay', '--help']))
+"""
+    done = subprocess.run(
+        [sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert 'replay' in done.stdout
+
+
+def test_nodes_need_no_rosbags():
+    """A stock ROS 2 has no rosbags; only bags need it."""
+    for name in ('front_end', 'back_end', 'slam', 'simulator'):
+        seen, todo = set(), [f'rlml_slam.nodes.{name}']
+        while todo:
+            module = todo.pop()
+            seen.add(module)
+            path = ROOT / (module.replace('.', '/') + '.py')
+            if not path.exists():
+                path = ROOT / module.replace('.', '/') / '__init__.py'
+            if path.exists():
+                top = [n for n in ast.parse(path.read_text()).body
+                       if isinstance(n, ast.Import | ast.ImportFrom)]  # fmt: skip
+                for node in top:
+                    if isinstance(node, ast.Import):
+                        names = {alias.name for alias in node.names}
+                    else:
+                        names = {node.module} | {f'{node.module}.{a.name}' for a in node.names}
+                    todo += [n for n in names if n.startswith('rlml_slam') and n not in seen]
+                    seen |= names
+        assert not [m for m in seen if m.startswith('rosbags')], name

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""config/, the parameters, the package description and the executables say the same."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from rlml_slam import __version__, warm_up
+from rlml_slam.params import (
+    Parameters,
+    PlayerParameters,
+    SimulatorParameters,
+    declarations,
+    flatten,
+    from_mapping,
+    read_yaml,
+)
+from rlml_slam.tools.config import FILES, parameter_file
+
+ROOT = Path(__file__).resolve().parents[1]
+ALL = (Parameters, SimulatorParameters, PlayerParameters)
+KNOWN = {d.name for of in ALL for d in declarations(of)}
+
+
+@pytest.mark.parametrize('name', FILES)
+def test_parameter_files_are_what_is_declared(name):
+    assert (ROOT / 'config' / name).read_text() == parameter_file(name), 'run `make config`'
+
+
+@pytest.mark.parametrize('name', FILES)
+def test_parameter_files_give_the_defaults(name):
+    of, _ = FILES[name]
+    assert from_mapping(read_yaml(ROOT / 'config' / name), of) == of()
+
+
+@pytest.mark.parametrize('path', sorted((ROOT / 'config').glob('*.yaml')), ids=lambda p: p.name)
+def test_parameter_files_name_no_unknown_parameter(path):
+    assert read_yaml(path).keys() <= KNOWN
+
+
+def test_every_parameter_says_what_it_is():
+    for of in ALL:
+        for d in declarations(of):
+            assert len(d.meaning) > 5, d.name
+            assert d.low <= d.high, d.name
+
+
+def test_defaults_lie_inside_their_bounds():
+    for of in ALL:
+        from_mapping({d.name: d.default for d in declarations(of)}, of)
+
+
+def test_nested_yaml_is_flattened_as_ros_does():
+    assert flatten({'a': {'b': {'c': 1}}, 'd': 2}) == {'a.b.c': 1, 'd': 2}
+
+
+def test_versions_agree():
+    described = ElementTree.parse(ROOT / 'package.xml').getroot().findtext('version')
+    (installed,) = re.findall(r"version='([^']+)'", (ROOT / 'setup.py').read_text())
+    assert described == installed == __version__
+
+
+def test_every_executable_exists_and_every_node_is_one():
+    (names,) = re.findall(r'^NODES = \((.*)\)$', (ROOT / 'setup.py').read_text(), re.M)
+    executables = set(re.findall(r"'(\w+)'", names))
+    nodes = {p.stem for p in (ROOT / 'rlml_slam/nodes').glob('*.py')} - {'__init__'}
+    assert executables == nodes
+    for name in executables:
+        assert 'def main()' in (ROOT / f'rlml_slam/nodes/{name}.py').read_text()
+
+
+def test_every_kernel_is_compiled_ahead():
+    """A module that uses ``kernel`` has a warm_up, or `make env` would leave it to the robot.
+
+    The deformable study is no robot's: it compiles what it needs at its first run.
+    """
+    for name in (n for n in warm_up.core_modules() if '.deformable' not in n):
+        spec = importlib.util.find_spec(name)
+        assert spec is not None
+        assert spec.origin is not None
+        source = Path(spec.origin).read_text()
+        if '@kernel' in source:
+            assert re.search(r'^def warm_up\(\) -> None:', source, re.M), name
+
+
+@pytest.mark.parametrize('kind', ['', 'colcon-'])
+def test_every_supported_python_has_pinned_requirements(kind):
+    for minor in range(10, 14):
+        lock = ROOT / 'requirements' / f'{kind}python3.{minor}.txt'
+        lines = [line for line in lock.read_text().splitlines() if not line.startswith('#')]
+        assert lines
+        assert all(re.fullmatch(r'[a-z0-9-]+==[\w.+]+', line) for line in lines), lock
+
+
+def test_pinned_requirements_hold_all_that_is_asked_for():
+    def names(path):
+        lines = (line for line in path.read_text().splitlines() if not line.startswith('#'))
+        return {re.split(r'[\[<=]', line)[0] for line in lines}
+
+    asked = names(ROOT / 'requirements/top.in')
+    (needed,) = re.findall(r'install_requires=\[(.*?)\]', (ROOT / 'setup.py').read_text(), re.S)
+    assert set(re.findall(r"'([\w-]+)'", needed)) <= asked
+    for minor in range(10, 14):
+        assert asked <= names(ROOT / f'requirements/python3.{minor}.txt')
+
+
+def test_this_python_is_supported():
+    assert (3, 10) <= sys.version_info[:2] <= (3, 13)
