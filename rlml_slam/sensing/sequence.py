@@ -18,13 +18,14 @@ import numpy as np
 
 from rlml_slam import se2
 from rlml_slam.errors import InputError
-from rlml_slam.motion import SECOND, STILL, MotionBuffer
+from rlml_slam.motion import SECOND, STILL, MotionBuffer, compose_motion
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.deskew import project, sweep_time
 from rlml_slam.types import Detections, Imu, Motion, Observation, Odometry, Scan
 
 PAIRING = 2_000_000  # [ns] stamps of one instant: drivers round to milliseconds
+CARRY = 5 * SECOND  # motion older than this is summed up; an observation later than it is late
 PERSISTENT = 10  # inputs in a row: fewer with a strange stamp are faults, more are a new clock
 Waiting: TypeAlias = tuple[int, str, Scan | Detections]
 
@@ -70,7 +71,8 @@ class Sequencer:
         # where odometry ended before the last observation: (stamp, motion assumed since)
         self._extrapolated: tuple[int, Array] | None = None
         self._strange: Counter[str] = Counter()
-        self._last: int | None = None
+        self._last: int | None = None  # stamp up to which motion is used or carried
+        self._carried = STILL
         # stamp of the last observation that had, or should have had, scan and detections
         self._paired = -(2**62)
 
@@ -85,6 +87,7 @@ class Sequencer:
         valid = np.shape(sample.pose) == (3,) and bool(np.all(np.isfinite(sample.pose)))
         if self._accept('odom', sample.stamp, valid, 'pose is not finite'):
             self.buffer.add_odometry(sample)
+            self._carry(sample.stamp)
             self.inputs.count('odom', 'used')
         return self._release()
 
@@ -237,11 +240,21 @@ class Sequencer:
             origin = T[:2].copy()
         if len(group) == 2:
             self._paired = stamp
-        motion = STILL if self._last is None else self._motion(self._last, stamp)
-        self._last = stamp
+        motion = STILL
+        if self._last is not None:
+            motion = compose_motion(self._carried, self._motion(self._last, stamp))
+        self._last, self._carried = stamp, STILL
         return Observation(
             stamp, motion, points, origin, detections, scan, self.buffer.pose_at(stamp)
         )
+
+    def _carry(self, now: int) -> None:
+        """Sum up the motion of a long time without observations before the buffer forgets it."""
+        if self._last is None or self._waiting or now - self._last < 2 * CARRY:
+            return
+        until = now - CARRY
+        self._carried = compose_motion(self._carried, self._motion(self._last, until))
+        self._last = until
 
     def _motion(self, last: int, stamp: int) -> Motion:
         """Motion since the last observation; what was extrapolated is made good afterwards."""
