@@ -3,15 +3,15 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
+import subprocess
 import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
 
-from rlml_slam import __version__, warm_up
+from rlml_slam import __version__
 from rlml_slam.params import (
     Parameters,
     PlayerParameters,
@@ -76,17 +76,44 @@ def test_every_executable_exists_and_every_node_is_one():
 
 
 def test_every_kernel_is_compiled_ahead():
-    """A module that uses ``kernel`` has a warm_up, or `make env` would leave it to the robot.
+    """After the warm-up, a drive asks for no kernel that is not there yet."""
+    code = """
+import sys
+from numba.core.dispatcher import Dispatcher
+from rlml_slam import warm_up
+from rlml_slam.params import Parameters
+from rlml_slam.rlml.slam import Slam
+from rlml_slam.ros.bag import BagReader, choose_topics
+from rlml_slam.ros.feed import Feed
 
-    The deformable study is no robot's: it compiles what it needs at its first run.
-    """
-    for name in (n for n in warm_up.core_modules() if '.deformable' not in n):
-        spec = importlib.util.find_spec(name)
-        assert spec is not None
-        assert spec.origin is not None
-        source = Path(spec.origin).read_text()
-        if '@kernel' in source:
-            assert re.search(r'^def warm_up\(\) -> None:', source, re.M), name
+def compiled():
+    return {
+        f'{value.__module__}.{value.__name__}{signature}'
+        for name, module in list(sys.modules.items()) if name.startswith('rlml_slam.')
+        for value in vars(module).values() if isinstance(value, Dispatcher)
+        for signature in value.signatures
+    }
+
+warm_up.compile_loaded()
+before = compiled()
+params = Parameters()
+slam = Slam(params)
+feed = Feed(params, slam, slam.sequencer.inputs)
+with BagReader('bags/room') as bag:
+    stream_of = {topic: s for s, topic in choose_topics(bag.topics, params.node).items()}
+    for time, topic, message in bag.messages(stream_of):
+        if time - bag.start > 10e9:
+            break
+        feed.add(stream_of[topic], message)
+slam.finish()
+slam.occupancy_grid(), slam.reflectors(), slam.trajectory()
+print('late:', *sorted(compiled() - before))
+"""
+    done = subprocess.run(
+        [sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == 'late:'
 
 
 @pytest.mark.parametrize('kind', ['', 'colcon-'])
