@@ -147,9 +147,9 @@ class MotionNoise(Group):
     """
 
     a: float = param(0.1, 'speed noise per speed', '', 0.0, 10.0)
-    b: float = param(0.01, 'speed noise floor', 'm/s', 0.0, 10.0)
+    b: float = param(0.02, 'speed noise floor', 'm/s', 0.0, 10.0)
     c: float = param(0.2, 'turn rate noise per turn rate', '', 0.0, 10.0)
-    d: float = param(0.02, 'turn rate noise floor', 'rad/s', 0.0, 10.0)
+    d: float = param(0.05, 'turn rate noise floor', 'rad/s', 0.0, 10.0)
     lateral: float = param(0.05, 'sideways slip per speed', '', 0.0, 10.0)
     imu_c: float = param(0.005, "the IMU's turn rate noise per turn rate", '', 0.0, 10.0)
     imu_d: float = param(0.003, "the IMU's turn rate noise floor", 'rad/s', 0.0, 10.0)
@@ -375,6 +375,92 @@ class Deformable(Group):
 
 
 @dataclass(frozen=True)
+class Ekf(Group):
+    """EKF-SLAM, the second system: what it takes for landmarks and how it holds them."""
+
+    extractor: str = param(
+        'reflectors', 'landmarks are reflector detections, or come out of the scan',
+        choices=('reflectors', 'spikes', 'lines'),
+    )  # fmt: skip
+    association: str = param(
+        'nearest', 'nearest neighbour in Mahalanobis distance, or joint compatibility',
+        choices=('nearest', 'joint'),
+    )  # fmt: skip
+    gate: float = param(0.997, 'probability inside the validation gate', '', 0.5, 0.999999)
+    new_gate: float = param(
+        0.99999, 'a detection inside this gate of a landmark never starts a candidate', '',
+        0.5, 0.9999999,
+    )  # fmt: skip
+    min_separation: float = param(
+        0.25, 'a detection this near to a landmark never starts a candidate', 'm', 0.0, 20.0
+    )
+    sightings: int = param(3, 'sightings before a candidate enters the state', '', 1, 1000)
+    candidate_timeout: float = param(
+        5.0, 'a candidate not seen again for this long is dropped', 's', 0.01, 1e4
+    )
+    candidate_sigma: float = param(
+        0.5, 'a candidate whose place relative to the robot is less sure is dropped', 'm',
+        1e-3, 100.0,
+    )  # fmt: skip
+    range_noise: float = param(0.0, 'range noise per range, added to the detection', '', 0.0, 1.0)
+    update: str = param(
+        'compressed', 'full update of all landmarks each time, or postponed for far ones',
+        choices=('plain', 'compressed'),
+    )  # fmt: skip
+    local_radius: float = param(
+        45.0, 'landmarks nearer than this to the robot are updated at once', 'm', 0.5, 1e4
+    )
+    local_margin: float = param(
+        5.0, 'travel after which the local region is chosen anew', 'm', 0.1, 1e4
+    )
+    line_origin: tuple[float, ...] = param(
+        (0.0, 0.0), 'fixed point of the map; a line is its point nearest to this', 'm, m'
+    )
+
+
+@dataclass(frozen=True)
+class Spikes(Group):
+    """Spike landmarks of a scan."""
+
+    test: str = param(
+        'jump', 'jump between neighbours on both sides, or sum of both differences',
+        choices=('jump', 'sum'),
+    )  # fmt: skip
+    threshold: float = param(0.5, 'range difference that makes a spike', 'm', 1e-3, 100.0)
+    reach: int = param(1, 'sum test: neighbours are this many valid beams away', '', 1, 100)
+    min_beams: int = param(1, 'fewer beams are no spike', '', 1, 1000)
+    max_width: float = param(0.5, 'wider objects are no landmarks', 'm', 1e-3, 10.0)
+    max_range: float = param(25.0, 'farther spikes are not used', 'm', 0.1, 1000.0)
+    offset: float = param(
+        0.0, "from the mean of its ranges to a spike's centre; pi/8 of a cylinder's diameter",
+        'm', -1.0, 1.0,
+    )  # fmt: skip
+    sigma_range: float = param(0.03, 'range noise of a spike', 'm', 1e-4, 10.0)
+    sigma_bearing: float = param(0.005, 'bearing noise of a spike', 'rad', 1e-5, 1.0)
+
+
+@dataclass(frozen=True)
+class Ransac(Group):
+    """RANSAC lines of a scan; the five parameters of the note are named in brackets."""
+
+    seed: int = param(0, 'seed of the samples; one scan always gives the same lines', '', 0, 2**31)
+    max_trials: int = param(100, 'trials at most (N)', '', 1, 100000)
+    samples: int = param(5, 'readings sampled besides the first one (S)', '', 1, 100)
+    sample_angle: float = param(
+        0.17, 'samples lie within this of the first reading (D)', 'rad', 1e-3, 3.2
+    )
+    tolerance: float = param(0.04, 'readings this near to a line belong to it (X)', 'm', 1e-4, 10)
+    consensus: int = param(60, 'readings that make a line (C)', '', 3, 100000)
+    min_length: float = param(1.0, 'shorter lines are not used', 'm', 0.0, 100.0)
+    max_gap: float = param(0.5, 'a line ends where its readings leave a gap', 'm', 1e-3, 100.0)
+    sigma: float = param(0.01, 'noise of a reading across its line', 'm', 1e-4, 10.0)
+    sigma_floor: tuple[float, ...] = param(
+        (0.01, 0.004), "error of a line's distance and direction that more readings do not lower",
+        'm, rad',
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
 class Parameters:
     """One of every group. Fields of ``node`` have plain ROS names, all others ``group.field``."""
 
@@ -387,6 +473,15 @@ class Parameters:
     back_end: BackEnd = BackEnd()
     loop_closure: LoopClosure = LoopClosure()
     solver: Solver = Solver()
+
+
+@dataclass(frozen=True)
+class EkfParameters(Parameters):
+    """Parameters of the EKF system: its own groups, and those that both systems share."""
+
+    ekf: Ekf = Ekf()
+    spikes: Spikes = Spikes()
+    ransac: Ransac = Ransac()
 
 
 @dataclass(frozen=True)

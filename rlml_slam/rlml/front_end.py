@@ -21,7 +21,16 @@ from rlml_slam.rlml.joint_state import ANCHORS, JointState
 from rlml_slam.rlml.submaps import Submaps
 from rlml_slam.rlml.tracks import Tracks
 from rlml_slam.se2 import Array
-from rlml_slam.types import Detections, Frame, Health, Motion, Observation, Reflectors, Status
+from rlml_slam.types import (
+    ANONYMOUS,
+    Detections,
+    Frame,
+    Health,
+    Motion,
+    Observation,
+    Reflectors,
+    Status,
+)
 
 REFLECTOR_ITERATIONS = 4
 POSE_AND_TARGET = np.array([0, 1, 2, *range(ANCHORS[0], ANCHORS[0] + 3)])
@@ -181,6 +190,12 @@ class FrontEnd:
                 )
         seen = matched.index >= 0
         matched.keys[seen] = self.tracks.keys[matched.index[seen]]
+        if detections is not None:
+            # what tells its id is known even where it does not fit: the back end weighs it
+            for k in np.flatnonzero(~seen & (detections.ids != ANONYMOUS)):
+                same = np.flatnonzero(self.tracks.ids == detections.ids[k])
+                if len(same):
+                    matched.keys[k] = self.tracks.keys[same[0]]
         drop = self.tracks.stale(observation.stamp, p.min_sightings, p.candidate_timeout)
         if drop.any():
             self.state.remove_landmarks(~drop)

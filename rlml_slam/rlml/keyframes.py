@@ -12,6 +12,8 @@ from rlml_slam.motion import STILL, compose_motion
 from rlml_slam.se2 import Array
 from rlml_slam.types import Frame, Motion
 
+AGREE = 9.2  # 99 % of a chi-square with 2 degrees of freedom
+
 
 @dataclass(frozen=True)
 class Keyframe:
@@ -38,9 +40,16 @@ class Sighting:
     def add(self, z: Array, cov: Array) -> None:
         """Fuse z (2,) with covariance (2, 2), in the keyframe's frame."""
         W = np.linalg.inv(cov)
-        self.information += W
-        self.weighted += np.asarray(W @ z, dtype=np.float64)
+        self.information = self.information + W
+        weighted: Array = self.weighted + W @ z
+        self.weighted = weighted
         self.count += 1
+
+    def agrees(self, z: Array, cov: Array) -> bool:
+        """Whether z (2,) can be of the same place: an outlier must not be averaged in."""
+        d = z - self.z
+        spread = cov + np.linalg.inv(self.information)
+        return bool(d @ np.linalg.solve(spread, d) < AGREE)
 
     @property
     def z(self) -> Array:
@@ -56,7 +65,7 @@ class Interval:
         self._T_local = T_local
         self.motion = STILL
         self.scanned = False
-        self.sightings: dict[int, Sighting] = {}
+        self.sightings: dict[int, list[Sighting]] = {}
 
     def add_motion(self, frame: Frame) -> None:
         """Compose the odometry motion of one more frame."""
@@ -79,4 +88,9 @@ class Interval:
         for k in np.flatnonzero(frame.landmarks >= 0):
             J = np.array([[1.0, 0.0, -(z[k, 1] - T[1])], [0.0, 1.0, z[k, 0] - T[0]]])
             cov = R @ d.cov[k] @ R.T + J @ self.motion.cov @ J.T
-            self.sightings.setdefault(int(frame.landmarks[k]), Sighting()).add(z[k], cov)
+            groups = self.sightings.setdefault(int(frame.landmarks[k]), [])
+            group = next((g for g in groups if g.agrees(z[k], cov)), None)
+            if group is None:
+                group = Sighting()
+                groups.append(group)
+            group.add(z[k], cov)

@@ -46,9 +46,9 @@ class ReflectorGraph:
             key = self._alias[key]
         return key
 
-    def add(self, pose: int, sightings: dict[int, Sighting]) -> None:
+    def add(self, pose: int, sightings: dict[int, list[Sighting]]) -> None:
         """The reflectors seen near keyframe ``pose``."""
-        for key, s in sightings.items():
+        for key, s in ((k, s) for k, groups in sightings.items() for s in groups):
             landmark = self._landmarks.setdefault(self.resolve(key), _Landmark(self.resolve(key)))
             landmark.count += s.count
             landmark.sightings.append((pose, s.z, s.information, -1))
