@@ -46,19 +46,21 @@ COMMANDS: Table = {
     'replay': Command('replay', 'run the system over a bag: no topics, deterministic'),
     'convert': Command('convert', 'recorded data sets become bags'),
     'evaluate': Command('evaluate', 'errors of a trajectory against relations or ground truth'),
-    'simulate': Command('simulate', 'drive through a synthetic world and record a bag'),
+    'simulate': Command('simulate', 'write a bag of a drive through a synthetic world'),
     'optimize': Command('optimize', 'optimise a pose graph file (g2o, TORO)'),
     'study': Group(
         'experiments that answer one question each',
         {
             'worlds': Command('study_front_end', 'accuracy and consistency over seeds and worlds'),
-            'deformable': Command('study_deformable', 'SLAM with deformable features'),
+            'deformable': Command(
+                'study_deformable', 'deformable-feature SLAM: EKF against NLS over many seeds'
+            ),
         },
     ),
     'bench': Group(
         'measured speed and quality against other libraries',
         {
-            'graph': Command('bench_graph', 'the graph solver against other libraries'),
+            'back-end': Command('bench_back_end', 'the graph solver against other libraries'),
         },
     ),
     'docs': Command('docs', "the README's tables from the declarations in the code"),

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the nodes offer, as data: the README is made of it, and tests hold it to the code."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+IN, OUT = 'sub', 'pub'
+SENSOR, RELIABLE, LATCHED = 'best effort', 'reliable', 'reliable, transient local'
+POSE = 'geometry_msgs/PoseWithCovarianceStamped'
+CLOUD = 'sensor_msgs/PointCloud2'
+MARKERS = 'visualization_msgs/MarkerArray'
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a node; its relative ``name`` is that of ``parameter``, where there is one."""
+
+    node: str
+    direction: str
+    name: str
+    type: str
+    qos: str
+    meaning: str
+    parameter: str = ''
+
+
+@dataclass(frozen=True)
+class Service:
+    """A service of a node; ``~`` is the node's name."""
+
+    node: str
+    name: str
+    type: str
+    meaning: str
+
+
+TOPICS = (
+    Topic('front_end', IN, 'scan', 'sensor_msgs/LaserScan', SENSOR,
+          'sweeps, stamped with the first ray; NaN, Inf and any number of beams are fine',
+          'scan_topic'),
+    Topic('front_end', IN, 'odom', 'nav_msgs/Odometry', SENSOR,
+          'wheel odometry; only the increments of its pose are used', 'odom_topic'),
+    Topic('front_end', IN, 'imu', 'sensor_msgs/Imu', SENSOR,
+          'yaw rate; its bias is estimated', 'imu_topic'),
+    Topic('front_end', IN, 'reflectors', CLOUD, SENSOR,
+          'detections: `x`, `y`; optional `id` (-1 is anonymous), `sigma_range`, '
+          '`sigma_bearing`, `diameter`. An empty cloud says "looked and saw none"',
+          'reflectors_topic'),
+    Topic('front_end', IN, 'reflector_poses', 'geometry_msgs/PoseArray', SENSOR,
+          'the same in its simplest form', 'reflector_poses_topic'),
+    Topic('front_end', IN, 'initialpose', POSE, RELIABLE, 'begin anew at this pose of the map'),
+    Topic('front_end', IN, 'correction', POSE, LATCHED,
+          'of the back end: the local frame in the map'),
+    Topic('front_end', IN, '/tf_static', 'tf2_msgs/TFMessage', LATCHED, 'where the sensors sit'),
+    Topic('front_end', OUT, 'pose', POSE, RELIABLE,
+          'pose in the map with covariance, one per scan, stamped as the scan'),
+    Topic('front_end', OUT, 'odometry/filtered', 'nav_msgs/Odometry', RELIABLE,
+          'pose in a continuous local frame, with twist and covariances'),
+    Topic('front_end', OUT, 'frames', CLOUD, RELIABLE, 'for the back end: all figures of a frame'),
+    Topic('front_end', OUT, 'deskewed_points', CLOUD, RELIABLE,
+          'end points of the scan in the base frame, motion taken out'),
+    Topic('front_end', OUT, 'reflectors/associated', CLOUD, RELIABLE,
+          'detections with the reflector that each was taken for'),
+    Topic('front_end', OUT, '/diagnostics', 'diagnostic_msgs/DiagnosticArray', RELIABLE,
+          '1 Hz: OK, DEGRADED or LOST with reasons; what became of the inputs'),
+    Topic('back_end', IN, 'frames', CLOUD, RELIABLE, 'of the front end'),
+    Topic('back_end', IN, 'deskewed_points', CLOUD, RELIABLE, 'of the front end'),
+    Topic('back_end', IN, 'reflectors/associated', CLOUD, RELIABLE, 'of the front end'),
+    Topic('back_end', OUT, 'correction', POSE, LATCHED, 'the front end\'s local frame in the map'),
+    Topic('back_end', OUT, 'initialpose', POSE, RELIABLE, 'tells the front end of a reset'),
+    Topic('back_end', OUT, '/tf', 'tf2_msgs/TFMessage', RELIABLE,
+          'map to odom only; without tf2_msgs on `~/map_to_odom` (TransformStamped)'),
+    Topic('back_end', OUT, 'map', 'nav_msgs/OccupancyGrid', LATCHED, 'the map of the scans'),
+    Topic('back_end', OUT, 'map_metadata', 'nav_msgs/MapMetaData', LATCHED, 'its size and place'),
+    Topic('back_end', OUT, 'trajectory', 'nav_msgs/Path', LATCHED,
+          'the optimised path, a pose per scan'),
+    Topic('back_end', OUT, 'reflector_map', MARKERS, LATCHED, 'reflectors with 95 % ellipses'),
+    Topic('back_end', OUT, 'reflector_map_points', CLOUD, LATCHED,
+          'reflectors with covariance, id, number of sightings'),
+    Topic('back_end', OUT, 'graph', MARKERS, LATCHED, 'keyframes, and edges by kind'),
+    Topic('back_end', OUT, '/diagnostics', 'diagnostic_msgs/DiagnosticArray', RELIABLE,
+          '1 Hz: size of the graph, frames that wait'),
+    Topic('simulator', IN, 'cmd_vel', 'geometry_msgs/Twist', RELIABLE, 'with `drive:=cmd_vel`'),
+    Topic('simulator', OUT, 'scan', 'sensor_msgs/LaserScan', SENSOR,
+          'with intensities and time per ray'),
+    Topic('simulator', OUT, 'odom', 'nav_msgs/Odometry', SENSOR, 'wheel odometry'),
+    Topic('simulator', OUT, 'imu', 'sensor_msgs/Imu', SENSOR, 'yaw rate with a bias'),
+    Topic('simulator', OUT, 'reflectors', CLOUD, SENSOR, 'detections, anonymous by default'),
+    Topic('simulator', OUT, 'ground_truth', 'nav_msgs/Odometry', RELIABLE, 'true pose in the map'),
+    Topic('simulator', OUT, 'ground_truth_reflectors', CLOUD, LATCHED,
+          'true places of the reflectors'),
+    Topic('simulator', OUT, '/clock', 'rosgraph_msgs/Clock', RELIABLE, 'simulated time'),
+    Topic('simulator', OUT, '/tf_static', 'tf2_msgs/TFMessage', LATCHED, 'base_link to laser'),
+)  # fmt: skip
+
+SERVICES = (
+    Service('back_end', '~/save_map', 'std_srvs/Trigger',
+            'write `map_directory`/`map_file_name`: reflectors and grid'),
+    Service('back_end', '~/load_map', 'nav_msgs/LoadMap',
+            'in localization mode, use another map of `map_directory`'),
+    Service('back_end', '~/reset', 'std_srvs/Trigger',
+            'forget the map and begin at `map_start_pose`'),
+    Service('back_end', '~/dynamic_map', 'nav_msgs/GetMap', 'the grid as it is now'),
+    Service('back_end', '~/pause_new_measurements', 'std_srvs/SetBool',
+            'leave new measurements out of the map, or take them in again'),
+)  # fmt: skip

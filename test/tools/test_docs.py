@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tables of the README are those of the code, and the code is what the nodes do."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from rlml_slam.errors import FileFormatError
+from rlml_slam.params import Parameters, SimulatorParameters, declarations
+from rlml_slam.tools.docs import TABLES, filled, parameter_table
+from rlml_slam.tools.interface import SERVICES, TOPICS
+from rlml_slam.tools.main import main
+
+README = Path(__file__).resolve().parents[2] / 'README.md'
+# what every node of rclpy has
+OF_EVERY_NODE = {'/rosout', '/parameter_events'}
+
+
+def test_readme_is_up_to_date():
+    text = README.read_text(encoding='utf-8')
+    assert filled(text) == text, 'run: rlml docs --write README.md'
+
+
+@pytest.mark.parametrize('of', [Parameters, SimulatorParameters])
+def test_every_parameter_has_its_row(of):
+    rows = parameter_table(of).splitlines()[2:]
+    assert [row.split('`')[1] for row in rows] == [d.name for d in declarations(of)]
+
+
+def test_tables_are_put_between_the_marks(tmp_path, capsys):
+    marks = [f'<!-- begin {t} -->\nold {t}\n<!-- end {t} -->\n' for t in TABLES]
+    path = tmp_path / 'README.md'
+    path.write_text('# Title\n' + 'text\n'.join(marks) + 'the end\n')
+    assert main(['docs', '--write', str(path)]) == 0
+    text = path.read_text()
+    assert text.startswith('# Title\n')
+    assert text.endswith('the end\n')
+    assert '\nold ' not in text
+    assert filled(text) == text
+    assert main(['docs']) == 0
+    printed = capsys.readouterr().out
+    assert all(make() in text and make() in printed for make in TABLES.values())
+
+
+def test_missing_marks_are_named():
+    with pytest.raises(
+        FileFormatError, match=r'<!-- begin topics --> … .* not there exactly once'
+    ):
+        filled('nothing', 'README.md')
+
+
+@pytest.fixture(scope='module')
+def nodes():
+    """All nodes in this process, with every optional topic switched on."""
+    rclpy = pytest.importorskip('rclpy', reason='needs ROS 2 or its wheels')
+    from rclpy.parameter import Parameter
+
+    from rlml_slam.nodes.back_end import BackEndNode
+    from rlml_slam.nodes.front_end import FrontEndNode
+    from rlml_slam.nodes.simulator import SimulatorNode
+
+    before = os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE')
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=10 + os.getpid() % 90)
+    drive = [Parameter('drive', value='cmd_vel')]
+    made = [
+        FrontEndNode(context=context),
+        BackEndNode(context=context),
+        SimulatorNode(context=context, parameter_overrides=drive),
+    ]
+    yield {node.get_name(): node for node in made}
+    for node in made:
+        node.destroy_node()
+    context.try_shutdown()
+    if before is None:
+        del os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE']
+    else:
+        os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = before
+
+
+def has_tf():
+    from rlml_slam.ros.messages import rclpy_class
+    from rlml_slam.ros.tf import TF_MESSAGE
+
+    return rclpy_class(TF_MESSAGE) is not None
+
+
+def quality(info):
+    profile = info.qos_profile
+    words = [profile.reliability.name.lower().replace('_', ' ')]
+    if profile.durability.name == 'TRANSIENT_LOCAL':
+        words.append('transient local')
+    return ', '.join(words)
+
+
+@pytest.mark.parametrize('name', ['front_end', 'back_end', 'simulator'])
+@pytest.mark.parametrize('direction', ['pub', 'sub'])
+def test_topics_are_those_of_the_node(nodes, name, direction):
+    node = nodes[name]
+    of_node, of_topic = {
+        'pub': (node.get_publisher_names_and_types_by_node, node.get_publishers_info_by_topic),
+        'sub': (node.get_subscriber_names_and_types_by_node, node.get_subscriptions_info_by_topic),
+    }[direction]
+    found = {
+        (topic, kinds[0].replace('/msg/', '/'), quality(info))
+        for topic, kinds in of_node(name, '/')
+        for info in of_topic(topic)
+        if info.node_name == name and topic not in OF_EVERY_NODE
+    }
+    told = {
+        ('/' + t.name.lstrip('/'), t.type, t.qos)
+        for t in TOPICS
+        if (t.node, t.direction) == (name, direction)
+    }
+    if not has_tf():  # the same transforms go elsewhere, or nowhere
+        told = {t for t in told if not t[0].startswith('/tf')}
+        found = {t for t in found if not t[0].endswith('map_to_odom')}
+    assert found == told
+
+
+@pytest.mark.parametrize('name', ['front_end', 'back_end', 'simulator'])
+def test_services_are_those_of_the_node(nodes, name):
+    found = {
+        (service, kinds[0].replace('/srv/', '/'))
+        for service, kinds in nodes[name].get_service_names_and_types_by_node(name, '/')
+        if not kinds[0].startswith(('rcl_interfaces', 'type_description_interfaces'))
+    }
+    told = {(s.name.replace('~', f'/{name}'), s.type) for s in SERVICES if s.node == name}
+    assert found == told
+
+
+def test_topics_of_parameters_have_their_names():
+    defaults = {d.name: d.default for d in declarations(Parameters)}
+    for t in TOPICS:
+        if t.parameter:
+            assert defaults[t.parameter] == t.name
