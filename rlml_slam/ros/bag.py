@@ -31,6 +31,7 @@ from rlml_slam.errors import BagError
 from rlml_slam.params import Node
 from rlml_slam.ros.feed import STREAMS, USED_BY
 from rlml_slam.ros.messages import bag_types
+from rlml_slam.ros.salvage import Salvage
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,8 @@ class BagReader:
 
     ``topics`` by name; ``start`` and ``end`` [ns] of the recording; ``skipped`` counts, by topic,
     the messages that ``messages`` left out because their type is unknown or they are broken;
-    ``damage`` says in one line what is wrong with the bag, empty for a sound one.
+    ``damage`` says in one line what is wrong with a bag that could only be read in part (then
+    in the order of its file), empty for a sound one.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -59,17 +61,26 @@ class BagReader:
         if not self.path.exists():
             raise BagError(f'{path}: no such bag')
         self.is_ros1 = self.path.suffix == '.bag'
-        try:
-            self._reader = (Reader1 if self.is_ros1 else Reader2)(self.path)
-            self._reader.open()
-        except Exception as e:  # the library lets struct.error, KeyError and others through
-            raise BagError(f'{path}: not a readable bag: {_line(e)}') from e
+        self._reader = self._open()
         self.topics = {
             name: Topic(name, info.msgtype or '', info.msgcount)
             for name, info in self._reader.topics.items()
         }
         self.start = int(self._reader.start_time)
         self.end = int(self._reader.end_time)
+
+    def _open(self) -> Any:
+        """The library's reader, or, for a bag that it refuses, what can be salvaged of it."""
+        try:
+            reader: Any = (Reader1 if self.is_ros1 else Reader2)(self.path)
+            reader.open()
+        except Exception as e:  # the library lets struct.error, KeyError and others through
+            try:
+                reader = Salvage(self.path)
+            except (ValueError, OSError):
+                raise BagError(f'{self.path}: not a readable bag: {_line(e)}') from e
+            self.damage = f'{self.path}: {reader.damage or _line(e)}'
+        return reader
 
     def __enter__(self) -> BagReader:
         return self

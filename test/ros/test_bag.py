@@ -153,3 +153,106 @@ def test_recorded_bags_are_read(name, topic, count):
         values = [read[topic.split('/')[-1]](m) for _, _, m in bag.messages([topic])]
     assert len(values) == count
     assert not bag.skipped
+
+
+# --- damage ---------------------------------------------------------------------------------
+
+
+def readable(path):
+    with BagReader(path) as bag:
+        return [(time, topic) for time, topic, _ in bag.messages()], bag.damage
+
+
+def test_mcap_cut_off_gives_what_came_before(tmp_path):
+    file = storage_file(write(tmp_path / 'bag', n=2000))
+    whole, _ = readable(file)
+    data = file.read_bytes()
+    for share in (0.5, 0.9):
+        cut = tmp_path / f'cut{share}.mcap'
+        cut.write_bytes(data[: int(share * len(data))])
+        got, damage = readable(cut)
+        assert damage.endswith('cut off')
+        assert got == whole[: len(got)]
+        # the rest of the file is its index
+        assert len(got) > (share - 0.2) * len(whole)
+
+
+def test_sqlite_cut_off_is_refused_in_one_line(tmp_path):
+    file = storage_file(write(tmp_path / 'bag', 'sqlite3', n=2000))
+    cut = tmp_path / 'cut.db3'
+    cut.write_bytes(file.read_bytes()[:500_000])
+    with pytest.raises(BagError, match=r'cut\.db3: not a readable bag: .*malformed') as error:
+        BagReader(cut)
+    assert '\n' not in str(error.value)
+
+
+def test_scratched_sqlite_gives_what_comes_before_the_scratch(tmp_path):
+    file = storage_file(write(tmp_path / 'bag', 'sqlite3', n=2000))
+    whole, _ = readable(file)
+    data = bytearray(file.read_bytes())
+    middle = len(data) // 2 // 4096 * 4096
+    data[middle : middle + 8192] = bytes(8192)
+    file.write_bytes(data)
+    got, damage = readable(file)
+    assert damage
+    assert got == whole[: len(got)]
+    assert len(got) > 0.2 * len(whole)
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_folder_that_lost_its_metadata_is_read(tmp_path, storage):
+    folder = write(tmp_path / 'bag', storage)
+    whole, _ = readable(folder)
+    (folder / 'metadata.yaml').unlink()
+    got, damage = readable(folder)
+    assert got == whole
+    assert 'has no metadata.yaml' in damage
+
+
+def test_scratched_mcap_loses_the_scratched_chunk_alone(tmp_path):
+    file = storage_file(write(tmp_path / 'bag', n=2000))
+    data = bytearray(file.read_bytes())
+    data[-37:] = bytes(37)  # the footer, so that the index is not found
+    file.write_bytes(data)
+    got, damage = readable(file)
+    assert len(got) == 4001
+    assert damage
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason='the recordings of ../shared are not here')
+@pytest.mark.parametrize('share', [0.3, 0.8])
+def test_ros1_bag_cut_off_gives_what_came_before(tmp_path, share):
+    data = (SHARED / 'ros-bags-misc' / 'turtlebot3_sim.bag').read_bytes()
+    cut = tmp_path / 'cut.bag'
+    cut.write_bytes(data[: int(share * len(data))])
+    whole, _ = readable(SHARED / 'ros-bags-misc' / 'turtlebot3_sim.bag')
+    got, damage = readable(cut)
+    assert damage.endswith('cut.bag: cut.bag is cut off')
+    assert (share - 0.2) * len(whole) < len(got) < share * 1.1 * len(whole)
+    assert set(got) <= set(whole)
+
+
+def test_broken_messages_are_skipped_and_counted(tmp_path):
+    path = tmp_path / 'bag'
+    with BagWriter(path) as bag:
+        good = build.imu(make_bag, Imu(SECOND, 0.1), 'imu')
+        bag.write('/imu', good, SECOND)
+        bag._writer.write(bag._connections['/imu'], SECOND + 1, b'\x00\x01\x00\x00\xff')
+        bag.write('/imu', good, SECOND + 2)
+    with BagReader(path) as bag:
+        assert [t for t, _, _ in bag.messages()] == [SECOND, SECOND + 2]
+        assert bag.skipped == {'/imu': 1}
+
+
+def test_messages_of_unknown_types_are_skipped_and_counted(tmp_path):
+    path = tmp_path / 'bag'
+    with BagWriter(path) as bag:
+        bag._connections['/secret'] = bag._writer.add_connection(
+            '/secret', 'acme/msg/Secret', msgdef='this is no definition', rihs01='RIHS01_0'
+        )
+        bag._writer.write(bag._connections['/secret'], SECOND, b'\x00\x01\x00\x00')
+        bag.write('/imu', build.imu(make_bag, Imu(SECOND, 0.1), 'imu'), SECOND)
+    with BagReader(path) as bag:
+        assert [topic for _, topic, _ in bag.messages()] == ['/imu']
+        assert bag.skipped == {'/secret': 1}
+        assert [topic for _, topic, _ in bag.serialized()] == ['/secret', '/imu']

@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a broken recording still holds: bags without index, without metadata, cut off or scratched.
+
+A recorder that lost its power leaves such files. They are read from the front, record by record,
+to the first damage; their messages come in the order of the file.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from contextlib import closing
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+from typing import Any, BinaryIO, TypeAlias
+
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag1,
+    ConnectionExtRosbag2,
+    MessageDefinition,
+    MessageDefinitionFormat,
+    TopicInfo,
+)
+from rosbags.rosbag1.reader import Header, decompressors, normalize
+from rosbags.rosbag2.storage_mcap import decompress
+from rosbags.typesys.msg import normalize_msgtype
+
+MCAP = b'\x89MCAP0\r\n'
+ROSBAG1 = b'#ROSBAG V2.0\n'
+SQLITE = b'SQLite format 3\0'
+# a connection when it is met, a message (connection id, log time [ns], raw), or what is broken
+Found: TypeAlias = Connection | tuple[int, int, bytes] | str
+_FORMATS = {
+    'ros2msg': MessageDefinitionFormat.MSG, 'ros2idl': MessageDefinitionFormat.IDL
+}  # fmt: skip
+
+
+class Truncated(Exception):
+    """The data end inside of a record."""
+
+
+class Salvage:
+    """Looks like a reader of rosbags; ``damage`` says in one line what is wrong.
+
+    Raises ValueError if nothing at all can be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._files = [path]
+        self.damage = ''
+        if path.is_dir():
+            self._files = sorted(f for f in path.iterdir() if f.suffix in ('.mcap', '.db3'))
+            if not (path / 'metadata.yaml').exists():
+                self.damage = 'has no metadata.yaml'
+        self.connections: list[Connection] = []
+        self._counts: Counter[int] = Counter()
+        self.start_time, self.end_time = 2**63 - 1, 0
+        for found in self._scan():
+            if isinstance(found, Connection):
+                self.connections.append(found)
+            elif isinstance(found, str):
+                self.damage = found
+            else:
+                connection, time, _ = found
+                self._counts[connection] += 1
+                self.start_time = min(self.start_time, time)
+                self.end_time = max(self.end_time, time + 1)
+        if not self._counts:
+            raise ValueError(self.damage or 'it holds no messages')
+
+    def open(self) -> None:
+        """Nothing is left to do."""
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    @property
+    def topics(self) -> dict[str, TopicInfo]:
+        """Topics with the number of messages that can be read."""
+        out: dict[str, TopicInfo] = {}
+        for c in self.connections:
+            before = out[c.topic].msgcount if c.topic in out else 0
+            count = before + self._counts[c.id]
+            out[c.topic] = TopicInfo(c.msgtype, c.msgdef, count, [])
+        return out
+
+    def messages(
+        self, connections: Collection[Connection]
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """(connection, log time [ns], raw) in the order of the file."""
+        wanted = {c.id: c for c in connections}
+        for found in self._scan():
+            if isinstance(found, str | Connection) or found[0] not in wanted:
+                continue
+            yield wanted[found[0]], found[1], found[2]
+
+    def _scan(self) -> Iterator[Found]:
+        for number, file in enumerate(self._files):
+            with file.open('rb') as source:
+                magic = source.read(len(SQLITE))
+            # ids are unique over several files
+            first = number * 100_000
+            if magic.startswith(MCAP):
+                yield from _from_file(file, len(MCAP), partial(_mcap, first=first, owner=self))
+            elif magic.startswith(ROSBAG1):
+                yield from _from_file(file, len(ROSBAG1), partial(_rosbag1, owner=self))
+            elif magic == SQLITE:
+                yield from _sqlite(file, first, self)
+            else:
+                yield f'{file.name} is no bag'
+
+
+def _from_file(
+    file: Path, start: int, scan: Callable[[BinaryIO], Iterator[Found]]
+) -> Iterator[Found]:
+    with file.open('rb') as source:
+        source.seek(start)
+        try:
+            yield from scan(source)
+        except Truncated:
+            yield f'{file.name} is cut off'
+
+
+def _exactly(source: BinaryIO, size: int) -> bytes:
+    data = source.read(size)
+    if len(data) != size:
+        raise Truncated
+    return data
+
+
+# --- MCAP ----------------------------------------------------------------------------------
+
+
+def _mcap(source: BinaryIO, first: int, owner: Any) -> Iterator[Found]:
+    """Records of a file or of a chunk."""
+    schemas: dict[int, tuple[str, MessageDefinition]] = {}
+    while code := source.read(1):
+        if code == MCAP[:1]:
+            return  # the closing magic
+        (size,) = struct.unpack('<Q', _exactly(source, 8))
+        if code == b'\x06':
+            yield from _mcap_chunk(source, size, schemas, first, owner)
+        else:
+            yield from _mcap_record(code, _exactly(source, size), schemas, first, owner)
+
+
+def _mcap_chunk(
+    source: BinaryIO, size: int, schemas: dict[int, Any], first: int, owner: Any
+) -> Iterator[Found]:
+    head = _exactly(source, 28)
+    _, _, raw_size, crc = struct.unpack('<QQQI', head)
+    (name_size,) = struct.unpack('<I', _exactly(source, 4))
+    compression = _exactly(source, name_size).decode()
+    (packed_size,) = struct.unpack('<Q', _exactly(source, 8))
+    packed = source.read(packed_size)
+    cut = len(packed) != packed_size
+    if cut and compression:
+        raise Truncated
+    try:
+        raw = packed if cut else decompress(packed, compression, raw_size, crc)
+    except Exception as e:  # whatever a decompressor says about broken data
+        yield f'a chunk is broken: {str(e).splitlines()[0] if str(e) else type(e).__name__}'
+        return
+    chunk = BytesIO(raw)
+    while code := chunk.read(1):
+        (size,) = struct.unpack('<Q', _exactly(chunk, 8))
+        yield from _mcap_record(code, _exactly(chunk, size), schemas, first, owner)
+    if cut:
+        raise Truncated
+
+
+def _mcap_record(
+    code: bytes, data: bytes, schemas: dict[int, Any], first: int, owner: Any
+) -> Iterator[Found]:
+    record = BytesIO(data)
+
+    def text() -> str:
+        (size,) = struct.unpack('<I', _exactly(record, 4))
+        return _exactly(record, size).decode()
+
+    if code == b'\x03':
+        (key,) = struct.unpack('<H', _exactly(record, 2))
+        name, encoding, definition = text(), text(), text()
+        form = _FORMATS.get(encoding, MessageDefinitionFormat.NONE)
+        schemas[key] = (name, MessageDefinition(form, definition))
+    elif code == b'\x04':
+        key, schema = struct.unpack('<HH', _exactly(record, 4))
+        name, definition = schemas.get(schema, ('', None))
+        known = {c.id for c in owner.connections}
+        if definition is not None and first + key not in known:
+            ext = ConnectionExtRosbag2('cdr', [])
+            yield Connection(first + key, text(), name, definition, '', 0, ext, owner)
+    elif code == b'\x05':
+        key, _, time, _ = struct.unpack('<HIQQ', _exactly(record, 22))
+        yield first + key, time, record.read()
+
+
+# --- ROS 1 ---------------------------------------------------------------------------------
+
+
+def _rosbag1(source: BinaryIO, owner: Any) -> Iterator[Found]:
+    """Records of a file or of a chunk."""
+    while size := source.read(4):
+        if len(size) < 4:
+            raise Truncated
+        header = _header(_exactly(source, struct.unpack('<I', size)[0]))
+        (size_of_data,) = struct.unpack('<I', _exactly(source, 4))
+        data, code = _exactly(source, size_of_data), header.get_uint8('op')
+        if code == 5:
+            try:
+                chunk = decompressors[header.get_string('compression')](data)
+            except Exception as e:
+                yield f'a chunk is broken: {str(e).splitlines()[0] if str(e) else "unreadable"}'
+                continue
+            yield from _rosbag1(BytesIO(chunk), owner)
+        elif code == 7:
+            number = header.get_uint32('conn')
+            if number not in {c.id for c in owner.connections}:
+                yield _connection(number, header, _header(data), owner)
+        elif code == 2:
+            yield header.get_uint32('conn'), header.get_time('time'), data
+
+
+def _header(data: bytes) -> Header:
+    return Header.read(BytesIO(struct.pack('<I', len(data)) + data))
+
+
+def _connection(number: int, header: Header, about: Header, owner: Any) -> Connection:
+    definition = about.get_string('message_definition')
+    return Connection(
+        number,
+        normalize(header.get_string('topic')),
+        normalize_msgtype(about.get_string('type')),
+        MessageDefinition(MessageDefinitionFormat.MSG, definition),
+        '',
+        0,
+        ConnectionExtRosbag1(None, int(about.get('latching', b'0') == b'1')),
+        owner,
+    )
+
+
+# --- SQLite --------------------------------------------------------------------------------
+
+
+def _sqlite(file: Path, first: int, owner: Any) -> Iterator[Found]:
+    with closing(sqlite3.connect(f'file:{file}?mode=ro&immutable=1', uri=True)) as base:
+        try:
+            # or SQLite refuses a file that is shorter than its header says
+            base.execute('PRAGMA writable_schema=ON')
+            definitions: dict[str, MessageDefinition] = {}
+            tables = {row[0] for row in base.execute('SELECT name FROM sqlite_master')}
+            if 'message_definitions' in tables:
+                for name, encoding, text in base.execute(
+                    'SELECT topic_type, encoding, encoded_message_definition '
+                    'FROM message_definitions'
+                ):
+                    form = _FORMATS.get(encoding, MessageDefinitionFormat.NONE)
+                    definitions[name] = MessageDefinition(form, text)
+            none = MessageDefinition(MessageDefinitionFormat.NONE, '')
+            for number, topic, kind in base.execute('SELECT id, name, type FROM topics'):
+                ext = ConnectionExtRosbag2('cdr', [])
+                definition = definitions.get(kind, none)
+                yield Connection(first + number, topic, kind, definition, '', 0, ext, owner)
+            for number, time, data in base.execute(
+                'SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY id'
+            ):
+                yield first + number, time, data
+        except sqlite3.DatabaseError as e:
+            yield f'{file.name} is broken: {e}'
