@@ -94,7 +94,8 @@ class Observation:
     ``motion`` is the odometry/IMU motion since the previous observation. ``points`` (n, 2) are
     the de-skewed end points of the valid beams, ``origin`` (2,) the laser's position; None where
     there was no scan. ``scan`` is the raw sweep. ``odom_pose`` (3,) is the raw odometry at the
-    stamp, None without odometry.
+    stamp, None without odometry. ``T_base_laser`` (3,) and ``sweep`` (3,), the motion of base
+    during the sweep, are those that ``points`` were made with.
     """
 
     stamp: int
@@ -104,6 +105,8 @@ class Observation:
     detections: Detections | None = None
     scan: Scan | None = None
     odom_pose: Array | None = None
+    T_base_laser: Array | None = None
+    sweep: Array | None = None
 
 
 class Status(IntEnum):
@@ -157,6 +160,22 @@ class Frame:
     chi2: float = 0.0
     iterations: int = 0
     wall_ms: float = 0.0
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What the back end believes at its newest keyframe, map frame.
+
+    ``T_map_base`` (3,) and ``points`` (m, 2) with their joint covariance ``cov``
+    (3 + 2m, 3 + 2m); ``keys`` (m,) are the front end's, ``aliases`` maps keys of reflectors that
+    were merged to the key that goes on.
+    """
+
+    T_map_base: Array
+    keys: NDArray[np.int64]
+    points: Array
+    cov: Array
+    aliases: dict[int, int]
 
 
 class EdgeKind(Enum):

@@ -21,7 +21,7 @@ from rlml_slam.rlml.keyframes import Interval, Keyframe
 from rlml_slam.rlml.loop_closure import Closure, ScanGraph
 from rlml_slam.rlml.reflector_graph import ReflectorGraph
 from rlml_slam.se2 import Array
-from rlml_slam.types import EdgeKind, Frame, Reflectors
+from rlml_slam.types import Belief, EdgeKind, Frame, Reflectors
 
 
 @dataclass(frozen=True)
@@ -153,6 +153,12 @@ class BackEnd:
         self.scans.changed = self.reflector_graph.changed = False
         last = self.keyframes[-1]
         self.T_map_local = se2.compose(self.graph.poses[last.index], se2.inverse(last.T_local))
+
+    def belief(self) -> Belief | None:
+        """The newest keyframe and the reflectors, with joint covariance; None without any."""
+        if not self.keyframes or not self.reflector_graph.found:
+            return None
+        return self.reflector_graph.belief(self.keyframes[-1].index)
 
     def finish(self) -> None:
         """Use what is still collected, look for the last closures and optimise."""

@@ -23,6 +23,7 @@ from rlml_slam.rlml.tracks import Tracks
 from rlml_slam.se2 import Array
 from rlml_slam.types import (
     ANONYMOUS,
+    Belief,
     Detections,
     Frame,
     Health,
@@ -47,6 +48,7 @@ class FrontEnd:
     def __init__(self, params: Parameters) -> None:
         self._p = params
         self._associator = association.Associator(params.reflector)
+        self._contradiction = association.gate(params.reflector.new_gate)
         self.reset(np.array(params.node.map_start_pose), np.zeros((3, 3)))
 
     def reset(self, pose: Array, cov: Array) -> None:
@@ -73,6 +75,50 @@ class FrontEnd:
     def correct(self, T_map_local: Array) -> None:
         """Take over the back end's newest correction of the local frame."""
         self._T_map_local = np.array(T_map_local, dtype=np.float64)
+
+    def contradicts(self, belief: Belief) -> bool:
+        """Whether the back end's reflectors are not where this end's estimate has them.
+
+        Both come from the same detections, so a difference beyond the gate is no noise: one of
+        them linearised too early, or took one reflector for another, and it is not the graph.
+        """
+        if set(belief.aliases) & {int(k) for k in self.tracks.keys}:
+            return True
+        mine, theirs = self._common(belief)
+        if not len(mine):
+            return False
+        points = se2.transform(se2.inverse(self._T_map_local), belief.points[theirs])
+        d = points - self.state.landmarks()[mine]
+        spread = self.state.landmark_covs()[mine]
+        d2 = np.einsum('ni,ni->n', d, np.linalg.solve(spread, d[..., None])[..., 0])
+        return bool((d2 > self._contradiction).any())
+
+    def _common(self, belief: Belief) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Indices of the same reflectors here and in the belief."""
+        _, mine, theirs = np.intersect1d(self.tracks.keys, belief.keys, return_indices=True)
+        return mine, theirs
+
+    def adopt(self, belief: Belief) -> None:
+        """Go on from the back end's reflectors, and its covariance of them and of the pose.
+
+        The local pose stays as it is; candidates that the back end does not know start anew.
+        Call it for the frame that became the newest keyframe, after :meth:`correct`.
+        """
+        self.tracks.rename(belief.aliases)
+        mine, theirs = self._common(belief)
+        keep = np.zeros(len(self.tracks), dtype=np.bool_)
+        keep[mine] = True
+        order = theirs[np.argsort(mine, kind='stable')]
+        self.tracks.keep(keep)
+        inverse = se2.inverse(self._T_map_local)
+        columns = np.concatenate([[0, 1, 2], np.stack([3 + 2 * order, 4 + 2 * order], 1).ravel()])
+        T = np.eye(len(columns))
+        R = se2.rotation(inverse[2])
+        T[:2, :2] = R
+        for k in range(3, len(columns), 2):
+            T[k : k + 2, k : k + 2] = R
+        cov = T @ belief.cov[np.ix_(columns, columns)] @ T.T
+        self.state.replace(se2.transform(inverse, belief.points[order]), cov, self.submaps.bias)
 
     def process(self, observation: Observation) -> Frame:
         """The pose at the observation's stamp; never raises for what was measured."""

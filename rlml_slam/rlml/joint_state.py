@@ -119,6 +119,26 @@ class JointState:
         a = ANCHORS[slot]
         return self.x[a : a + 3].copy()
 
+    def replace(self, points: Array, cov: Array, anchor_cov: Array) -> None:
+        """New reflectors (m, 2) and the joint covariance (3 + 2m, 3 + 2m) of the pose and them.
+
+        Pose, bias and anchors keep their means; an anchor keeps its place relative to the pose,
+        known but for ``anchor_cov`` (3, 3).
+        """
+        n = LANDMARKS + 2 * len(points)
+        x, P = np.zeros(n), np.zeros((n, n))
+        x[:LANDMARKS] = self.x[:LANDMARKS]
+        x[LANDMARKS:] = points.ravel()
+        rows = np.r_[0:3, LANDMARKS:n]
+        P[np.ix_(rows, rows)] = cov
+        P[BIAS, BIAS] = self.P[BIAS, BIAS]
+        for a in ANCHORS:
+            J, _ = se2.compose_jacobians(x[:3], se2.between(x[:3], x[a : a + 3]))
+            P[a : a + 3, :] = J @ P[:3, :]
+            P[:, a : a + 3] = P[:, :3] @ J.T
+            P[a : a + 3, a : a + 3] = J @ P[:3, :3] @ J.T + anchor_cov
+        self.x, self.P = x, P
+
     def add_landmark(self, z: Array, R: Array) -> int:
         """Append the reflector seen at z (2,) with covariance R (2, 2) in base; its index."""
         n = len(self.x)

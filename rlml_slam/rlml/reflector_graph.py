@@ -13,7 +13,7 @@ from rlml_slam.matching.association import gate
 from rlml_slam.params import Reflector
 from rlml_slam.rlml.keyframes import Sighting
 from rlml_slam.se2 import Array, transform
-from rlml_slam.types import ANONYMOUS, Reflectors
+from rlml_slam.types import ANONYMOUS, Belief, Reflectors
 
 MERGE_DISTANCE = 1.5  # [m] pairs farther apart are not looked at
 
@@ -66,6 +66,11 @@ class ReflectorGraph:
         landmark.sightings[k] = (pose, z, information, factor)
         self.changed = True
 
+    @property
+    def found(self) -> bool:
+        """Whether there is any reflector in the graph."""
+        return bool(self._alive())
+
     def _alive(self) -> list[_Landmark]:
         return [m for m in self._landmarks.values() if m.index >= 0]
 
@@ -110,6 +115,18 @@ class ReflectorGraph:
         keep.id = gone.id if keep.id == ANONYMOUS else keep.id
         self._alias[gone.key] = keep.key
         del self._landmarks[gone.key]
+
+    def belief(self, pose: int) -> Belief:
+        """Pose ``pose`` and all reflectors with their joint covariance."""
+        alive = sorted(self._alive(), key=lambda m: m.key)
+        index = [m.index for m in alive]
+        return Belief(
+            self._graph.poses[pose].copy(),
+            np.array([m.key for m in alive], dtype=np.int64),
+            self._graph.landmarks[index].reshape(-1, 2),
+            Marginals(self._graph).joint([pose], index),
+            {key: self.resolve(key) for key in self._alias},
+        )
 
     def reflectors(self) -> Reflectors:
         """The map's reflectors with marginal covariances, sorted by key."""

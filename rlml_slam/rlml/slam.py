@@ -66,6 +66,9 @@ class Slam:
                 self.updates.append(update)
                 if update.optimized:
                     self.front_end.correct(update.T_map_local)
+                    belief = self.back_end.belief()
+                    if belief is not None and self.front_end.contradicts(belief):
+                        self.front_end.adopt(belief)
             frames.append(frame)
         return frames
 

@@ -25,8 +25,8 @@ class Submaps:
         self._p = parameters
         self._maps: list[Submap] = []
         self._last: Array | None = None
-        self._bias = np.zeros((3, 3))
-        self._bias[[0, 1, 2], [0, 1, 2]] = parameters.bias2
+        self.bias = np.zeros((3, 3))
+        self.bias[[0, 1, 2], [0, 1, 2]] = parameters.bias2
 
     @property
     def target(self) -> Submap | None:
@@ -59,7 +59,7 @@ class Submaps:
         if not self._maps or (
             len(self._maps) == 1 and self._maps[0].insertions >= self._p.size // 2
         ):
-            state.clone_pose(len(self._maps), GRID_TURN, self._bias)
+            state.clone_pose(len(self._maps), GRID_TURN, self.bias)
             self._maps.append(Submap(self._p))
 
     def cells(self) -> int:

@@ -70,6 +70,11 @@ class Tracks:
             drop[left[order[: len(left) - MAX_CANDIDATES]]] = True
         return drop
 
+    def rename(self, aliases: dict[int, int]) -> None:
+        """Give merged reflectors the key that goes on."""
+        for k in range(len(self.keys)):
+            self.keys[k] = aliases.get(int(self.keys[k]), int(self.keys[k]))
+
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Forget all where the mask (m,) is false."""
         for name in ('keys', 'ids', 'sightings', 'last_seen', 'surveyed', 'diameters'):
