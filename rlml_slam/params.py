@@ -191,6 +191,9 @@ class Reflector(Group):
         0.5,
         0.9999999,
     )
+    ambiguity: float = param(
+        4.0, 'lead of the best match over the next, in squared sigmas, to be used', '', 0.0, 100.0
+    )
     min_separation: float = param(
         0.25, 'reflectors closer than this cannot be told apart', 'm', 0.0, 10.0
     )

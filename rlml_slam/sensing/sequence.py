@@ -224,7 +224,7 @@ class Sequencer:
 
     def _observe(self, stamp: int, group: list[Waiting]) -> Observation:
         scan: Scan | None = None
-        points = origin = detections = None
+        points = origin = detections = T = delta = None
         for _, stream, item in group:
             self.inputs.count(stream, 'used')
             if isinstance(item, Scan):
@@ -245,7 +245,7 @@ class Sequencer:
             motion = compose_motion(self._carried, self._motion(self._last, stamp))
         self._last, self._carried = stamp, STILL
         return Observation(
-            stamp, motion, points, origin, detections, scan, self.buffer.pose_at(stamp)
+            stamp, motion, points, origin, detections, scan, self.buffer.pose_at(stamp), T, delta
         )
 
     def _carry(self, now: int) -> None:

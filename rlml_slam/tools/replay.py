@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from rlml_slam import warm_up
+from rlml_slam.ekf.slam import EkfSlam
 from rlml_slam.errors import BagError, InputError
-from rlml_slam.params import Parameters, from_mapping, read_yaml
+from rlml_slam.params import EkfParameters, Parameters, from_mapping, read_yaml
 from rlml_slam.rlml.slam import Slam
 from rlml_slam.ros.bag import BagReader
 from rlml_slam.ros.feed import Feed
@@ -27,7 +28,11 @@ from rlml_slam.tools.record import FrameLog, Run, Truth
 from rlml_slam.tools.summary import summary_text
 from rlml_slam.tools.tum import Trajectory, read_tum
 
-SYSTEMS: Mapping[str, Callable[[Parameters], Slam]] = {'rlml': Slam}
+# name -> the type of its parameters and its constructor
+SYSTEMS: Mapping[str, tuple[type[Any], Callable[[Any], Slam | EkfSlam]]] = {
+    'rlml': (Parameters, Slam),
+    'ekf': (EkfParameters, EkfSlam),
+}
 
 
 def add_parser(subparsers: Any) -> None:
@@ -51,7 +56,8 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replay, write the results, and say what they are."""
-    params = from_mapping(read_yaml(args.config)) if args.config else Parameters()
+    kind = SYSTEMS[args.system][0]
+    params = from_mapping(read_yaml(args.config), kind) if args.config else kind()
     make_folder(args.out)  # before the work, not after it
     truth = Truth(read_tum(args.truth), is_map=False) if args.truth else None
     result = replay(args.bag, params, truth, args.system, quiet=args.json)
@@ -82,7 +88,7 @@ def replay(
     warm_up.compile_loaded()
     with BagReader(path) as bag:
         inputs = BagInputs(bag, params)
-        slam = SYSTEMS[system](params)
+        slam = SYSTEMS[system][1](params)
         log, problem = FrameLog(), ''
         began = time.perf_counter()
         try:
@@ -104,7 +110,7 @@ def replay(
 
 
 def _drive(
-    slam: Slam,
+    slam: Slam | EkfSlam,
     params: Parameters,
     inputs: BagInputs,
     log: FrameLog,
@@ -124,18 +130,21 @@ def _drive(
                 progress.update(done, f'{factor:.0f} x real time')
 
 
-def collect(slam: Slam, log: FrameLog, name: str, truth: Truth | None) -> Run:
+def collect(slam: Slam | EkfSlam, log: FrameLog, name: str, truth: Truth | None) -> Run:
     """The products of a finished system."""
+    stamps, optimized = slam.trajectory()
+    path = Trajectory(stamps, optimized)
+    if isinstance(slam, EkfSlam):
+        return Run(name, log, path, slam.reflectors(), slam.occupancy_grid(), truth=truth)
     back_end = slam.back_end
     indices = [key.index for key in back_end.keyframes]
     poses = back_end.graph.poses
     tried = back_end.scans.closures
     ends = [poses[[c.i, c.j], :2] for c in tried if c.accepted]
-    stamps, optimized = slam.trajectory()
     return Run(
         name,
         log,
-        Trajectory(stamps, optimized),
+        path,
         slam.reflectors(),
         slam.occupancy_grid(),
         np.array(poses[indices]).reshape(-1, 3),

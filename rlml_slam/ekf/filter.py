@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The filter: predict, update, augment, over the landmarks near the robot; the others later.
+
+State (x, y, theta, b, x_1, y_1, ...): the note's, with the bias b of the gyro, which stays where
+it is without an IMU. Only the robot and the landmarks of a local region are worked on. What an
+update means for the landmarks beyond it is collected in three small matrices and applied when the
+region changes (compressed filter: Guivant, Nebot 2001), which gives the same state exactly.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam import se2
+from rlml_slam.ekf.models import Model
+from rlml_slam.se2 import Array
+from rlml_slam.types import Motion
+
+BIAS, ROBOT = 3, 4
+
+
+class Filter:
+    """Mean ``x`` (4 + 2a,) and covariance ``P`` of robot and local landmarks ``local`` (a,).
+
+    Landmarks are numbered 0, 1, ... in the order they were added; those not in ``local`` are as
+    of the last :meth:`settle`. In a filter whose region is never chosen all landmarks are local.
+    """
+
+    def __init__(self, pose: Array, cov: Array, bias_sigma: float, model: Model) -> None:
+        self.model = model
+        self.x = np.zeros(ROBOT)
+        self.x[:3] = pose
+        self.P = np.zeros((ROBOT, ROBOT))
+        self.P[:3, :3] = cov
+        self.P[BIAS, BIAS] = bias_sigma**2
+        self.local = np.zeros(0, dtype=np.int64)
+        self.num_landmarks = 0
+        self._others = np.zeros(0, dtype=np.int64)
+        self._x = self.x.copy()
+        self._P = self.P.copy()
+        self._phi: Array | None = None
+        self._psi = np.zeros((0, 0))
+        self._theta = np.zeros(0)
+
+    # --- step 1 ----------------------------------------------------------------------------
+
+    def predict(self, motion: Motion, walk: float = 0.0) -> None:
+        """Move the robot: P_rr <- A P_rr A^T + Q, P_ri <- A P_ri (eq. 7, 8), in O(n).
+
+        Q = W C W^T is the motion's covariance turned into the map. ``walk``: variance that the
+        gyro's bias gained meanwhile.
+        """
+        if np.isfinite(motion.bias_var):
+            self._measure_bias(motion.bias, motion.bias_var)
+        gain = motion.bias_gain
+        delta = motion.delta + gain * self.x[BIAS]
+        J_a, J_b = se2.compose_jacobians(self.x[:3], delta)
+        self.x[:3] = se2.compose(self.x[:3], delta)
+        A = np.eye(ROBOT)
+        A[:3, :3] = J_a
+        A[:3, BIAS] = J_b @ gain
+        P = self.P
+        P[:ROBOT, ROBOT:] = A @ P[:ROBOT, ROBOT:]
+        P[ROBOT:, :ROBOT] = P[:ROBOT, ROBOT:].T
+        rr = A @ P[:ROBOT, :ROBOT] @ A.T
+        rr[:3, :3] += J_b @ motion.cov @ J_b.T
+        rr[BIAS, BIAS] += walk
+        P[:ROBOT, :ROBOT] = 0.5 * (rr + rr.T)
+        if self._phi is not None:
+            self._phi[:ROBOT] = A @ self._phi[:ROBOT]
+
+    def _measure_bias(self, bias: float, variance: float) -> None:
+        """What IMU and wheels together say of the bias, gated against slip."""
+        error = bias - float(self.x[BIAS])
+        if error * error < 16.0 * (float(self.P[BIAS, BIAS]) + variance):
+            column = np.array([BIAS])
+            self.apply(column, np.ones((1, 1)), np.array([[variance]]), np.array([error]))
+
+    # --- step 2 ----------------------------------------------------------------------------
+
+    def update(self, slot: int, z: Array, R: Array) -> None:
+        """Use one re-observed landmark, the ``slot``-th of ``local``: z (2,) with R (2, 2)."""
+        a = ROBOT + 2 * slot
+        h, H_r, H_m = self.model.observe(self.x[:3], self.x[None, a : a + 2])
+        columns = np.array([0, 1, 2, a, a + 1])
+        nu = self.model.innovation(z, h[0])
+        self.apply(columns, np.concatenate([H_r[0], H_m[0]], axis=1), R, nu)
+
+    def apply(self, columns: NDArray[np.int64], H: Array, R: Array, nu: Array) -> None:
+        """Kalman update X <- X + K nu for nu = H dx[columns] + noise of covariance R, in O(n^2).
+
+        Joseph form (I - KH) P (I - KH)^T + K R K^T, multiplied out with W = H P:
+        P - K W - W^T K^T + K S K^T, written so that P stays symmetric to the last bit.
+        """
+        W = H @ self.P[columns]
+        S = W[:, columns] @ H.T + R
+        S = 0.5 * (S + S.T)
+        S_inv = np.linalg.inv(S)
+        K = W.T @ S_inv
+        if self._phi is not None:
+            HPhi = H @ self._phi[columns]
+            self._psi += HPhi.T @ S_inv @ HPhi
+            self._theta += HPhi.T @ (S_inv @ nu)
+            self._phi -= K @ HPhi
+        self.x += K @ nu
+        self.x[2] = se2.wrap(self.x[2])
+        M = K @ (0.5 * S @ K.T - W)
+        self.P += M + M.T
+
+    # --- step 3 ----------------------------------------------------------------------------
+
+    def augment(self, z: Array, R: Array) -> int:
+        """Add the landmark measured as z (2,) with R (2, 2); its number.
+
+        P_NN = J_xr P_rr J_xr^T + J_z R J_z^T, P_Ni = J_xr P_ri for every i.
+        """
+        m, J_xr, J_z = self.model.place(self.x[:3], z[None])
+        n = len(self.x)
+        self.x = np.concatenate([self.x, m[0]])
+        P = np.empty((n + 2, n + 2))
+        P[:n, :n] = self.P
+        P[n:, :n] = J_xr[0] @ self.P[:3]
+        P[:n, n:] = P[n:, :n].T
+        new = J_xr[0] @ self.P[:3, :3] @ J_xr[0].T + J_z[0] @ R @ J_z[0].T
+        P[n:, n:] = 0.5 * (new + new.T)
+        self.P = P
+        if self._phi is not None:
+            self._phi = np.concatenate([self._phi, J_xr[0] @ self._phi[:3]])
+        return self._append()
+
+    def fix(self, point: Array, cov: Array) -> int:
+        """Add a landmark of a given map, independent of the rest; its number."""
+        n = len(self.x)
+        P = np.zeros((n + 2, n + 2))
+        P[:n, :n], P[n:, n:] = self.P, cov
+        self.x, self.P = np.concatenate([self.x, point]), P
+        if self._phi is not None:
+            self._phi = np.concatenate([self._phi, np.zeros((2, self._phi.shape[1]))])
+        return self._append()
+
+    def _append(self) -> int:
+        self.local = np.append(self.local, self.num_landmarks)
+        self.num_landmarks += 1
+        return self.num_landmarks - 1
+
+    # --- the local region ------------------------------------------------------------------
+
+    def settle(self) -> None:
+        """Bring the landmarks beyond the region up to date; afterwards all are local."""
+        if not len(self._others):
+            return
+        assert self._phi is not None
+        a, b = self._rows(self.local), self._columns(self._others)
+        a0 = a[: self._phi.shape[1]]
+        n = ROBOT + 2 * self.num_landmarks
+        P_ba0 = self._P[np.ix_(b, a0)]
+        x, P = np.empty(n), np.empty((n, n))
+        x[a], x[b] = self.x, self._x[b] + P_ba0 @ self._theta
+        P_ba = P_ba0 @ self._phi.T
+        bb = self._P[np.ix_(b, b)] - P_ba0 @ self._psi @ P_ba0.T
+        P[np.ix_(b, b)] = 0.5 * (bb + bb.T)
+        P[np.ix_(b, a)] = P_ba
+        P[np.ix_(a, b)] = P_ba.T
+        P[np.ix_(a, a)] = self.P
+        self.x, self.P, self._phi = x, P, None
+        self.local = np.arange(self.num_landmarks)
+        self._others = np.zeros(0, dtype=np.int64)
+
+    def choose(self, keep: NDArray[np.bool_]) -> None:
+        """Work on the landmarks where ``keep`` (m,) is true alone, from now on."""
+        self.settle()
+        if keep.all():
+            return
+        self.local, self._others = np.flatnonzero(keep), np.flatnonzero(~keep)
+        self._x, self._P = self.x, self.P
+        a = self._rows(self.local)
+        self.x, self.P = self._x[a], self._P[np.ix_(a, a)]
+        self._phi = np.eye(len(a))
+        self._psi = np.zeros((len(a), len(a)))
+        self._theta = np.zeros(len(a))
+
+    @staticmethod
+    def _columns(landmarks: NDArray[np.int64]) -> NDArray[np.int64]:
+        first = ROBOT + 2 * landmarks
+        return np.stack([first, first + 1], -1).ravel()
+
+    def _rows(self, landmarks: NDArray[np.int64]) -> NDArray[np.int64]:
+        return np.concatenate([np.arange(ROBOT), self._columns(landmarks)])
+
+    # --- what it knows -----------------------------------------------------------------------
+
+    @property
+    def pose(self) -> Array:
+        """Pose (3,)."""
+        return self.x[:3].copy()
+
+    @property
+    def pose_cov(self) -> Array:
+        """Covariance (3, 3) of the pose."""
+        return self.P[:3, :3].copy()
+
+    @property
+    def points(self) -> Array:
+        """Local landmarks (a, 2)."""
+        return self.x[ROBOT:].reshape(-1, 2)
+
+    def point_covs(self) -> Array:
+        """Marginal covariances (a, 2, 2) of the local landmarks."""
+        m = len(self.local)
+        k = np.arange(m)
+        out: Array = self.P[ROBOT:, ROBOT:].reshape(m, 2, m, 2)[k, :, k, :]
+        return out
+
+    def landmarks(self) -> Array:
+        """All landmarks (m, 2); those beyond the region as of when it was chosen."""
+        out = np.empty((self.num_landmarks, 2))
+        out[self.local] = self.points
+        out[self._others] = self._x[self._columns(self._others)].reshape(-1, 2)
+        return out
+
+    def pose_and_points_cov(self) -> Array:
+        """Joint covariance (3 + 2a, 3 + 2a) of pose and local landmarks."""
+        keep = np.r_[0:3, ROBOT : len(self.x)]
+        out: Array = self.P[np.ix_(keep, keep)]
+        return out
+
+    def innovation_covs(self, H_r: Array, H_m: Array) -> Array:
+        """H P H^T (a, 2, 2) of every local landmark, for its Jacobians (a, 2, 3), (a, 2, 2)."""
+        m = len(self.local)
+        P_rm = self.P[:3, ROBOT:].reshape(3, m, 2).transpose(1, 0, 2)
+        cross = H_r @ P_rm @ H_m.transpose(0, 2, 1)
+        out: Array = (
+            H_r @ self.P[:3, :3] @ H_r.transpose(0, 2, 1)
+            + cross
+            + cross.transpose(0, 2, 1)
+            + H_m @ self.point_covs() @ H_m.transpose(0, 2, 1)
+        )
+        return out

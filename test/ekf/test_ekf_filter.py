@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The filter's three steps against textbook matrices; the postponed update against the plain."""
+
+import numpy as np
+import pytest
+from differences import central_differences
+
+from rlml_slam import se2
+from rlml_slam.ekf.filter import ROBOT, Filter
+from rlml_slam.ekf.models import POINT, line_model
+from rlml_slam.types import Motion
+
+POSE, COV = np.array([0.2, -0.1, 0.3]), np.diag([0.01, 0.02, 0.005])
+R = np.diag([0.02**2, 0.01**2])
+Q = np.array([[4e-4, 1e-5, 2e-5], [1e-5, 1e-4, -1e-5], [2e-5, -1e-5, 9e-5]])
+
+
+def small(seed=0, n=4):
+    rng = np.random.default_rng(seed)
+    f = Filter(POSE, COV, 0.02, POINT)
+    for _ in range(n):
+        f.augment(np.array([rng.uniform(1.0, 6.0), rng.uniform(-3.0, 3.0)]), R)
+    f.predict(Motion(np.array([0.4, 0.02, 0.1]), Q))
+    return f, rng
+
+
+def is_covariance(P):
+    return np.array_equal(P, P.T) and np.linalg.eigvalsh(P)[0] > -1e-14
+
+
+def test_predict_is_the_full_matrix_equation_with_numeric_jacobians():
+    f, _ = small()
+    x, P = f.x.copy(), f.P.copy()
+    motion = Motion(np.array([0.5, -0.03, 0.2]), Q, bias_gain=np.array([0.01, 0.02, -0.1]))
+    move = lambda s, u: se2.compose(s[:3], u + motion.bias_gain * s[3])  # noqa: E731
+    n = len(x)
+    A, B = np.eye(n), np.zeros((n, 3))
+    A[:3] = central_differences(lambda s: move(s, motion.delta), x, angles=(2,))
+    B[:3] = central_differences(lambda u: move(x, u), motion.delta, angles=(2,))
+    f.predict(motion)
+    assert np.allclose(f.x[:3], move(x, motion.delta), atol=1e-14)
+    assert np.abs(f.P - (A @ P @ A.T + B @ Q @ B.T)).max() < 1e-9
+    assert is_covariance(f.P)
+
+
+def test_update_is_the_joseph_form_with_numeric_jacobians():
+    f, _ = small()
+    x, P = f.x.copy(), f.P.copy()
+    h = lambda s: POINT.observe(s[:3], s[None, ROBOT + 4 : ROBOT + 6])[0][0]  # noqa: E731
+    H = central_differences(h, x, angles=(1,))
+    z = h(x) + np.array([0.03, -0.02])
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    I_KH = np.eye(len(x)) - K @ H
+    f.update(2, z, R)
+    assert np.abs(f.x - (x + K @ (z - h(x)))).max() < 1e-8
+    assert np.abs(f.P - (I_KH @ P @ I_KH.T + K @ R @ K.T)).max() < 1e-9
+    assert is_covariance(f.P)
+
+
+def test_augment_is_the_full_matrix_equation_with_numeric_jacobians():
+    f, _ = small()
+    x, P, z = f.x.copy(), f.P.copy(), np.array([2.0, -0.7])
+    place = lambda s, q: POINT.place(s[:3], q[None])[0][0]  # noqa: E731
+    n = len(x)
+    G = np.vstack([np.eye(n), central_differences(lambda s: place(s, z), x)])
+    J_z = central_differences(lambda q: place(x, q), z)
+    expected = G @ P @ G.T
+    expected[n:, n:] += J_z @ R @ J_z.T
+    f.augment(z, R)
+    assert np.abs(f.P - expected).max() < 1e-9
+    assert is_covariance(f.P)
+
+
+def near(f, radius):
+    f.settle()
+    return np.hypot(*(f.points - f.x[:2]).T) < radius
+
+
+def near_now(f, radius):
+    return f.local[np.hypot(*(f.points - f.x[:2]).T) < radius]
+
+
+def test_postponed_update_equals_the_plain_filter():
+    plain = Filter(POSE, COV, 0.02, POINT)
+    rng = np.random.default_rng(5)
+    motions = [
+        Motion(np.array([0.3, 0.0, 0.05]) + 0.01 * rng.standard_normal(3), Q) for _ in range(200)
+    ]
+    noise = 0.01 * rng.standard_normal((200, 50, 2))
+    new = np.stack([rng.uniform(0.5, 2.5, 200), rng.uniform(-3.0, 3.0, 200)], -1)
+    postponed = Filter(POSE, COV, 0.02, POINT)
+    shares = []
+    for k, motion in enumerate(motions):
+        for f in (plain, postponed):
+            f.predict(motion)
+        if k % 10 == 0:
+            postponed.choose(near(postponed, 7.0))
+        if k % 4 == 0:
+            for f in (plain, postponed):
+                f.augment(new[k], R)
+        seen = near_now(plain, 3.0)
+        shares.append(len(postponed.local) / len(plain.local))
+        for i, number in enumerate(seen):
+            z = POINT.observe(plain.x[:3], plain.points[number][None])[0][0] + noise[k, i]
+            plain.update(int(number), z, R)
+            postponed.update(int(np.flatnonzero(postponed.local == number)[0]), z, R)
+    # the region did leave landmarks out
+    assert min(shares) < 0.75
+    postponed.settle()
+    # rounding of some thousand updates
+    assert np.abs(postponed.x - plain.x).max() < 1e-9
+    assert np.abs(postponed.P - plain.P).max() < 1e-10
+    assert is_covariance(plain.P)
+
+
+def test_a_line_does_not_tell_the_place_along_it():
+    f = Filter(np.zeros(3), np.diag([0.04, 0.04, 1e-6]), 0.0, line_model(np.zeros(2)))
+    f.fix(np.array([0.0, 2.0]), 1e-12 * np.eye(2))
+    f.update(0, np.array([2.0, 0.5 * np.pi]), np.diag([1e-4, 1e-4]))
+    assert f.P[0, 0] == pytest.approx(0.04, rel=1e-6)
+    assert f.P[1, 1] < 2e-4
