@@ -192,7 +192,11 @@ class Reflector(Group):
         0.9999999,
     )
     ambiguity: float = param(
-        4.0, 'lead of the best match over the next, in squared sigmas, to be used', '', 0.0, 100.0
+        0.0,
+        'lead of the best match over the next, in squared sigmas, to be used; 0 is off',
+        '',
+        0.0,
+        100.0,
     )
     min_separation: float = param(
         0.25, 'reflectors closer than this cannot be told apart', 'm', 0.0, 10.0
@@ -375,6 +379,21 @@ class Deformable(Group):
     tolerance: float = param(
         1e-4, 'iterations stop when no state moves by more than this', 'm or rad', 1e-12, 1.0
     )
+    motion_floor: float = param(
+        2e-4, "noise added to the odometry's, so that a standing robot's is not zero",
+        'm/sqrt(s), rad/sqrt(s)', 1e-6, 1.0,
+    )  # fmt: skip
+    velocity_timeout: float = param(
+        1.0, 'an older velocity of the carrier is still used, but DEGRADED', 's', 0.01, 1e4
+    )
+    suggest: str = param(
+        'off', 'publish on cmd_vel_suggested how to see the features best, for either drive',
+        choices=('off', 'omnidirectional', 'differential'),
+    )  # fmt: skip
+    plan_step: float = param(1.0, 'length of each of the 6 steps of a plan', 's', 0.05, 60.0)
+    plan_offset: float = param(
+        0.5, "largest offset of a suggestion from the carrier's velocity", 'm/s', 0.01, 10.0
+    )
 
 
 @dataclass(frozen=True)
@@ -485,6 +504,16 @@ class EkfParameters(Parameters):
     ekf: Ekf = Ekf()
     spikes: Spikes = Spikes()
     ransac: Ransac = Ransac()
+
+
+@dataclass(frozen=True)
+class DeformableParameters:
+    """Parameters of deformable_slam: its own group, and those that it shares."""
+
+    node: Node = Node()
+    motion: MotionNoise = MotionNoise()
+    reflector: Reflector = Reflector()
+    deformable: Deformable = Deformable()
 
 
 @dataclass(frozen=True)
@@ -608,6 +637,55 @@ class SimulatorParameters:
     laser: Laser = Laser()
     markers: Markers = Markers()
     transport: Transport = Transport()
+
+
+@dataclass(frozen=True)
+class CarrierRun(Group):
+    """How carrier_simulator runs; a seed fixes all of it."""
+
+    seed: int = param(0, 'seed of all noise', '', 0, 2**31 - 1)
+    rate: float = param(1.0, 'simulated seconds per second', '', 0.01, 1000.0)
+    duration: float = param(0.0, 'stop after this long; 0 is never', 's', 0.0, 1e6)
+    exit_at_end: bool = param(True, 'the node ends, with exit code 0, after the duration')
+    wait_for_subscribers: int = param(
+        0, 'time begins when the reflectors have this many subscribers', '', 0, 100
+    )
+    map_frame: str = param('map', 'frame of the ground truth: the base at start')
+    odom_frame: str = param('odom', 'frame of the odometry')
+    base_frame: str = param('base_link', 'frame of the robot and of its detections')
+
+
+@dataclass(frozen=True)
+class Carrier(Group):
+    """The carrier, the robot beside it and its sensors; the noise is what it says."""
+
+    kind: str = param(
+        'train', 'its features stay together and turn, or pass by and are replaced',
+        choices=('train', 'conveyor'),
+    )  # fmt: skip
+    features: int = param(6, 'features at one time', '', 1, 100)
+    rate: float = param(10.0, 'detections and odometry per second', 'Hz', 0.1, 1000.0)
+    speed: float = param(1.0, 'mean nominal speed', 'm/s', 0.0, 10.0)
+    turn_rate: float = param(0.1, "amplitude of the train's swaying turn", 'rad/s', 0.0, 3.0)
+    drift: float = param(0.05, 'random walk of each feature', 'm/sqrt(s)', 0.0, 10.0)
+    common_drift: float = param(0.05, 'random walk of the whole carrier', 'm/sqrt(s)', 0.0, 10.0)
+    odometry_sigma: tuple[float, ...] = param(
+        (0.01, 0.01, 0.004), 'odometry noise along, across per speed, and of the heading',
+        'm/sqrt(s), sqrt(s), rad/sqrt(s)',
+    )  # fmt: skip
+    sigma: float = param(0.02, 'noise of a detection per axis', 'm', 1e-9, 10.0)
+    max_range: float = param(8.0, 'farther features are not detected', 'm', 0.5, 500.0)
+    missing: float = param(0.1, 'share of detections that fail to appear', '', 0.0, 1.0)
+    ghosts: float = param(0.0, 'mean number of false detections per step', '', 0.0, 100.0)
+    ids: bool = param(True, 'detections tell which feature they are of')
+
+
+@dataclass(frozen=True)
+class CarrierParameters:
+    """Parameters of carrier_simulator."""
+
+    node: CarrierRun = CarrierRun()
+    carrier: Carrier = Carrier()
 
 
 @dataclass(frozen=True)

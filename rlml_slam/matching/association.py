@@ -92,6 +92,9 @@ class Associator:
         rows, cols = self._nearest(d2 + log_det - log_det.min(), compatible)
         if self._in_doubt(rows, cols, nu, compatible, believed, J, Rt, detections):
             rows, cols = self._jointly(nu, d2, compatible, believed, J, Rt, detections)
+        if len(rows) and self._p.ambiguity > 0.0:
+            sure = self._sure(rows, cols, d2 + log_det, compatible, detections)
+            rows, cols = rows[sure], cols[sure]
         match[rows] = cols
         status[rows] = Status.USED
         distance2[rows] = d2[rows, cols]
@@ -102,6 +105,26 @@ class Associator:
         gated = (match < 0) & (near | known) & ~unknown
         status[gated] = np.where(compatible[gated].any(axis=1), Status.AMBIGUOUS, Status.GATED)
         return Association(match, status, distance2)
+
+    def _sure(
+        self,
+        rows: NDArray[np.int64],
+        cols: NDArray[np.int64],
+        cost: Array,
+        compatible: NDArray[np.bool_],
+        detections: Detections,
+    ) -> NDArray[np.bool_]:
+        """(q,): no other reflector explains the detection nearly as well; ids are always sure.
+
+        A detection that could be of two reflectors waits until others have told them apart: one
+        wrong match costs more than many that are not used.
+        """
+        others = np.where(compatible, cost, np.inf)
+        own = others[rows, cols]
+        others[rows, cols] = np.inf
+        lead = others[rows].min(axis=1) - own
+        sure: NDArray[np.bool_] = (lead > self._p.ambiguity) | (detections.ids[rows] != ANONYMOUS)
+        return sure
 
     def _compatible(
         self, detections: Detections, believed: Believed, d2: Array
@@ -159,7 +182,7 @@ class Associator:
         Rt: Array,
         detections: Detections,
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Joint compatibility branch and bound (Neira, Tardos 2001): most matches, then nearest."""
+        """Joint compatibility branch and bound (Neira, Tardos 2001): most matches, then near."""
         order = [int(i) for i in np.argsort(compatible.sum(axis=1), kind='stable')]
         order = [i for i in order if compatible[i].any()]
         best: tuple[int, float, list[int], list[int]] = (0, 0.0, [], [])
