@@ -31,6 +31,7 @@ from rlml_slam.types import Detections, Health, Level, Reflectors
 DEEP = QoSProfile(depth=1000)  # of the small messages, none may be lost
 SENSOR = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 LAST_MAP, PATIENCE = 1.5, 10.0  # [s] for the last map to come; for the last pose at most
+SETTLE = 1.0  # [s] in which two nodes that are there find each other
 FRAME_TIME = 'wall time of the last frame [ms]'
 NO_REFLECTORS = Reflectors(
     np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)),
@@ -60,6 +61,7 @@ class Recorder(Node):
         self._keyframes, self._closures = np.zeros((0, 3)), np.zeros((0, 2, 2))
         self._last_true: Array | None = None
         self._scan: Any = None
+        self._settled = time.monotonic() + SETTLE
         listen = self.create_subscription
         listen(PoseWithCovarianceStamped, 'pose', self.on_pose, DEEP)
         listen(Odometry, 'ground_truth', self.on_truth, DEEP)
@@ -75,12 +77,16 @@ class Recorder(Node):
 
         The simulator waits for this listener, so that nobody misses the beginning.
         """
-        if self._scan is None and self.count_publishers('pose') and self.count_publishers('graph'):
-            # bytes: the stamp is all that is wanted of a scan
-            self._scan = self.create_subscription(
-                LaserScan, 'scan', self.on_scan, SENSOR, raw=True
-            )
-        return self._scan is not None
+        if self._scan is not None:
+            return True
+        now = time.monotonic()
+        if not (self.count_publishers('pose') and self.count_publishers('graph')):
+            self._settled = now + SETTLE
+        if now < self._settled:
+            return False
+        # bytes: the stamp is all that is wanted of a scan
+        self._scan = self.create_subscription(LaserScan, 'scan', self.on_scan, SENSOR, raw=True)
+        return True
 
     def on_scan(self, data: bytes) -> None:
         """One serialized LaserScan: note when it came."""
@@ -202,14 +208,14 @@ class Recorder(Node):
         )  # fmt: skip
 
     def trajectory(self) -> Trajectory:
-        """The newest trajectory, and for the scans after its end the live poses."""
-        live = self.frames.trajectory()
-        if not len(self._path):
+        """The newest trajectory, and for the scans before and after it the live poses."""
+        live, path = self.frames.trajectory(), self._path
+        if not len(path):
             return live
-        tail = live.stamps > self._path.stamps[-1]
+        head, tail = live.stamps < path.stamps[0], live.stamps > path.stamps[-1]
         return Trajectory(
-            np.concatenate([self._path.stamps, live.stamps[tail]]),
-            np.concatenate([self._path.poses, live.poses[tail]]),
+            np.concatenate([live.stamps[head], path.stamps, live.stamps[tail]]),
+            np.concatenate([live.poses[head], path.poses, live.poses[tail]]),
         )
 
     def _figure(self, node: str, key: str) -> float:

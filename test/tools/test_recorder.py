@@ -75,14 +75,15 @@ def test_scan_is_paired_with_its_pose_by_stamp(recorder):
     assert len(recorder.latency_ms) == 1
 
 
-def test_scans_after_the_last_trajectory_have_their_live_poses(recorder):
-    for k in range(1, 5):
+def test_scans_outside_the_last_trajectory_have_their_live_poses(recorder):
+    for k in range(1, 6):
         recorder.on_pose(pose(k, 10.0 * k))
-    path = build.path(make, 1, 'map', [SECOND, 2 * SECOND], np.array([[1.0, 0, 0], [2.0, 0, 0]]))
+    stamps = [2 * SECOND, 3 * SECOND]
+    path = build.path(make, 1, 'map', stamps, np.array([[2.0, 0, 0], [3.0, 0, 0]]))
     recorder.on_trajectory(path)
     t = recorder.trajectory()
-    assert_array_equal(t.stamps, SECOND * np.arange(1, 5))
-    assert_allclose(t.poses[:, 0], [1.0, 2.0, 30.0, 40.0])
+    assert_array_equal(t.stamps, SECOND * np.arange(1, 6))
+    assert_allclose(t.poses[:, 0], [10.0, 2.0, 3.0, 40.0, 50.0])
 
 
 def test_products_of_the_back_end_are_kept(recorder):
