@@ -17,6 +17,7 @@ from rlml_slam.rlml.front_end import FrontEnd
 from rlml_slam.ros import convert
 from rlml_slam.ros.answers import FramePublisher
 from rlml_slam.ros.associated import read_reflector_map
+from rlml_slam.ros.beliefs import read_belief
 from rlml_slam.ros.declare import declare
 from rlml_slam.ros.feed import STREAMS
 from rlml_slam.ros.health import HealthPublisher
@@ -41,6 +42,7 @@ class FrontEndNode(Node):
         pose = PoseWithCovarianceStamped
         self.create_subscription(pose, 'initialpose', checked(self, self.start_at), RELIABLE)
         self.create_subscription(pose, 'correction', checked(self, self.correct), LATCHED)
+        self.create_subscription(PointCloud2, 'belief', checked(self, self.believe), RELIABLE)
         self._map: Reflectors | None = None
         if self.params.node.mode == 'localization':
             self.create_subscription(
@@ -74,6 +76,14 @@ class FrontEndNode(Node):
         if self._map is not None:
             self.front_end.use_map(self._map)
         self.answers.begin_session()
+
+    def believe(self, msg: PointCloud2) -> None:
+        """Go on from the back end's reflectors where its graph contradicts this end's."""
+        said = read_belief(msg)
+        if said.session == self.answers.session:
+            self.front_end.correct(said.T_map_local)
+            if self.front_end.contradicts(said.belief):
+                self.front_end.adopt(said.belief)
 
     def correct(self, msg: PoseWithCovarianceStamped) -> None:
         """Take over T_map_local from the back end."""

@@ -12,6 +12,7 @@ from rlml_slam.errors import MapError
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.ros import build
+from rlml_slam.ros.beliefs import StampedBelief, build_belief
 from rlml_slam.ros.frames import Record
 from rlml_slam.ros.map_folder import MapFolder, SavedMap
 from rlml_slam.ros.messages import make_rclpy, rclpy_class
@@ -49,6 +50,9 @@ class Mapper:
         self._tf = TransformPublisher(node)
         kind = rclpy_class('geometry_msgs/msg/PoseWithCovarianceStamped')
         self._correction = node.create_publisher(kind, 'correction', LATCHED)
+        self._belief = node.create_publisher(
+            rclpy_class('sensor_msgs/msg/PointCloud2'), 'belief', 5
+        )
         self._initialpose = node.create_publisher(kind, 'initialpose', 10)
         if self.saved is not None:
             self.worker.submit(self.publish_map)
@@ -64,14 +68,15 @@ class Mapper:
             self._logger.warning('the front end began anew, and so does the map')
             self.worker.submit(self._forget)
         self._session = record.session
-        self.worker.submit(lambda: self._add(record.frame))
+        self.worker.submit(lambda: self._add(record))
 
-    def _add(self, frame: Frame) -> None:
-        self._newest = frame
+    def _add(self, record: Record) -> None:
+        frame = self._newest = record.frame
         if self.saved is None:
             update = self.back_end.add(frame)
             if update is not None and update.optimized:
                 self._send_correction()
+                self._send_belief(record)
         T_map_base = se2.compose(self.back_end.T_map_local, frame.T_local_base)
         T_odom_base = frame.observation.odom_pose
         if T_odom_base is None:  # without odometry, odom is the front end's local frame
@@ -85,6 +90,15 @@ class Mapper:
         frame, T = self._p.node.map_frame, self.back_end.T_map_local
         message = build.pose_with_covariance(make_rclpy, self.stamp, frame, T, CERTAIN)
         self._correction.publish(message)
+
+    def _send_belief(self, record: Record) -> None:
+        belief = self.back_end.belief()
+        if belief is None:
+            return
+        stamped = StampedBelief(
+            record.frame.stamp, record.session, self.back_end.T_map_local, belief
+        )
+        self._belief.publish(build_belief(make_rclpy, stamped, self._p.node.map_frame))
 
     def publish_map(self) -> None:
         """In the worker: send map, trajectory, reflectors and graph now."""

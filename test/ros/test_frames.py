@@ -17,6 +17,7 @@ from rlml_slam.ros.associated import (
     read_associated,
     read_reflector_map,
 )
+from rlml_slam.ros.beliefs import StampedBelief, build_belief, read_belief
 from rlml_slam.ros.frames import (
     MAX_BEHIND,
     FrameJoin,
@@ -27,6 +28,7 @@ from rlml_slam.ros.frames import (
 )
 from rlml_slam.ros.messages import make_bag
 from rlml_slam.types import (
+    Belief,
     Detections,
     Frame,
     Health,
@@ -37,6 +39,10 @@ from rlml_slam.types import (
     Status,
 )
 
+# the raw sweep and how it was de-skewed are the front end's; the reasons are on /diagnostics
+LEFT_OUT = (
+    '.observation.scan', '.observation.T_base_laser', '.observation.sweep', '.health.reasons'
+)  # fmt: skip
 SECOND = 1_000_000_000
 
 
@@ -54,8 +60,9 @@ def a_frame(stamp=SECOND, seed=0, n=3):
         stamp, 'base_link', rng.normal(size=(n, 2)), covs, rng.integers(9, size=n), rng.random(n)
     )
     observation = Observation(
-        stamp, motion, rng.normal(size=(50, 2)), rng.normal(size=2), seen, None, rng.normal(size=3)
-    )
+        stamp, motion, rng.normal(size=(50, 2)), rng.normal(size=2), seen, None,
+        rng.normal(size=3), rng.normal(size=3), rng.normal(size=3),
+    )  # fmt: skip
     return Frame(
         stamp, observation, rng.normal(size=3), cov(3), rng.normal(size=3), cov(3),
         rng.integers(-1, 9, size=n), rng.integers(5, size=n), Health(Level.DEGRADED, ('why',)),
@@ -82,8 +89,8 @@ def assert_equal(got, want, exact, path=''):
     if dataclasses.is_dataclass(want):
         for f in dataclasses.fields(want):
             name = f'{path}.{f.name}'
-            if name in ('.observation.scan', '.health.reasons'):
-                continue  # the raw sweep is not needed, the reasons are on /diagnostics
+            if name in LEFT_OUT:
+                continue
             assert_equal(getattr(got, f.name), getattr(want, f.name), exact, name)
     elif isinstance(want, np.ndarray) and not exact and path.startswith('.observation.'):
         # float32 on the wire for points and detections
@@ -188,3 +195,24 @@ def test_statuses_are_those_of_the_enumeration():
 def test_header_of_the_clouds_is_the_frame():
     msg = build_record(make_bag, a_frame(), 1, 'local')
     assert msg.header == build.header(make_bag, SECOND, 'local')
+
+
+def test_belief_travels_exactly():
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(9, 9))
+    belief = Belief(
+        rng.normal(size=3), np.array([2, 5, 7]), rng.normal(size=(3, 2)), A @ A.T, {3: 2, 9: 5}
+    )
+    want = StampedBelief(SECOND, 12345, rng.normal(size=3), belief)
+    assert_equal(read_belief(build_belief(make_bag, want, 'map')), want, exact=True)
+    bare = Belief(np.zeros(3), np.zeros(0, np.int64), np.zeros((0, 2)), np.eye(3), {})
+    got = read_belief(build_belief(make_bag, StampedBelief(1, 1, np.zeros(3), bare), 'map'))
+    assert_equal(got.belief, bare, exact=True)
+
+
+def test_belief_that_contradicts_itself_is_refused():
+    belief = Belief(np.zeros(3), np.array([1]), np.zeros((1, 2)), np.eye(5), {})
+    msg = build_belief(make_bag, StampedBelief(1, 1, np.zeros(3), belief), 'map')
+    msg.width -= 4  # the last landmark row and the correction
+    with pytest.raises(InputError, match='belief: 4 values do not fit'):
+        read_belief(msg)
