@@ -8,7 +8,7 @@ import json
 import os
 import signal
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -69,8 +69,7 @@ def run(args: argparse.Namespace) -> int:
             f'{world.name}: simulator, front end and back end are three processes over DDS, '
             f'at {args.rate:g} × real time'
         )
-    with interruptible():
-        result = live(args, out, world)
+    result = live(args, out, world)
     figures = write_outputs(result, out)
     if args.json:
         print(json.dumps(figures))
@@ -81,17 +80,24 @@ def run(args: argparse.Namespace) -> int:
 
 
 @contextmanager
-def interruptible() -> Iterator[None]:
-    """SIGTERM ends the block as Ctrl-C does, so that the children are ended as well."""
+def held_interrupts() -> Iterator[Callable[[], None]]:
+    """SIGINT and SIGTERM are held until the yielded function is called; it raises the interrupt.
 
-    def stop(_number: int, _frame: Any) -> None:
-        raise KeyboardInterrupt
+    Raised anywhere, it could strike while a child is being started, which nobody would end then.
+    """
+    caught: list[int] = []
 
-    before = signal.signal(signal.SIGTERM, stop)
+    def check() -> None:
+        if caught:
+            raise KeyboardInterrupt
+
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(n, lambda number, _frame: caught.append(number)) for n in numbers]
     try:
-        yield
+        yield check
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for n, handler in zip(numbers, before, strict=True):
+            signal.signal(n, handler)
 
 
 def live(args: argparse.Namespace, out: Path, world: World) -> Run:
@@ -101,13 +107,16 @@ def live(args: argparse.Namespace, out: Path, world: World) -> Run:
     os.environ.update(environment)
     rclpy.init(args=[], domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
     try:
-        with Processes(out / 'log', environment) as processes:
+        with held_interrupts() as check, Processes(out / 'log', environment) as processes:
             recorder = Recorder()
             executor = SingleThreadedExecutor()
             executor.add_node(recorder)
             try:
                 start(processes, args)
-                listen(processes, recorder, executor, route_length(world), args.json)
+                with Progress('driving', route_length(world), args.json) as progress:
+                    for _ in listen(processes, recorder, executor):
+                        check()
+                        progress.update(recorder.distance, recorder.note())
                 memory = [processes.peak_rss_mb(name) for name in ('front_end', 'back_end')]
             finally:
                 executor.shutdown(timeout_sec=1.0)
@@ -141,28 +150,23 @@ def node(name: str, parameters: Mapping[str, Any]) -> list[str]:
 
 
 def listen(
-    processes: Processes,
-    recorder: Recorder,
-    executor: SingleThreadedExecutor,
-    length: float,
-    quiet: bool,
-) -> None:
-    """Hear the whole drive; RlmlError if a process dies or falls silent."""
+    processes: Processes, recorder: Recorder, executor: SingleThreadedExecutor
+) -> Iterator[None]:
+    """Hear the whole drive, bit by bit; RlmlError if a process dies or falls silent."""
     began = time.monotonic()
     finished: float | None = None
-    with Progress('driving', length, quiet) as progress:
-        while finished is None or not recorder.has_caught_up(finished):
-            executor.spin_once(timeout_sec=0.1)
-            recorder.is_ready()
-            now = time.monotonic()
-            processes.check('front_end', 'back_end')
-            if finished is None and processes.has_ended('simulator'):
-                finished = now
-            if not recorder.frames.stamps and now - began > START_TIMEOUT:
-                raise RlmlError(f'no pose within {START_TIMEOUT:g} s of the start')
-            if recorder.silence(now) > SILENCE:
-                raise RlmlError(f'the front end has been silent for {SILENCE:g} s')
-            progress.update(recorder.distance, recorder.note())
+    while finished is None or not recorder.has_caught_up(finished):
+        executor.spin_once(timeout_sec=0.1)
+        now = time.monotonic()
+        recorder.is_ready()
+        processes.check('front_end', 'back_end')
+        if finished is None and processes.has_ended('simulator'):
+            finished = now
+        if not recorder.frames.stamps and now - began > START_TIMEOUT:
+            raise RlmlError(f'no pose within {START_TIMEOUT:g} s of the start')
+        if finished is None and recorder.silence(now) > SILENCE:
+            raise RlmlError(f'the front end has been silent for {SILENCE:g} s')
+        yield
 
 
 def route_length(world: World) -> float:

@@ -72,6 +72,7 @@ def test_interrupt_ends_all_processes(world, tmp_path, number):
         cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     deadline = time.monotonic() + 60.0
+    # the log of the last process is there before the process itself
     while len(list(out.glob('log/*.log'))) < 3:
         assert time.monotonic() < deadline
         assert demo.poll() is None
@@ -80,7 +81,7 @@ def test_interrupt_ends_all_processes(world, tmp_path, number):
     _, err = demo.communicate(timeout=30.0)
     assert demo.returncode == 130
     assert err.endswith('rlml: interrupted\n')
-    running = subprocess.run(['ps', '-eo', 'args'], capture_output=True, text=True).stdout
+    running = subprocess.run(['ps', '-ww', '-eo', 'args'], capture_output=True, text=True).stdout
     assert str(world) not in running
 
 
