@@ -191,6 +191,9 @@ class Reflector(Group):
         0.5,
         0.9999999,
     )
+    blur: float = param(
+        4.0, 'anonymous reflectors within this many sigmas of a detection are one', '', 0.0, 100.0
+    )
     ambiguity: float = param(
         0.0,
         'lead of the best match over the next, in squared sigmas, to be used; 0 is off',
@@ -258,6 +261,11 @@ class ScanMatch(Group):
     )
     search_window: float = param(0.1, 'half width of the search', 'm', 0.0, 10.0)
     search_angle: float = param(0.35, 'half width of the search', 'rad', 0.0, 3.2)
+    poor_score: float = param(
+        0.58, 'mean hit probability below which the wide search is made', '', 0.0, 1.0
+    )
+    wide_window: float = param(0.6, 'half width of the wide search', 'm', 0.0, 10.0)
+    wide_angle: float = param(0.5, 'half width of the wide search', 'rad', 0.0, 3.2)
     search_share: float = param(
         0.05, 'share of the hits that a component far from the prior costs in the search', '',
         0.0, 1.0,
@@ -425,6 +433,10 @@ class Ekf(Group):
         1e-3, 100.0,
     )  # fmt: skip
     range_noise: float = param(0.0, 'range noise per range, added to the detection', '', 0.0, 1.0)
+    landmark_sigma: float = param(
+        0.0, 'extent of what is held as one landmark, 1 sigma, added to the detection', 'm',
+        0.0, 10.0,
+    )  # fmt: skip
     update: str = param(
         'compressed', 'full update of all landmarks each time, or postponed for far ones',
         choices=('plain', 'compressed'),

@@ -137,10 +137,17 @@ class Associator:
         return ok
 
     def _inseparable(self, detections: Detections, believed: Believed) -> NDArray[np.bool_]:
-        """(k,): closer to a known reflector than two reflectors can be told apart."""
+        """(k,): closer to a known reflector than two reflectors can be told apart.
+
+        That is ``min_separation``, and never less than what the detection's own noise allows: of
+        two markers within it, an anonymous detection can be of either, and both count as one.
+        """
         p = se2.transform(believed.pose, detections.points)
         gap = np.linalg.norm(p[:, None] - believed.points[None], axis=-1)
-        near: NDArray[np.bool_] = gap.min(axis=1) < self._p.min_separation
+        noise = np.sqrt(np.linalg.eigvalsh(detections.cov)[:, -1])
+        blur = np.where(detections.ids == ANONYMOUS, self._p.blur * noise, 0.0)
+        limit = np.maximum(self._p.min_separation, blur)
+        near: NDArray[np.bool_] = gap.min(axis=1) < limit
         return near
 
     @staticmethod
