@@ -6,7 +6,10 @@ from glob import glob
 from setuptools import find_packages, setup
 
 NAME = 'rlml_slam'
-NODES = ('front_end', 'back_end', 'slam', 'simulator', 'bag_player')
+NODES = (
+    'front_end', 'back_end', 'slam', 'simulator', 'bag_player', 'deformable_slam',
+    'carrier_simulator',
+)  # fmt: skip
 
 setup(
     name=NAME,

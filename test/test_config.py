@@ -13,6 +13,8 @@ import pytest
 
 from rlml_slam import __version__
 from rlml_slam.params import (
+    CarrierParameters,
+    DeformableParameters,
     Parameters,
     PlayerParameters,
     SimulatorParameters,
@@ -24,7 +26,13 @@ from rlml_slam.params import (
 from rlml_slam.tools.config import FILES, parameter_file
 
 ROOT = Path(__file__).resolve().parents[1]
-ALL = (Parameters, SimulatorParameters, PlayerParameters)
+ALL = (
+    Parameters,
+    DeformableParameters,
+    SimulatorParameters,
+    CarrierParameters,
+    PlayerParameters,
+)
 KNOWN = {d.name for of in ALL for d in declarations(of)}
 
 
@@ -67,7 +75,7 @@ def test_versions_agree():
 
 
 def test_every_executable_exists_and_every_node_is_one():
-    (names,) = re.findall(r'^NODES = \((.*)\)$', (ROOT / 'setup.py').read_text(), re.M)
+    (names,) = re.findall(r'^NODES = \((.*?)\)', (ROOT / 'setup.py').read_text(), re.M | re.S)
     executables = set(re.findall(r"'(\w+)'", names))
     nodes = {p.stem for p in (ROOT / 'rlml_slam/nodes').glob('*.py')} - {'__init__'}
     assert executables == nodes

@@ -16,7 +16,9 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.parameter import Parameter
 
 from rlml_slam.params import (
+    CarrierParameters,
     Declaration,
+    DeformableParameters,
     Parameters,
     PlayerParameters,
     SimulatorParameters,
@@ -24,7 +26,13 @@ from rlml_slam.params import (
     from_mapping,
 )
 
-AGGREGATES: tuple[type[Any], ...] = (Parameters, SimulatorParameters, PlayerParameters)
+AGGREGATES: tuple[type[Any], ...] = (
+    Parameters,
+    DeformableParameters,
+    SimulatorParameters,
+    CarrierParameters,
+    PlayerParameters,
+)
 # rclpy's own, which it takes from the same overrides
 _OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 

@@ -7,11 +7,20 @@ import math
 import sys
 from typing import Any
 
-from rlml_slam.params import Declaration, Parameters, SimulatorParameters, declarations
+from rlml_slam.params import (
+    CarrierParameters,
+    Declaration,
+    DeformableParameters,
+    Parameters,
+    SimulatorParameters,
+    declarations,
+)
 
 FILES: dict[str, tuple[type[Any], str]] = {
     'default.yaml': (Parameters, 'Every parameter of front_end, back_end, slam and `rlml replay`'),
     'simulator.yaml': (SimulatorParameters, 'Every parameter of the simulator'),
+    'deformable_slam.yaml': (DeformableParameters, 'Every parameter of deformable_slam'),
+    'carrier_simulator.yaml': (CarrierParameters, 'Every parameter of carrier_simulator'),
 }
 
 
