@@ -86,11 +86,16 @@ class _Track:
 class DeformableWindow:
     """Estimate of the robot and its carrier's features, update by update.
 
-    ``start`` (3,) is the first pose; its uncertainty is a parameter.
+    ``start`` (3,) is the first pose and ``start_cov`` (3, 3) its covariance; the parameter
+    ``start_sigma`` where none is given, and added to one that is.
     """
 
     def __init__(
-        self, params: Deformable, reflector: Reflector, start: Array | None = None
+        self,
+        params: Deformable,
+        reflector: Reflector,
+        start: Array | None = None,
+        start_cov: Array | None = None,
     ) -> None:
         self._p, self._reflector = params, reflector
         self._associator = Associator(reflector)
@@ -101,8 +106,9 @@ class DeformableWindow:
         self._allocate(SLOTS)
         self._w.mean[0, :3] = 0.0 if start is None else start
         self._prior.at[:3] = self._w.mean[0, :3]
-        self._prior.info[:3, :3] = np.diag(1.0 / np.array(params.start_sigma) ** 2)
-        self._cov[:3, :3] = np.diag(np.array(params.start_sigma) ** 2)
+        cov = np.diag(np.array(params.start_sigma) ** 2)
+        self._cov[:3, :3] = cov if start_cov is None else cov + start_cov
+        self._prior.info[:3, :3] = _inverse(self._cov[:3, :3])
 
     def update(
         self, stamp: int, motion: Motion, detections: Detections, velocity: CarrierVelocity
@@ -308,3 +314,12 @@ def _inverse(cov: Array) -> Array:
     inverse = np.linalg.inv(cov)
     symmetric: Array = 0.5 * (inverse + inverse.T)
     return symmetric
+
+
+def warm_up() -> None:
+    """Compile the kernels: a window that fills, turns and marginalises."""
+    window = DeformableWindow(Deformable(window=2), Reflector(min_sightings=1))
+    none = np.full(1, np.nan)
+    for k in range(4):
+        seen = Detections(k, '', np.ones((1, 2)), np.eye(2)[None], np.zeros(1, np.int64), none)
+        window.update(k, Motion(np.zeros(3), np.eye(3)), seen, CarrierVelocity(np.zeros(2), 0.1))

@@ -14,27 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.se2 import Array, compose, rotation
+from rlml_slam.params import Carrier
+from rlml_slam.se2 import Array, between, compose, exp, rotation
 from rlml_slam.types import ANONYMOUS, Detections, Motion
-
-
-@dataclass(frozen=True)
-class CarrierSettings:
-    """What is simulated; the noise is what it says, so an estimator can be consistent."""
-
-    kind: str = 'train'  # or 'conveyor'
-    features: int = 6
-    rate: float = 10.0  # Hz
-    speed: float = 1.0  # m/s
-    turn_rate: float = 0.1  # rad/s, amplitude of the train's swaying turn
-    drift: float = 0.05  # m/sqrt(s), each feature on its own
-    common_drift: float = 0.05  # m/sqrt(s), the whole carrier
-    odometry_sigma: tuple[float, float, float] = (0.01, 0.01, 0.004)  # per sqrt(s)
-    sigma: float = 0.02  # m, of a detection per axis
-    max_range: float = 8.0  # m
-    missing: float = 0.1  # share of detections that fail to appear
-    ghosts: float = 0.0  # mean number of false detections per step
-    with_ids: bool = True
 
 
 @dataclass(frozen=True)
@@ -52,7 +34,7 @@ class CarrierStep:
     seen: NDArray[np.int64]  # (k,) true id of each detection, ANONYMOUS for a ghost
 
 
-def simulate_carrier(settings: CarrierSettings, seed: int) -> Iterator[CarrierStep]:
+def simulate_carrier(settings: Carrier, seed: int) -> Iterator[CarrierStep]:
     """Steps without end; the same for the same settings and seed."""
     generator = np.random.default_rng(seed)
     dt = 1.0 / settings.rate
@@ -62,7 +44,7 @@ def simulate_carrier(settings: CarrierSettings, seed: int) -> Iterator[CarrierSt
     points[:, 0] += 1.2 * (np.arange(settings.features) - (settings.features - 1) / 2.0)
     points[:, 1] += 0.8 * (-1.0) ** np.arange(settings.features)
     ids = np.arange(settings.features, dtype=np.int64)
-    motion = Motion(np.zeros(3), np.diag(np.array(settings.odometry_sigma) ** 2 * dt))
+    motion = Motion(np.zeros(3), np.diag(np.array(settings.odometry_sigma) ** 2 * dt + 1e-24))
     linear, angular, k = np.zeros(2), 0.0, 0
     while True:
         detections, seen = _detect(settings, generator, k, dt, pose, ids, points)
@@ -74,34 +56,40 @@ def simulate_carrier(settings: CarrierSettings, seed: int) -> Iterator[CarrierSt
         direction = heading if settings.kind == 'train' else 0.0
         speed = settings.speed * (1.0 + 0.3 * np.sin(0.2 * time))
         linear = speed * np.array([np.cos(direction), np.sin(direction)])
-        pose, motion = _drive(settings, generator, dt, pose, points, linear, angular)
+        pose, motion = _drive(
+            settings, generator, dt, pose, points, np.array([speed, direction, angular])
+        )
         points = _carry(settings, generator, dt, points, linear, angular)
         if settings.kind == 'conveyor':
             ids, points = _feed(settings, pose, ids, points)
 
 
 def _drive(
-    settings: CarrierSettings, generator: np.random.Generator, dt: float, pose: Array,
-    points: Array, linear: Array, angular: float,
+    settings: Carrier, generator: np.random.Generator, dt: float, pose: Array, points: Array,
+    carrier: Array,
 ) -> tuple[Array, Motion]:  # fmt: skip
-    """The robot stays beside the carrier, or lets a conveyor pass; true pose and odometry."""
-    along = linear / max(float(np.linalg.norm(linear)), 1e-9)
-    across = np.array([-along[1], along[0]])
-    gap = points.mean(axis=0) - pose[:2]
-    wanted = 0.5 * across * (across @ gap - 2.0)  # the carrier 2 m to the left
+    """A wheeled robot stays beside the carrier, or lets a conveyor pass; true pose and odometry.
+
+    ``carrier`` = (speed, direction, turn rate). The steering is Kanayama's tracking law.
+    """
+    speed, direction, turn = carrier
+    beside = np.array([*points.mean(axis=0), direction])
+    beside = compose(beside, np.array([0.0, -2.0, 0.0]))  # the carrier 2 m to the left
+    ahead, aside, astray = between(pose, beside)
     if settings.kind == 'train':
-        wanted += linear + 0.5 * along * (along @ gap)
+        v, w = speed + 2.0 * turn, turn
     else:
-        wanted += 0.6 * linear
-    turn = angular * dt
-    command = np.append(rotation(pose[2]).T @ (wanted * dt), turn)
-    sigma = np.array(settings.odometry_sigma) * np.sqrt(dt)
+        v, w, ahead = 0.6 * speed, 0.0, 0.0
+    w += v * (0.25 * aside + np.sin(astray))
+    v = v * np.cos(astray) + 0.5 * ahead
+    command = exp(np.array([v, 0.0, w]) * dt)
+    sigma = np.array(settings.odometry_sigma) * [1.0, abs(v), 1.0] * np.sqrt(dt)
     true = command + sigma * generator.standard_normal(3)
-    return compose(pose, true), Motion(command, np.diag(sigma**2))
+    return compose(pose, true), Motion(command, np.diag(sigma**2 + 1e-24))
 
 
 def _carry(
-    settings: CarrierSettings, generator: np.random.Generator, dt: float, points: Array,
+    settings: Carrier, generator: np.random.Generator, dt: float, points: Array,
     linear: Array, angular: float,
 ) -> Array:  # fmt: skip
     """The features one step on: nominal motion about their centroid, and both random walks."""
@@ -114,7 +102,7 @@ def _carry(
 
 
 def _feed(
-    settings: CarrierSettings, pose: Array, ids: NDArray[np.int64], points: Array
+    settings: Carrier, pose: Array, ids: NDArray[np.int64], points: Array
 ) -> tuple[NDArray[np.int64], Array]:
     """A conveyor's feature that is far downstream comes back upstream as a new one."""
     ids, points = ids.copy(), points.copy()
@@ -125,7 +113,7 @@ def _feed(
 
 
 def _detect(
-    settings: CarrierSettings, generator: np.random.Generator, k: int, dt: float, pose: Array,
+    settings: Carrier, generator: np.random.Generator, k: int, dt: float, pose: Array,
     ids: NDArray[np.int64], points: Array,
 ) -> tuple[Detections, NDArray[np.int64]]:  # fmt: skip
     """Detections of what is in range, some missing, some ghosts, in random order."""
@@ -141,7 +129,7 @@ def _detect(
     seen = np.concatenate([ids[kept], np.full(num, ANONYMOUS, dtype=np.int64)])
     order = generator.permutation(len(found))
     found, seen = found[order], seen[order]
-    told = seen if settings.with_ids else np.full(len(seen), ANONYMOUS, dtype=np.int64)
+    told = seen if settings.ids else np.full(len(seen), ANONYMOUS, dtype=np.int64)
     cov = np.broadcast_to(settings.sigma**2 * np.eye(2), (len(found), 2, 2)).copy()
     stamp = round(1e9 * k * dt)
     diameters = np.full(len(found), np.nan)

@@ -11,9 +11,9 @@ from rlml_slam.deformable.scoring import chi2_bounds
 from rlml_slam.deformable.window import CarrierVelocity, DeformableWindow
 from rlml_slam.deformable.window_equations import carry, motion_covariance, motion_information
 from rlml_slam.errors import InputError
-from rlml_slam.params import Deformable, Reflector
+from rlml_slam.params import Carrier, Deformable, Reflector
 from rlml_slam.se2 import wrap
-from rlml_slam.simulation.carrier import CarrierSettings, simulate_carrier, true_features
+from rlml_slam.simulation.carrier import simulate_carrier, true_features
 from rlml_slam.types import Motion, Status
 
 EXACT = {
@@ -22,7 +22,7 @@ EXACT = {
 
 
 def steps(count, seed=0, **settings):
-    return list(islice(simulate_carrier(CarrierSettings(**settings), seed), count))
+    return list(islice(simulate_carrier(Carrier(**settings), seed), count))
 
 
 def follow(run, reflector=None, **params):
@@ -140,7 +140,7 @@ def test_covariances_account_for_the_errors(kind):
 
 def test_cost_and_memory_stay_constant():
     """Nothing grows over 60 s of a conveyor whose features come and go."""
-    run = steps(600, kind='conveyor', with_ids=False, ghosts=0.05)
+    run = steps(600, kind='conveyor', ids=False, ghosts=0.05)
     window = DeformableWindow(Deformable(), Reflector())
     sizes, seconds = [], []
     for s in run:
@@ -155,7 +155,7 @@ def test_cost_and_memory_stay_constant():
 
 
 def test_anonymous_features_are_followed_among_ghosts():
-    run = steps(300, with_ids=False, ghosts=0.1)
+    run = steps(300, ids=False, ghosts=0.1)
     estimates, owner, _ = follow(run)
     last, step = estimates[-1], run[-1]
     found = last.features.points[:, None] - step.points[None]
@@ -217,7 +217,7 @@ def test_moving_the_start_moves_everything_and_changes_nothing_else():
 
 
 def test_replay_is_identical_bit_for_bit():
-    run = steps(60, with_ids=False, ghosts=0.2)
+    run = steps(60, ids=False, ghosts=0.2)
     a, b = follow(run)[0], follow(run)[0]
     for x, y in zip(a, b, strict=True):
         np.testing.assert_array_equal(x.joint_cov, y.joint_cov)

@@ -4,12 +4,13 @@ from itertools import islice, pairwise
 import numpy as np
 import pytest
 
+from rlml_slam.params import Carrier
 from rlml_slam.se2 import between, transform
-from rlml_slam.simulation.carrier import CarrierSettings, simulate_carrier, true_features
+from rlml_slam.simulation.carrier import simulate_carrier, true_features
 
 
 def steps(count, seed=0, **settings):
-    return list(islice(simulate_carrier(CarrierSettings(**settings), seed), count))
+    return list(islice(simulate_carrier(Carrier(**settings), seed), count))
 
 
 def test_same_seed_gives_the_same_steps():
@@ -56,7 +57,7 @@ def test_train_stays_in_range_and_a_conveyor_brings_new_features():
 
 
 def test_ghosts_and_missing_come_in_the_stated_share():
-    run = steps(1000, ghosts=0.5, missing=0.3, with_ids=False)
+    run = steps(1000, ghosts=0.5, missing=0.3, ids=False)
     seen = np.concatenate([s.seen for s in run])
     assert (seen == -1).mean() * len(seen) / 1000 == pytest.approx(0.5, abs=0.07)
     assert (seen >= 0).sum() / 6000 == pytest.approx(0.7, abs=0.02)

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Executable ``deformable_slam``: the robot and the features of a moving, deforming carrier."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.node import Node
+
+from rlml_slam import warm_up
+from rlml_slam.deformable.slam import DeformableSlam
+from rlml_slam.params import DeformableParameters, Parameters
+from rlml_slam.ros import convert
+from rlml_slam.ros.declare import declare
+from rlml_slam.ros.deformable_answers import EstimatePublisher
+from rlml_slam.ros.deformable_input import VelocityInput
+from rlml_slam.ros.feed import STREAMS
+from rlml_slam.ros.health import HealthPublisher
+from rlml_slam.ros.run import run
+from rlml_slam.ros.sensors import RELIABLE, Sensors, checked
+from rlml_slam.types import Observation
+
+
+class DeformableSlamNode(Node):
+    """Drives a DeformableSlam with detections; all stamps are those of the input."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__('deformable_slam', **options)
+        p: DeformableParameters = declare(self, DeformableParameters)
+        self.slam = DeformableSlam(p)
+        warm_up.compile_loaded()
+        self.answers = EstimatePublisher(self, p)
+        self.velocity = VelocityInput(self, p.node, self.slam.announce)
+        shared = Parameters(node=p.node, motion=p.motion, reflector=p.reflector)
+        streams = [s for s in STREAMS if s != 'scan']
+        self.sensors = Sensors(self, shared, streams, self.process, self.restart)
+        self.health = HealthPublisher(self, self.sensors, self.figures)
+        self.create_subscription(
+            PoseWithCovarianceStamped, 'initialpose', checked(self, self.start_at), RELIABLE
+        )
+
+    def process(self, observation: Observation) -> None:
+        """One observation: estimate and publish."""
+        self.velocity.drain()
+        frame = self.slam.process(observation)
+        if self.slam.estimate is not None:
+            self.answers.publish(self.slam.estimate, self.slam.velocity)
+        self.health.update(frame)
+
+    def start_at(self, msg: PoseWithCovarianceStamped) -> None:
+        """Begin anew at a pose of the map."""
+        start = convert.pose_estimate(msg, 'initialpose')
+        self.slam.begin_at(start.pose, start.cov)
+        self.get_logger().info(f'begins at {np.round(start.pose, 3).tolist()}')
+
+    def restart(self) -> None:
+        """Forget everything: the clock jumped back."""
+        self.slam.restart()
+
+    def figures(self) -> dict[str, object]:
+        """Figures for /diagnostics."""
+        estimate = self.slam.estimate
+        return {'features': 0 if estimate is None else len(estimate.features.keys)}
+
+
+def main() -> int:
+    """Run the node."""
+    return run(DeformableSlamNode)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

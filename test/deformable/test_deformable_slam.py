@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+from itertools import islice, pairwise
+
+import numpy as np
+import pytest
+
+from rlml_slam.deformable.active import offsets
+from rlml_slam.deformable.gyro_bias import GyroBias
+from rlml_slam.deformable.slam import DeformableSlam
+from rlml_slam.deformable.suggest import drivable, suggest_twist
+from rlml_slam.deformable.velocity import MAX_KEPT, VelocityHistory
+from rlml_slam.deformable.window import CarrierVelocity, DeformableWindow
+from rlml_slam.errors import SolverError
+from rlml_slam.params import (
+    Carrier,
+    Deformable,
+    DeformableParameters,
+    MotionNoise,
+    Node,
+    Reflector,
+)
+from rlml_slam.se2 import exp
+from rlml_slam.simulation.carrier import simulate_carrier
+from rlml_slam.types import Level, Motion, Observation
+
+SECOND = 1_000_000_000
+STILL = CarrierVelocity(np.zeros(2))
+
+
+def steps(count, seed=0, **settings):
+    return list(islice(simulate_carrier(Carrier(**settings), seed), count))
+
+
+def announce(slam, run):
+    for before, step in pairwise(run):
+        slam.announce(before.stamp, CarrierVelocity(step.linear, step.angular))
+
+
+def observe(step):
+    return Observation(step.stamp, step.motion, detections=step.detections)
+
+
+def drive(run, params=None):
+    slam = DeformableSlam(params or DeformableParameters())
+    announce(slam, run)
+    return [(slam.process(observe(s)), slam.estimate) for s in run], slam
+
+
+# --- the carrier's velocity -----------------------------------------------------------------
+
+
+def test_velocity_holds_until_the_next_one():
+    history = VelocityHistory()
+    for stamp, v in ((3, 3.0), (0, 1.0), (1, 2.0), (1, 5.0)):  # out of order; the last one wins
+        history.add(stamp * SECOND, CarrierVelocity(np.array([v, -v]), 0.1 * v))
+    mean = history.mean(0, 4 * SECOND)  # 1 s at 1, 2 s at 5, 1 s at 3
+    np.testing.assert_allclose(mean.linear, [3.5, -3.5])
+    assert mean.angular == pytest.approx(0.35)
+    np.testing.assert_allclose(history.mean(4 * SECOND, 9 * SECOND).linear, [3.0, -3.0])
+    assert history.age(9 * SECOND) == pytest.approx(6.0)
+
+
+def test_first_velocity_held_before_it_and_none_is_standing_still():
+    history = VelocityHistory()
+    assert history.age(5) is None
+    np.testing.assert_array_equal(history.mean(0, 5).linear, [0.0, 0.0])
+    history.add(10 * SECOND, CarrierVelocity(np.array([1.0, 0.0])))
+    np.testing.assert_allclose(history.mean(SECOND, 2 * SECOND).linear, [1.0, 0.0])
+    assert history.age(SECOND) == 0.0
+
+
+def test_history_forgets_what_was_used_and_has_a_limit():
+    history = VelocityHistory()
+    for k in range(MAX_KEPT + 50):
+        history.add(k, STILL)
+    assert len(history._stamps) == len(history._velocities) == MAX_KEPT
+    history.mean(MAX_KEPT + 40, MAX_KEPT + 45)
+    assert history._stamps == list(range(MAX_KEPT + 40, MAX_KEPT + 50))
+
+
+# --- the gyro -------------------------------------------------------------------------------
+
+
+def gyro_motion(rate, wheels, dt, variance):
+    """Motion as MotionBuffer says it: turn of the gyro, bias as the wheels see it."""
+    gain = np.array([0.0, 0.0, -dt])
+    return Motion(np.array([0.0, 0.0, rate * dt]), 1e-12 * np.eye(3), True, gain, rate - wheels,
+                  variance)  # fmt: skip
+
+
+def test_heading_error_by_a_biased_gyro_stays_within_its_covariance():
+    """Summed over 30 s in 100 runs: the sum of the steps' variances covers the true spread."""
+    dt, sigma, noise = 0.1, 0.05, MotionNoise()
+    errors, variances = [], []
+    for seed in range(100):
+        g = np.random.default_rng(seed)
+        filtered, bias = GyroBias(noise), noise.imu_bias * g.standard_normal()
+        error = variance = 0.0
+        for _ in range(300):
+            bias += noise.imu_bias_walk * np.sqrt(dt) * g.standard_normal()
+            m = gyro_motion(bias, sigma * g.standard_normal(), dt, sigma**2)
+            got = filtered.correct(m, dt)
+            error += got.delta[2]  # the robot does not turn
+            variance += got.cov[2, 2]
+        errors.append(error)
+        variances.append(variance)
+    ratio = np.mean(np.square(errors)) / np.mean(variances)
+    # the widening is an upper bound of the correlation: conservative, by no more than a factor 4
+    assert 0.25 < ratio < 1.0
+
+
+def test_motion_without_a_gyro_is_left_alone():
+    motion = Motion(np.ones(3), np.eye(3))
+    assert GyroBias(MotionNoise()).correct(motion, 0.1) is motion
+
+
+def test_slipping_wheels_do_not_spoil_the_bias():
+    filtered = GyroBias(MotionNoise())
+    for _ in range(200):
+        filtered.correct(gyro_motion(0.01, 0.0, 0.1, 1e-4), 0.1)
+    settled = filtered.bias
+    filtered.correct(gyro_motion(0.01, 3.0, 0.1, 1e-4), 0.1)
+    assert settled == pytest.approx(0.01, rel=0.1)
+    assert filtered.bias == settled
+
+
+# --- the system -----------------------------------------------------------------------------
+
+
+def test_system_is_the_window_with_motion_and_velocity_of_the_observations():
+    run = steps(40)
+    answers, _ = drive(run)
+    window = DeformableWindow(Deformable(), Reflector())
+    for s, (frame, estimate) in zip(run, answers, strict=True):
+        expected = window.update(
+            s.stamp, s.motion, s.detections, CarrierVelocity(s.linear, s.angular)
+        )
+        # the motion floor adds 4e-8 to variances of 1e-4
+        np.testing.assert_allclose(estimate.pose, expected.pose, atol=1e-5)
+        np.testing.assert_array_equal(frame.T_map_base, estimate.pose)
+        np.testing.assert_array_equal(frame.landmarks, expected.keys)
+    assert frame.health.level is Level.OK
+
+
+def test_standing_still_beside_a_standing_carrier_is_fine():
+    """Odometry of a standing robot may have a covariance of exactly 0."""
+    run = [replace(s, motion=Motion(np.zeros(3), np.zeros((3, 3))))
+           for s in steps(60, speed=0.0, turn_rate=0.0)]  # fmt: skip
+    answers, _ = drive(run)
+    assert np.abs(answers[-1][1].pose).max() < 0.01
+    assert answers[-1][0].health.level is Level.OK
+
+
+def test_health_names_what_is_wrong():
+    run = steps(60)
+    lost = replace(run[-1].motion, known=False)
+    run = [replace(s, motion=lost if k == 55 else s.motion) for k, s in enumerate(run)]
+    slam = DeformableSlam(DeformableParameters())
+    frames = [slam.process(replace(observe(s), detections=None if k >= 40 else s.detections))
+              for k, s in enumerate(run)]  # fmt: skip
+    assert 'no carrier_velocity yet' in frames[5].health.reasons[0]
+    assert 'no feature of the carrier is known' in frames[0].health.reasons
+    assert frames[55].health.level is Level.LOST
+    assert 'odometry does not cover the motion' in frames[55].health.reasons
+    announce(slam, run)
+    late = slam.process(Observation(run[-1].stamp + 3 * SECOND, lost))
+    assert any(r.startswith('carrier_velocity is 3.') for r in late.health.reasons)
+
+
+def test_unusable_covariance_costs_the_detections_but_not_the_motion():
+    run = steps(30)
+    broken = replace(run[-1].detections, cov=np.zeros_like(run[-1].detections.cov))
+    answers, slam = drive(run[:-1])
+    announce(slam, run)
+    frame = slam.process(replace(observe(run[-1]), detections=broken))
+    assert frame.health.level is Level.DEGRADED
+    assert any('not positive definite' in r for r in frame.health.reasons)
+    moved = np.linalg.norm(slam.estimate.pose[:2] - answers[-1][1].pose[:2])
+    assert moved == pytest.approx(np.linalg.norm(run[-1].motion.delta[:2]), abs=0.02)
+
+
+def test_unsolvable_window_begins_anew_where_the_robot_is(monkeypatch):
+    run = steps(30)
+    answers, slam = drive(run[:-1])
+
+    def fail(*args):
+        raise SolverError('singular')
+
+    monkeypatch.setattr(slam._window, 'update', fail)
+    frame = slam.process(observe(run[-1]))
+    assert frame.health.reasons[0] == 'singular: began anew'
+    step = np.linalg.norm(slam.estimate.pose[:2] - answers[-1][1].pose[:2])
+    assert step == pytest.approx(np.linalg.norm(run[-1].motion.delta[:2]), abs=1e-6)
+    assert np.all(np.diag(frame.cov_map) >= np.diag(answers[-1][1].cov))
+
+
+def test_start_pose_is_a_parameter():
+    params = DeformableParameters(node=Node(map_start_pose=(3.0, -1.0, 0.5)))
+    answers, _ = drive(steps(1), params)
+    np.testing.assert_allclose(answers[0][1].pose, [3.0, -1.0, 0.5], atol=1e-6)
+
+
+# --- suggestions ----------------------------------------------------------------------------
+
+
+def suggest(**deformable):
+    params = DeformableParameters(
+        deformable=Deformable(**deformable), reflector=Reflector(max_range=3.0)
+    )
+    _, slam = drive(steps(20, max_range=3.0, features=4, seed=1), params)
+    return suggest_twist(slam.estimate, slam.velocity, params), slam
+
+
+def test_suggestion_is_the_carriers_velocity_plus_one_of_the_offsets():
+    twist, slam = suggest(suggest='omnidirectional')
+    c, s = np.cos(slam.estimate.pose[2]), np.sin(slam.estimate.pose[2])
+    keep_up = np.array([[c, s], [-s, c]]) @ slam.velocity.linear
+    gaps = np.linalg.norm(keep_up + 0.5 * offsets() - twist[:2], axis=-1)
+    assert gaps.min() < 1e-9
+    assert twist[2] == pytest.approx(slam.velocity.angular)
+
+
+def test_differential_suggestion_reaches_the_same_place():
+    free, _ = suggest(suggest='omnidirectional', plan_step=0.5)
+    wheeled, _ = suggest(suggest='differential', plan_step=0.5)
+    assert wheeled[1] == 0.0
+    np.testing.assert_allclose(exp(wheeled * 0.5)[:2], free[:2] * 0.5, atol=1e-12)
+
+
+@pytest.mark.parametrize('to', [(1.0, 0.4), (-1.0, 0.4), (-0.3, -0.2), (0.0, 1.0), (2.0, 0.0)])
+def test_arc_ends_where_it_should(to):
+    v, across, turn = drivable(np.array([*to, 0.7]))
+    assert across == 0.0
+    assert abs(turn) <= np.pi
+    assert v * to[0] >= 0.0  # what lies behind is backed up to
+    np.testing.assert_allclose(exp(np.array([v, 0.0, turn]))[:2], to, atol=1e-12)
+
+
+def test_robot_that_stands_turns_with_its_carrier():
+    np.testing.assert_array_equal(drivable(np.array([0.0, 0.0, 0.7])), [0.0, 0.0, 0.7])
+
+
+def test_nothing_is_suggested_without_features():
+    slam = DeformableSlam(DeformableParameters())
+    slam.process(observe(steps(1)[0]))
+    assert suggest_twist(slam.estimate, slam.velocity, DeformableParameters()) is None

@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: Apache-2.0
+"""deformable_slam beside a simulated carrier over DDS, and what it does with single messages."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from itertools import islice, pairwise
+
+import numpy as np
+import pytest
+from rclpy.qos import QoSProfile
+
+from rlml_slam import se2
+from rlml_slam.deformable.scoring import chi2_bounds
+from rlml_slam.deformable.window import CarrierVelocity
+from rlml_slam.nodes.deformable_slam import DeformableSlamNode
+from rlml_slam.params import Carrier, CarrierParameters
+from rlml_slam.ros import build, convert
+from rlml_slam.ros.deformable_answers import build_velocity, read_features
+from rlml_slam.ros.deformable_simulated import CarrierMessages
+from rlml_slam.ros.messages import make_rclpy as make
+from rlml_slam.simulation.carrier import simulate_carrier
+
+SECOND = 1_000_000_000
+SECONDS = 12.0
+DEEP = QoSProfile(depth=2000)
+TOPICS = {
+    'pose': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    'features': 'sensor_msgs/msg/PointCloud2',
+    'markers': 'visualization_msgs/msg/MarkerArray',
+    'cmd_vel_suggested': 'geometry_msgs/msg/Twist',
+    'ground_truth': 'nav_msgs/msg/Odometry',
+    'ground_truth_features': 'sensor_msgs/msg/PointCloud2',
+}
+# the simulator's odometry in terms of the node's: sigma per sqrt(s) over sqrt(interval)
+NOISE = {
+    'motion.a': 0.0, 'motion.b': 0.01 / math.sqrt(0.1), 'motion.c': 0.0,
+    'motion.d': 0.004 / math.sqrt(0.1), 'motion.lateral': 0.01 / math.sqrt(0.1),
+}  # fmt: skip
+
+
+def arguments(**values):
+    return ['--ros-args', *(a for k, v in values.items() for a in ('-p', f'{k}:={v}'))]
+
+
+def by_stamp(messages):
+    return {convert.stamp(m, ''): m for m in messages}
+
+
+def chi2_of(error, cov):
+    return float(error @ np.linalg.solve(cov, error))
+
+
+@pytest.mark.parametrize(('kind', 'ids'), [('train', 'true'), ('conveyor', 'false')])
+def test_processes_follow_a_carrier_within_their_covariances(live, start, kind, ids):
+    """Simulator and node over DDS: pose and features against the truth of the same stamps."""
+    topics = ('pose', 'features', 'ground_truth', 'ground_truth_features')
+    for topic in topics:
+        live.listen(topic, TOPICS[topic], DEEP)
+    live.listen('reflectors', TOPICS['features'])  # time begins when the ear hears as well
+    node = start('deformable_slam', *arguments(**NOISE))
+    live.spin_until(lambda: live.ear.count_publishers('features') == 1, timeout=60.0)
+    simulator = start(
+        'carrier_simulator',
+        *arguments(rate=4.0, duration=SECONDS, wait_for_subscribers=2, **{
+            'carrier.kind': kind, 'carrier.ids': ids,
+        }),
+    )  # fmt: skip
+    end = SECOND + int(SECONDS) * SECOND
+    live.spin_until(
+        lambda: live.heard['pose'] and convert.stamp(live.heard['pose'][-1], '') == end,
+        timeout=60.0,
+    )
+    live.spin_until(lambda: convert.stamp(live.heard['features'][-1], '') == end)
+    assert simulator.finish()[0] == 0
+    node.interrupt()
+    code, out = node.finish()
+    assert code == 0, out
+    pose, features, truth, true_features = (by_stamp(live.heard[topic]) for topic in topics)
+    # one answer per detections, at most a few of which were lost by best effort
+    assert len(pose) > 9.5 * SECONDS
+    assert pose.keys() == features.keys()
+    of_pose, of_features = [], []
+    for stamp in sorted(pose.keys() & truth.keys() & true_features.keys()):
+        got = convert.pose_estimate(pose[stamp])
+        error = got.pose - convert.pose_estimate(truth[stamp]).pose
+        error[2] = se2.wrap(error[2])
+        of_pose.append(chi2_of(error, got.cov))
+        assert np.hypot(*error[:2]) < 4.0 * np.sqrt(np.trace(got.cov[:2, :2]))
+        found = read_features(features[stamp])
+        assert np.all((found.ids >= 0) == (ids == 'true'))
+        existing = convert.detections(true_features[stamp], convert.Reflector()).points
+        for point, cov in zip(found.points, found.cov, strict=True):
+            nearest = existing[np.argmin(np.linalg.norm(existing - point, axis=-1))]
+            of_features.append(chi2_of(point - nearest, cov))
+    assert len(of_pose) > 9.0 * SECONDS
+    # the mean over a run varies less than one sample, whose 99.9 % bounds these are
+    low, high = chi2_bounds(3, 1)
+    assert low < np.mean(of_pose) < high
+    low, high = chi2_bounds(2, 1)
+    assert low < np.mean(of_features) < high
+    assert len(of_features) > 4 * len(of_pose)
+    assert np.sqrt(np.trace(got.cov[:2, :2])) < 0.5
+
+
+# --- in this process ------------------------------------------------------------------------
+
+
+def messages(count, **settings):
+    """(topic, message) of a simulated drive."""
+    convertible = CarrierMessages(make, CarrierParameters())
+    for step, after in islice(pairwise(simulate_carrier(Carrier(**settings), 0)), count):
+        yield from convertible(step, after)
+
+
+def feed(node, count=30, skip=(), **settings):
+    for topic, msg in messages(count, **settings):
+        if topic in skip:
+            continue
+        if topic == 'carrier_velocity':
+            node.velocity.receive(msg)
+        elif topic in ('odom', 'reflectors'):
+            node.sensors.add(topic, msg)
+
+
+def start_node(live, **values):
+    node = live.start(DeformableSlamNode, **{k.replace('.', '__'): v for k, v in NOISE.items()},
+                      **values)  # fmt: skip
+    node.sensors.stop_waiting()
+    return node
+
+
+def test_answers_are_published_at_the_rate_and_stamps_of_the_detections(live):
+    topics = ('pose', 'features', 'markers')
+    for topic in topics:
+        live.listen(topic, TOPICS[topic], DEEP)
+    node = start_node(live)
+    live.spin_until(lambda: all(node.count_subscribers(topic) == 1 for topic in topics))
+    feed(node, 30)
+    newest = node.slam.estimate.stamp
+    live.spin_until(lambda: all(live.heard[topic] for topic in topics))
+    live.drain()
+    stamps = list(by_stamp(live.heard['pose']))
+    assert set(np.diff(stamps)) == {SECOND // 10}
+    assert stamps[-1] == newest == max(by_stamp(live.heard['features']))
+    got, estimate = convert.pose_estimate(live.heard['pose'][-1]), node.slam.estimate
+    np.testing.assert_allclose(got.pose, estimate.pose, atol=1e-12)
+    np.testing.assert_allclose(got.cov, estimate.cov, atol=1e-12)
+    found = read_features(live.heard['features'][-1])
+    # coordinates travel as float32
+    np.testing.assert_allclose(found.points, estimate.features.points, atol=1e-5)
+    np.testing.assert_allclose(found.cov, estimate.features.cov, rtol=1e-5, atol=1e-9)
+    assert found.ids.tolist() == estimate.features.ids.tolist()
+    names = [m.ns for m in live.heard['markers'][-1].markers]
+    assert names.count('ellipses') == len(found.keys) == 6
+
+
+def test_suggestions_are_off_by_default(live):
+    node = start_node(live)
+    assert node.count_publishers('cmd_vel_suggested') == 0
+
+
+@pytest.mark.parametrize('drive', ['omnidirectional', 'differential'])
+def test_suggestions_keep_up_with_the_carrier(live, drive):
+    live.listen('cmd_vel_suggested', TOPICS['cmd_vel_suggested'], DEEP)
+    node = start_node(live, deformable__suggest=drive, reflector__max_range=4.0)
+    live.spin_until(lambda: node.count_subscribers('cmd_vel_suggested') == 1)
+    feed(node, 20)
+    live.spin_until(lambda: len(live.heard['cmd_vel_suggested']) > 10)
+    twist = live.heard['cmd_vel_suggested'][-1]
+    # within plan_offset, 0.5 m/s, of the carrier's velocity; an arc is a little longer
+    assert np.hypot(twist.linear.x - 1.0, twist.linear.y) < 0.8
+    assert (twist.linear.y == 0.0) or drive == 'omnidirectional'
+
+
+def diagnosis(live):
+    def stamped():
+        return [m for m in live.heard['/diagnostics'] if m.header.stamp.sec]
+
+    live.spin_until(stamped, what='no diagnostics')
+    return stamped()[0].status[0]
+
+
+def test_diagnostics_tell_what_is_missing(live):
+    live.listen('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', DEEP)
+    node = start_node(live)
+    feed(node, 30, skip=('carrier_velocity',))
+    status = diagnosis(live)
+    assert status.level == b'\x01'
+    assert 'no carrier_velocity yet' in status.message
+    assert 'features' in {v.key for v in status.values}
+
+
+def test_diagnostics_are_ok_where_nothing_is_missing(live):
+    live.listen('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', DEEP)
+    node = start_node(live)
+    live.spin_until(lambda: node.count_subscribers('/diagnostics') == 1)
+    feed(node, 30)
+    node.health.publish()
+    status = diagnosis(live)
+    assert (status.level, status.message) == (b'\x00', 'OK')
+    assert {v.key: v.value for v in status.values}['features'] == '6'
+
+
+def test_velocity_in_the_robots_axes_is_turned_into_the_maps(live):
+    node = start_node(live)
+    start = np.array([0.0, 0.0, math.pi / 2])
+    node.start_at(build.pose_with_covariance(make, SECOND, 'map', start, np.zeros((3, 3))))
+    ahead = CarrierVelocity(np.array([1.0, 0.0]), 0.2)
+    node.velocity.receive(build_velocity(make, SECOND, 'base_link', ahead))
+    node.velocity.receive(build_velocity(make, 2 * SECOND, 'map', ahead))
+    history = node.slam._velocities
+    np.testing.assert_allclose(history.mean(SECOND, 2 * SECOND).linear, [0.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(history.mean(2 * SECOND, 3 * SECOND).linear, [1.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ('axes', 'linear'), [('wagon', [1.0, 0.0]), ('map', [np.nan, 0.0]), ('map', [0.0, np.inf])]
+)
+def test_velocity_that_cannot_be_believed_changes_nothing(live, axes, linear):
+    node = start_node(live)
+    velocity = CarrierVelocity(np.array(linear))
+    node.velocity.receive(build_velocity(make, SECOND, axes, velocity))
+    assert node.slam._velocities.age(2 * SECOND) is None
+
+
+def test_initial_pose_begins_anew_there(live):
+    node = start_node(live)
+    feed(node, 10)
+    there = np.array([5.0, -2.0, 1.0])
+    node.start_at(build.pose_with_covariance(make, SECOND, 'map', there, 0.04 * np.eye(3)))
+    feed_more = [m for topic, m in messages(11) if topic in ('odom', 'reflectors')][-2:]
+    for topic, msg in zip(('odom', 'reflectors'), feed_more, strict=True):
+        node.sensors.add(topic, msg)
+    # the next observation is the first of the new beginning: its motion is not used
+    np.testing.assert_allclose(node.slam.estimate.pose, there, atol=1e-9)
+    np.testing.assert_allclose(np.diag(node.slam.estimate.cov), 0.04, rtol=0.01)
+
+
+def test_clock_that_jumps_back_begins_anew(live):
+    node = start_node(live, tf_buffer_duration=1.0)
+    feed(node, 40)
+    feed(node, 30)
+    assert node.slam.estimate.stamp == SECOND + 29 * SECOND // 10
+    assert len(node.slam.estimate.features.keys) == 6
+
+
+def test_empty_detections_move_the_carrier_on(live):
+    node = start_node(live)
+    feed(node, 20)
+    before = node.slam.estimate
+    empty = []
+    for topic, msg in islice(messages(25), 20 * 5, None):
+        if topic == 'reflectors':
+            seen = convert.detections(msg, convert.Reflector())
+            none = np.zeros(0)
+            msg = build.detections(make, dataclasses.replace(
+                seen, points=np.zeros((0, 2)), cov=np.zeros((0, 2, 2)), diameters=none,
+                ids=none.astype(np.int64),
+            ))  # fmt: skip
+        if topic == 'carrier_velocity':
+            node.velocity.receive(msg)
+        elif topic in ('odom', 'reflectors'):
+            node.sensors.add(topic, msg)
+            empty.append(topic)
+    after = node.slam.estimate
+    assert after.stamp == before.stamp + SECOND // 2
+    shift = after.features.points.mean(0) - before.features.points.mean(0)
+    # 1 m/s for half a second; sway and speed change it by a tenth
+    np.testing.assert_allclose(shift, [0.5, 0.0], atol=0.1)
+    assert np.all(np.trace(after.features.cov, axis1=1, axis2=2)
+                  > np.trace(before.features.cov, axis1=1, axis2=2))  # fmt: skip
