@@ -20,6 +20,7 @@ from rlml_slam.matching import search, surfaces, thinning
 from rlml_slam.matching.submap import P_MIN, STEP, Submap
 from rlml_slam.se2 import Array, wrap
 
+WIDE_STRIDE = 2  # cells between the shifts of the wide search; a wall is about as thick
 UNKNOWN = 0.1  # M of an unknown cell; like free space, so that a wall is a ridge from both sides
 INLIER = 0.5  # M from which an end point counts as explained
 ROBUST = 0.6  # e at which the Geman-McClure weight has fallen to a quarter
@@ -298,40 +299,65 @@ def match(
     """Pose of base in the submap from ``points`` (n, 2), base frame, and an odometry prior.
 
     ``prior_pose`` (3,), ``prior_information`` (3, 3) in raw coordinates of the submap frame.
-    Points are thinned here. With ``searched`` a correlative search in the window of the
-    parameters gives the start, else the prior does. With no points, or no submap, the prior is
-    returned with no information and score 0.
+    Points are in scan order and thinned here. With ``searched`` a correlative search in the
+    window of the parameters gives the start, and where the fit is poor another one in the wide
+    window; else the prior does. With no points, or no submap, the prior is returned with no
+    information and score 0.
     """
     p = parameters or params.ScanMatch()
     prior_pose = np.ascontiguousarray(prior_pose, dtype=np.float64)
-    information = np.ascontiguousarray(prior_information, dtype=np.float64)
     points = thinning.thin(points, p.voxel, p.max_points)
     if not len(points) or not submap.values.size:
         return ScanMatchResult(prior_pose.copy(), np.zeros((3, 3)), 0.0, 0, False, 1.0)
-    start = prior_pose
-    W = whitening_of(information, float(prior_pose[2]))
-    if searched:
-        start = search.window(
-            submap,
-            points,
-            prior_pose,
-            p.search_window,
-            p.search_angle,
-            W,
-            p.prior_scale,
-            p.search_share,
+    W = whitening_of(np.asarray(prior_information, dtype=np.float64), float(prior_pose[2]))
+    solve = _Solve(submap, points, surfaces.constraints(points), prior_pose, W, p)
+    if not searched:
+        return solve.refined(prior_pose)
+    result = solve.refined(solve.found(p.search_window, p.search_angle, 1))
+    if result.score < p.poor_score:
+        other = solve.refined(solve.found(p.wide_window, p.wide_angle, WIDE_STRIDE))
+        if solve.merit(other) > solve.merit(result):
+            return other
+    return result
+
+
+@dataclass(frozen=True)
+class _Solve:
+    """One match: what all its searches and refinements share."""
+
+    submap: Submap
+    points: Array
+    constraints: Array
+    prior: Array
+    whitening: Array
+    p: params.ScanMatch
+
+    def found(self, half_width: float, half_angle: float, stride: int) -> Array:
+        """The best pose of a window search around the prior."""
+        p = self.p
+        return search.window(
+            self.submap, self.points, self.prior, half_width, half_angle, self.whitening,
+            p.prior_scale, p.search_share, stride,
         ).pose  # fmt: skip
-    out = np.empty(12)
-    j, i = submap.corner
-    x, y, theta, weight, iterations, converged = refine(
-        submap.values, float(j), float(i), 1.0 / submap.resolution, points,
-        surfaces.constraints(points), start, prior_pose, W, p.prior_scale, p.sigma,
-        p.max_iterations, out,
-    )  # fmt: skip
-    return ScanMatchResult(
-        np.array([x, y, float(wrap(theta))]), symmetric(out[4:10]) / p.sigma**2,
-        float(out[10]) / len(points), iterations, converged, weight,
-    )  # fmt: skip
+
+    def refined(self, start: Array) -> ScanMatchResult:
+        """The local optimum from ``start``."""
+        p, (j, i), out = self.p, self.submap.corner, np.empty(12)
+        x, y, theta, weight, iterations, converged = refine(
+            self.submap.values, float(j), float(i), 1.0 / self.submap.resolution, self.points,
+            self.constraints, start, self.prior, self.whitening, p.prior_scale, p.sigma,
+            p.max_iterations, out,
+        )  # fmt: skip
+        return ScanMatchResult(
+            np.array([x, y, float(wrap(theta))]), symmetric(out[4:10]) / p.sigma**2,
+            float(out[10]) / len(self.points), iterations, converged, weight,
+        )  # fmt: skip
+
+    def merit(self, result: ScanMatchResult) -> float:
+        """Score less what the prior has against the pose, as in the search."""
+        x, y, turn = result.pose - self.prior
+        loss = search.prior_loss(x, y, float(wrap(turn)), self.whitening, self.p.prior_scale)
+        return result.score - self.p.search_share * loss
 
 
 def warm_up() -> None:
@@ -340,4 +366,4 @@ def warm_up() -> None:
     points = np.array([[1.0, 0.5], [-0.5, 1.0], [0.3, -0.8]])
     submap.insert(points, np.zeros(2))
     linearize(submap, points, np.zeros(3))
-    match(submap, points, np.zeros(3), np.eye(3))
+    match(submap, points, np.zeros(3), np.eye(3), params.ScanMatch(poor_score=1.0))
