@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -37,22 +38,33 @@ def read_cloud(msg: Any, topic: str = 'cloud') -> NDArray[np.void]:
 
 
 def _dtype(msg: Any, topic: str) -> np.dtype[np.void]:
-    order = '>' if msg.is_bigendian else '<'
-    names, formats, offsets = [], [], []
-    for f in msg.fields:
-        if f.datatype not in _DATATYPES:
-            raise InputError(f'{topic}: field {f.name!r} has the unknown datatype {f.datatype}')
-        code = order + _DATATYPES[f.datatype]
-        names.append(f.name)
-        formats.append(code if f.count <= 1 else f'({f.count},){code}')
-        offsets.append(int(f.offset))
-    layout = {
-        'names': names, 'formats': formats, 'offsets': offsets, 'itemsize': int(msg.point_step)
-    }  # fmt: skip
+    fields = tuple((f.name, int(f.offset), int(f.datatype), int(f.count)) for f in msg.fields)
+    for name, _, datatype, _ in fields:
+        if datatype not in _DATATYPES:
+            raise InputError(f'{topic}: field {name!r} has the unknown datatype {datatype}')
     try:
-        return np.dtype(layout)  # type: ignore[call-overload]
+        return _layout(fields, int(msg.point_step), bool(msg.is_bigendian))
     except ValueError as e:
         raise InputError(f'{topic}: fields do not fit point_step {msg.point_step}: {e}') from e
+
+
+@lru_cache(maxsize=64)
+def _layout(
+    fields: tuple[tuple[str, int, int, int], ...], point_step: int, is_bigendian: bool
+) -> np.dtype[np.void]:
+    """A topic's layout is the same in every message, and numpy takes long to make one."""
+    order = '>' if is_bigendian else '<'
+    codes = [np.dtype(order + _DATATYPES[datatype]) for _, _, datatype, _ in fields]
+    layout = {
+        'names': [name for name, *_ in fields],
+        'formats': [
+            code if count <= 1 else (code, (count,))
+            for code, (*_, count) in zip(codes, fields, strict=True)
+        ],
+        'offsets': [offset for _, offset, *_ in fields],
+        'itemsize': point_step,
+    }
+    return np.dtype(layout)  # type: ignore[call-overload]
 
 
 def column(points: NDArray[np.void], name: str, absent: float) -> NDArray[np.float64]:
@@ -65,10 +77,26 @@ def column(points: NDArray[np.void], name: str, absent: float) -> NDArray[np.flo
 def build_cloud(make: Make, header: Any, points: NDArray[np.void]) -> Any:
     """A dense PointCloud2 of one row from a structured array (n,)."""
     packed = np.ascontiguousarray(points)
-    fields = []
-    for name in packed.dtype.names or ():
-        kind, offset = packed.dtype.fields[name][:2]  # type: ignore[index]
-        fields.append(
+    return make(
+        'sensor_msgs/msg/PointCloud2',
+        header=header,
+        height=1,
+        width=len(packed),
+        fields=_fields(make, packed.dtype),
+        is_bigendian=False,
+        point_step=packed.dtype.itemsize,
+        row_step=packed.dtype.itemsize * len(packed),
+        data=packed.view(np.uint8).reshape(-1),
+        is_dense=True,
+    )
+
+
+@lru_cache(maxsize=64)
+def _fields(make: Make, dtype: np.dtype[np.void]) -> list[Any]:
+    out = []
+    for name in dtype.names or ():
+        kind, offset = dtype.fields[name][:2]  # type: ignore[index]
+        out.append(
             make(
                 'sensor_msgs/msg/PointField',
                 name=name,
@@ -77,15 +105,4 @@ def build_cloud(make: Make, header: Any, points: NDArray[np.void]) -> Any:
                 count=int(np.prod(kind.shape)),
             )
         )
-    return make(
-        'sensor_msgs/msg/PointCloud2',
-        header=header,
-        height=1,
-        width=len(packed),
-        fields=fields,
-        is_bigendian=False,
-        point_step=packed.dtype.itemsize,
-        row_step=packed.dtype.itemsize * len(packed),
-        data=packed.view(np.uint8).reshape(-1),
-        is_dense=True,
-    )
+    return out
