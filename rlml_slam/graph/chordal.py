@@ -11,8 +11,8 @@ are linear (Martinec & Pajdla 2007; Carlone, Tron, Daniilidis & Dellaert 2015). 
 information of the angle and the mean information of the position, because the axes of the
 residual are not known yet. Every block of the normal matrix is a complex number w conj(c_p) c_q,
 so the same fronts serve with two rows per unknown. Without sightings the headings are solved
-first and the positions after them; with sightings all at once, because then the landmarks are
-what ties the headings together, and the positions again with the headings on the unit circle.
+alone; with sightings all at once, because then the landmarks are what ties them together.
+Positions follow with the headings back on the unit circle.
 """
 
 from __future__ import annotations
@@ -36,40 +36,97 @@ def relax(system: System, poses: Array, landmarks: Array) -> bool:
     for i in range(n):
         state[i, 0], state[i, 1] = math.cos(poses[i, 2]), math.sin(poses[i, 2])
         state[i, 2], state[i, 3] = poses[i, 0], poses[i, 1]
-    together = len(system.sightings) > 0
-    good = _stage(system, state, landmarks, True, together)
     variables = system.variables
+    good = _headings(system, state, landmarks, len(system.sightings) > 0)
     if good:
         for a in range(len(variables)):
             i = variables[a]['node']
-            if i < n:
-                length = math.hypot(state[i, 0], state[i, 1])
-                if not length > 1e-9:
-                    state[i, 0], state[i, 1], length = 1.0, 0.0, 1.0
-                state[i, 0] /= length
-                state[i, 1] /= length
-        good = _stage(system, state, landmarks, False, True)
-    if good:
-        for a in range(len(variables)):
-            i = variables[a]['node']
-            if i < n:
-                poses[i, 0], poses[i, 1] = state[i, 2], state[i, 3]
+            if i < n and math.hypot(state[i, 0], state[i, 1]) > 1e-9:
                 poses[i, 2] = math.atan2(state[i, 1], state[i, 0])
+        good = _positions(system, poses, landmarks)
     place(system.structure, system.fronts, system.entries, variables, system.edges,
           system.sightings)  # fmt: skip
     return good
 
 
 @part
-def _stage(system: System, state: Array, landmarks: Array, turn: bool, shift: bool) -> bool:
-    """Solve for the headings (``turn``), the positions and landmarks (``shift``), or both."""
+def _positions(system: System, poses: Array, landmarks: Array) -> bool:
+    """Positions and landmarks with the headings held: one real unknown each for x and for y."""
+    variables, edges, sightings = system.variables, system.edges, system.sightings
+    n, num = len(poses), len(variables)
+    dims = np.empty(num, np.int64)
+    for a in range(num):
+        dims[a] = 1
+    fronts, entries, size = lay_out(system.structure, dims)
+    place(system.structure, fronts, entries, variables, edges, sightings)
+    v = np.empty(fronts[len(fronts) - 1]['panel'])
+    for i in range(len(v)):
+        v[i] = 0.0
+    gx, gy = np.empty(num), np.empty(num)
+    for i in range(num):
+        gx[i] = gy[i] = 0.0
+    for f in range(len(edges) + len(sightings)):
+        if f < len(edges):
+            z = edges[f]
+            i, j, a, b, k = z['i'], z['j'], z['a'], z['b'], z['block']
+            w, x, y = 0.5 * (z['I00'] + z['I11']), z['x'], z['y']
+            angle = poses[i, 2] + z['theta']  # the record holds R_delta^T t_delta
+            tx, ty = poses[j, 0], poses[j, 1]
+        else:
+            q = sightings[f - len(edges)]
+            i, j, a, b, k = q['i'], q['j'], q['a'], q['b'], q['block']
+            w, x, y = 0.5 * (q['I00'] + q['I11']), q['x'], q['y']
+            angle = poses[i, 2]
+            tx, ty = landmarks[j, 0], landmarks[j, 1]
+        c, s = math.cos(angle), math.sin(angle)
+        ex = w * (tx - poses[i, 0] - c * x + s * y)
+        ey = w * (ty - poses[i, 1] - s * x - c * y)
+        if a >= 0:
+            gx[variables[a]['scalar']] -= ex
+            gy[variables[a]['scalar']] -= ey
+            v[variables[a]['address']] += w
+        if b >= 0:
+            gx[variables[b]['scalar']] += ex
+            gy[variables[b]['scalar']] += ey
+            v[variables[b]['address']] += w
+        if k >= 0:
+            v[k] -= w
+    for f in range(len(system.priors)):
+        p = system.priors[f]
+        i, a = p['i'], p['a']
+        if a >= 0:
+            w = 0.5 * (p['I00'] + p['I11'])
+            x, y = (poses[i, 0], poses[i, 1]) if i < n else (
+                landmarks[i - n, 0], landmarks[i - n, 1])  # fmt: skip
+            gx[variables[a]['scalar']] += w * (x - p['x'])
+            gy[variables[a]['scalar']] += w * (y - p['y'])
+            v[variables[a]['address']] += w
+    if factorise(fronts, entries, v, np.empty(size)) >= 0:
+        return False
+    for g in (gx, gy):
+        solve_lower(fronts, entries, v, g)
+        solve_upper(fronts, entries, v, g)
+    for a in range(num):
+        i, k = variables[a]['node'], variables[a]['scalar']
+        if i < n:
+            poses[i, 0] -= gx[k]
+            poses[i, 1] -= gy[k]
+        else:
+            landmarks[i - n, 0] -= gx[k]
+            landmarks[i - n, 1] -= gy[k]
+    return True
+
+
+@part
+def _headings(system: System, state: Array, landmarks: Array, shift: bool) -> bool:
+    """Solve for the headings r into ``state``; with ``shift`` together with the positions."""
     variables, edges, sightings = system.variables, system.edges, system.sightings
     n = len(state)
     dims = np.empty(len(variables), np.int64)
     rows = 0
     for a in range(len(variables)):
         is_pose = variables[a]['node'] < n
-        dims[a] = (2 if turn and is_pose else 0) + (2 if shift else 0)
+        dims[a] = (2 if is_pose else 0) + (2 if shift else 0)
         rows += dims[a]
     fronts, entries, size = lay_out(system.structure, dims)
     place(system.structure, fronts, entries, variables, edges, sightings)
@@ -79,28 +136,19 @@ def _stage(system: System, state: Array, landmarks: Array, turn: bool, shift: bo
     g = np.empty(rows)
     for i in range(rows):
         g[i] = 0.0
-    _edges(edges, variables, state, values, g, turn, shift)
+    _edges(edges, variables, state, values, g, shift)
     if shift:
-        _sightings(sightings, variables, state, landmarks, values, g, turn)
-    _priors(system.priors, variables, state, landmarks, values, g, turn, shift)
+        _sightings(sightings, variables, state, landmarks, values, g)
+    _priors(system.priors, variables, state, landmarks, values, g, shift)
     if factorise(fronts, entries, values, np.empty(size)) >= 0:
         return False
     solve_lower(fronts, entries, values, g)
     solve_upper(fronts, entries, values, g)
     for a in range(len(variables)):
         i, k = variables[a]['node'], variables[a]['scalar']
-        if i >= n:
-            if shift:
-                landmarks[i - n, 0] -= g[k]
-                landmarks[i - n, 1] -= g[k + 1]
-            continue
-        if turn:
+        if i < n:
             state[i, 0] -= g[k]
             state[i, 1] -= g[k + 1]
-            k += 2
-        if shift:
-            state[i, 2] -= g[k]
-            state[i, 3] -= g[k + 1]
     return True
 
 
@@ -115,9 +163,8 @@ def _add(v: Array, k: int, ld: int, re: float, im: float) -> None:
 
 @part
 def _edges(
-    edges: Records, variables: Records, state: Array, v: Array, g: Array, turn: bool, shift: bool
+    edges: Records, variables: Records, state: Array, v: Array, g: Array, shift: bool
 ) -> None:
-    t = 2 if turn else 0  # first row of the position
     for f in range(len(edges)):
         z = edges[f]
         i, j, a, b = z['i'], z['j'], z['a'], z['b']
@@ -130,53 +177,50 @@ def _edges(
             gb, kb, lb = variables[b]['scalar'], variables[b]['address'], variables[b]['stride']
         first = ga < gb  # the columns are those of a
         ld = la if first else lb
-        if turn:
-            w, c, s = z['I22'], z['c'], z['s']
-            e0 = w * (state[j, 0] - c * state[i, 0] + s * state[i, 1])
-            e1 = w * (state[j, 1] - s * state[i, 0] - c * state[i, 1])
-            if a >= 0:
-                g[ga] -= c * e0 + s * e1
-                g[ga + 1] -= c * e1 - s * e0
-                _add(v, ka, la, w, 0.0)
-            if b >= 0:
-                g[gb] += e0
-                g[gb + 1] += e1
-                _add(v, kb, lb, w, 0.0)
-            if block >= 0:
-                _add(v, block, ld, -w * c, -w * s if first else w * s)
-        if shift:
-            w = 0.5 * (z['I00'] + z['I11'])
-            # the record holds R_delta^T t_delta
-            dx, dy = z['c'] * z['x'] - z['s'] * z['y'], z['s'] * z['x'] + z['c'] * z['y']
-            e0 = w * (state[j, 2] - state[i, 2] - dx * state[i, 0] + dy * state[i, 1])
-            e1 = w * (state[j, 3] - state[i, 3] - dy * state[i, 0] - dx * state[i, 1])
-            if a >= 0:
-                g[ga + t] -= e0
-                g[ga + t + 1] -= e1
-                _add(v, ka + t * la + t, la, w, 0.0)
-                if turn:
-                    g[ga] -= dx * e0 + dy * e1
-                    g[ga + 1] -= dx * e1 - dy * e0
-                    _add(v, ka, la, w * (dx * dx + dy * dy), 0.0)
-                    _add(v, ka + t, la, w * dx, w * dy)
-            if b >= 0:
-                g[gb + t] += e0
-                g[gb + t + 1] += e1
-                _add(v, kb + t * lb + t, lb, w, 0.0)
-            if block >= 0:
-                _add(v, block + t * ld + t, ld, -w, 0.0)
-                if turn and first:
-                    _add(v, block + t, ld, -w * dx, -w * dy)
-                elif turn:
-                    _add(v, block + t * ld, ld, -w * dx, w * dy)
+        w, c, s = z['I22'], z['c'], z['s']
+        e0 = w * (state[j, 0] - c * state[i, 0] + s * state[i, 1])
+        e1 = w * (state[j, 1] - s * state[i, 0] - c * state[i, 1])
+        if a >= 0:
+            g[ga] -= c * e0 + s * e1
+            g[ga + 1] -= c * e1 - s * e0
+            _add(v, ka, la, w, 0.0)
+        if b >= 0:
+            g[gb] += e0
+            g[gb + 1] += e1
+            _add(v, kb, lb, w, 0.0)
+        if block >= 0:
+            _add(v, block, ld, -w * c, -w * s if first else w * s)
+        if not shift:
+            continue
+        w = 0.5 * (z['I00'] + z['I11'])
+        # the record holds R_delta^T t_delta
+        dx, dy = c * z['x'] - s * z['y'], s * z['x'] + c * z['y']
+        e0 = w * (state[j, 2] - state[i, 2] - dx * state[i, 0] + dy * state[i, 1])
+        e1 = w * (state[j, 3] - state[i, 3] - dy * state[i, 0] - dx * state[i, 1])
+        if a >= 0:
+            g[ga] -= dx * e0 + dy * e1
+            g[ga + 1] -= dx * e1 - dy * e0
+            g[ga + 2] -= e0
+            g[ga + 3] -= e1
+            _add(v, ka, la, w * (dx * dx + dy * dy), 0.0)
+            _add(v, ka + 2, la, w * dx, w * dy)
+            _add(v, ka + 2 * la + 2, la, w, 0.0)
+        if b >= 0:
+            g[gb + 2] += e0
+            g[gb + 3] += e1
+            _add(v, kb + 2 * lb + 2, lb, w, 0.0)
+        if block >= 0:
+            _add(v, block + 2 * ld + 2, ld, -w, 0.0)
+            if first:
+                _add(v, block + 2, ld, -w * dx, -w * dy)
+            else:
+                _add(v, block + 2 * ld, ld, -w * dx, w * dy)
 
 
 @part
 def _sightings(
-    sightings: Records, variables: Records, state: Array, landmarks: Array, v: Array, g: Array,
-    turn: bool,
-) -> None:  # fmt: skip
-    t = 2 if turn else 0
+    sightings: Records, variables: Records, state: Array, landmarks: Array, v: Array, g: Array
+) -> None:
     for f in range(len(sightings)):
         z = sightings[f]
         i, j, a, b = z['i'], z['j'], z['a'], z['b']
@@ -191,31 +235,28 @@ def _sightings(
             _add(v, variables[b]['address'], ld, w, 0.0)
         if a >= 0:
             ga, k, la = variables[a]['scalar'], variables[a]['address'], variables[a]['stride']
-            g[ga + t] -= e0
-            g[ga + t + 1] -= e1
-            _add(v, k + t * la + t, la, w, 0.0)
-            if turn:
-                g[ga] -= x * e0 + y * e1
-                g[ga + 1] -= x * e1 - y * e0
-                _add(v, k, la, w * (x * x + y * y), 0.0)
-                _add(v, k + t, la, w * x, w * y)
+            g[ga] -= x * e0 + y * e1
+            g[ga + 1] -= x * e1 - y * e0
+            g[ga + 2] -= e0
+            g[ga + 3] -= e1
+            _add(v, k, la, w * (x * x + y * y), 0.0)
+            _add(v, k + 2, la, w * x, w * y)
+            _add(v, k + 2 * la + 2, la, w, 0.0)
             if ga < gb:
                 ld = la
         k = z['block']
         if k >= 0 and ga < gb:  # rows of the landmark, columns of the pose
-            _add(v, k + t * ld, ld, -w, 0.0)
-            if turn:
-                _add(v, k, ld, -w * x, -w * y)
+            _add(v, k, ld, -w * x, -w * y)
+            _add(v, k + 2 * ld, ld, -w, 0.0)
         elif k >= 0:
-            _add(v, k + t, ld, -w, 0.0)
-            if turn:
-                _add(v, k, ld, -w * x, w * y)
+            _add(v, k, ld, -w * x, w * y)
+            _add(v, k + 2, ld, -w, 0.0)
 
 
 @part
 def _priors(
     priors: Records, variables: Records, state: Array, landmarks: Array, v: Array, g: Array,
-    turn: bool, shift: bool,
+    shift: bool,
 ) -> None:  # fmt: skip
     n = len(state)
     for f in range(len(priors)):
@@ -224,17 +265,19 @@ def _priors(
         if a < 0:
             continue
         k, ld, gk = variables[a]['address'], variables[a]['stride'], variables[a]['scalar']
-        if turn and i < n:
+        x, y = 0.0, 0.0
+        if i < n:
             w = z['I22']
             g[gk] += w * (state[i, 0] - math.cos(z['theta']))
             g[gk + 1] += w * (state[i, 1] - math.sin(z['theta']))
             _add(v, k, ld, w, 0.0)
             k += 2 * ld + 2
             gk += 2
+            x, y = state[i, 2], state[i, 3]
+        else:
+            x, y = landmarks[i - n, 0], landmarks[i - n, 1]
         if shift:
             w = 0.5 * (z['I00'] + z['I11'])
-            x, y = (state[i, 2], state[i, 3]) if i < n else (
-                landmarks[i - n, 0], landmarks[i - n, 1])  # fmt: skip
             g[gk] += w * (x - z['x'])
             g[gk + 1] += w * (y - z['y'])
             _add(v, k, ld, w, 0.0)

@@ -13,7 +13,8 @@ from rlml_slam.graph.system import System, set_up
 def system_of(graph: Graph) -> System:
     """The normal equations of a graph, set up but not linearised.
 
-    Raises SolverError, naming the node, if a value is not finite or nothing ties a part to the map.
+    Raises SolverError, naming the node, if a value is not finite or if a part is not tied to the
+    map.
     """
     for name, values in (('pose', graph.poses), ('landmark', graph.landmarks)):
         if not np.isfinite(values).all():

@@ -70,37 +70,40 @@ def gauss_newton(
     Converged means that a further step promises to lower the cost by less than ``tolerance`` of
     it plus ``floor``.
     """
-    cost, chi2 = linearize(system, poses, landmarks, True)
-    best, best_chi2 = cost, chi2
     kept, kept_landmarks = np.empty_like(poses), np.empty_like(landmarks)
-    copy(poses, kept)
-    copy(landmarks, kept_landmarks)
+    best, best_chi2, cost, chi2 = math.inf, math.inf, math.inf, math.inf
+    promised, before = 0.0, 0.0
     iterations, misses = 0, 0
-    converged, failed = False, not math.isfinite(cost)
-    while not (converged or failed) and iterations < max_iterations:
-        if iterations > 0:
-            linearize(system, poses, landmarks, True)
-        if factorise(system.fronts, system.entries, system.values, system.stack) >= 0:
-            break
-        promised = newton_step(system)
-        converged = promised <= tolerance * cost + floor
-        reuse = promised < SMALL_CHANGE * cost
-        again = True
-        while again and not (converged or failed) and iterations < max_iterations:
-            move(system.variables, system.step, poses, landmarks)
-            iterations += 1
-            cost, chi2 = linearize(system, poses, landmarks, False)
-            misses += 1
+    fresh, reuse, moved, converged = True, False, True, False
+    while True:
+        cost, chi2 = linearize(system, poses, landmarks, fresh)
+        if moved:
             if cost < best:
                 best, best_chi2, misses = cost, chi2, 0
                 copy(poses, kept)
                 copy(landmarks, kept_landmarks)
-            failed = misses > PATIENCE or not math.isfinite(cost)
-            before = promised
-            promised = newton_step(system)
-            converged = promised <= tolerance * cost + floor
-            again = reuse and promised < SMALL_STEP * cost and promised < GROUND * before
-    if cost > best or not math.isfinite(cost):
+            else:
+                misses += 1
+        if misses > PATIENCE or not math.isfinite(cost):
+            break
+        if fresh and factorise(system.fronts, system.entries, system.values, system.stack) >= 0:
+            break
+        before = promised
+        promised = newton_step(system)
+        converged = promised <= tolerance * cost + floor
+        if converged or iterations >= max_iterations:
+            break
+        if not fresh and not (reuse and promised < min(SMALL_STEP * cost, GROUND * before)):
+            fresh, moved = True, False
+            continue
+        move(system.variables, system.step, poses, landmarks)
+        if fresh:
+            reuse = promised < SMALL_CHANGE * cost
+        # a first step is rarely the last, and then the old factor need not be asked
+        fresh = iterations == 0 and not reuse
+        iterations += 1
+        moved = True
+    if not cost <= best:
         copy(kept, poses)
         copy(kept_landmarks, landmarks)
         converged = converged and cost <= best * (1.0 + 1e-9) + floor

@@ -49,7 +49,13 @@ def linearize(system: System, poses: Array, landmarks: Array, fill: bool) -> tup
 
 @part
 def _edges(
-    edges: Records, variables: Records, losses: Array, poses: Array, v: Array, g: Array, fill: bool
+    edges: Records,
+    variables: Records,
+    losses: Array,
+    poses: Array,
+    v: Array,
+    g: Array,
+    fill: bool,
 ) -> tuple[float, float]:
     rotations = np.empty((len(poses), 2))
     for i in range(len(poses)):

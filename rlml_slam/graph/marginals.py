@@ -15,6 +15,7 @@ from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.inverse import columns, diagonal_blocks
 from rlml_slam.graph.linearize import linearize
 from rlml_slam.se2 import Array
+from rlml_slam.types import EdgeKind
 
 
 class Marginals:
@@ -88,3 +89,14 @@ class Marginals:
 
 def _indices(indices: ArrayLike) -> NDArray[np.int64]:
     return np.asarray(indices, dtype=np.int64).reshape(-1)
+
+
+def warm_up() -> None:
+    """Compile the kernels of the covariances."""
+    graph = Graph()
+    graph.add_poses([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    graph.fixed_poses[0] = True
+    graph.add_edge(EdgeKind.ODOMETRY, 0, 1, [1.0, 0.0, 0.0], np.eye(3))
+    marginals = Marginals(graph)
+    marginals.poses([1])
+    marginals.joint([1])

@@ -6,6 +6,8 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
+import numpy as np
+
 from rlml_slam import params
 from rlml_slam.graph.chordal import relax
 from rlml_slam.graph.descend import dog_leg, levenberg_marquardt
@@ -16,6 +18,7 @@ from rlml_slam.graph.iterate import Progress, gauss_newton
 from rlml_slam.graph.linearize import linearize
 from rlml_slam.graph.system import System
 from rlml_slam.se2 import Array
+from rlml_slam.types import EdgeKind
 
 # a start is bad, and one is computed from the edges, above this cost per residual
 BAD_START = 4.0
@@ -53,14 +56,14 @@ def optimize(graph: Graph, parameters: params.Solver | None = None) -> Solution:
     cost, chi2 = linearize(system, poses, landmarks, False)
     if not len(system.variables):
         return Solution(chi2, chi2, cost, cost, 0, True, _since(start))
-    if parameters.initialization == 'auto':
-        if cost > BAD_START * _residuals(system):
-            _relax_if_better(system, poses, landmarks, cost)
-    elif parameters.initialization == 'chordal':
-        relax(system, poses, landmarks)
-    else:
-        initialize(graph, parameters.initialization)
-    end = _minimise(system, poses, landmarks, parameters)
+    end = None
+    method = parameters.initialization
+    if method in ('odometry', 'spanning_tree'):
+        initialize(graph, method)
+    elif method == 'chordal' or (method == 'auto' and cost > BAD_START * _residuals(system)):
+        end = _from_relaxation(system, poses, landmarks, parameters, cost)
+    if end is None:
+        end = _minimise(system, poses, landmarks, parameters)
     return Solution(
         chi2, end.chi2, cost, end.cost, end.iterations, end.converged, _since(start)
     )  # fmt: skip
@@ -75,11 +78,17 @@ def _residuals(system: System) -> int:
     return 3 * len(system.edges) + 2 * len(system.sightings) + 3 * len(system.priors)
 
 
-def _relax_if_better(system: System, poses: Array, landmarks: Array, cost: float) -> None:
+def _from_relaxation(
+    system: System, poses: Array, landmarks: Array, parameters: params.Solver, cost: float
+) -> Progress | None:
+    """Minimise from relaxed headings; None, with the estimate as it was, if that is no better."""
     before = poses.copy(), landmarks.copy()
-    relax(system, poses, landmarks)
-    if not linearize(system, poses, landmarks, False)[0] < cost:
-        poses[:], landmarks[:] = before
+    if relax(system, poses, landmarks):
+        end = _minimise(system, poses, landmarks, parameters)
+        if end.cost < cost:
+            return end
+    poses[:], landmarks[:] = before
+    return None
 
 
 def _minimise(
@@ -96,3 +105,15 @@ def _minimise(
         return end
     more = dog_leg(system, poses, landmarks, limit, tolerance, floor)
     return more._replace(iterations=end.iterations + more.iterations)
+
+
+def warm_up() -> None:
+    """Compile every kernel of the solver."""
+    graph = Graph()
+    graph.add_poses([[k, 0.0, 0.0] for k in range(3)])
+    graph.fixed_poses[0] = True
+    graph.add_landmark([1.0, 1.0])
+    graph.add_edges(EdgeKind.ODOMETRY, [[0, 1], [1, 2]], [[1.0, 0.1, 0.0]] * 2, [np.eye(3)] * 2)
+    graph.add_sightings([[0, 0], [2, 0]], [[1.0, 1.0], [-1.0, 1.1]], [np.eye(2)] * 2)
+    for method in ('auto', 'dog_leg'):
+        optimize(graph, params.Solver(initialization='chordal', method=method))

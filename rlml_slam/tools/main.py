@@ -55,6 +55,7 @@ COMMANDS: Table = {
             'deformable': Command(
                 'study_deformable', 'deformable-feature SLAM: EKF against NLS over many seeds'
             ),
+            'lego': Command('study_lego', 'spikes and EKF on the LEGO robot among cylinders'),
         },
     ),
     'bench': Group(
