@@ -139,16 +139,22 @@ class Estimator:
         gated = np.where(told, np.where(d2 <= self._new_gate, 0.0, np.inf), d2)
         slots = nearest(np.where(same, gated, np.inf), self._gate)
         status[slots >= 0] = Status.USED
-        status[(slots < 0) & self._is_known(z, d2, told)] = Status.GATED
+        status[(slots < 0) & self._is_known(z, d2, told, detections)] = Status.GATED
         best = np.where(slots >= 0, d2[np.arange(k), np.maximum(slots, 0)], np.nan)
         return slots, status, best
 
-    def _is_known(self, z: Array, d2: Array, told: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def _is_known(
+        self, z: Array, d2: Array, told: NDArray[np.bool_], detections: Detections
+    ) -> NDArray[np.bool_]:
         """(k,): so near to a landmark, though outside of its gate, that it starts no candidate."""
         where = self.model.place(self.filter.x[:3], z)[0]
         gap = np.linalg.norm(where[:, None] - self.filter.points[None], axis=-1)
-        near = gap.min(axis=1) < self._p.ekf.min_separation
-        out: NDArray[np.bool_] = near | (d2.min(axis=1) <= self._new_gate) | told.any(axis=1)
+        blur = self._p.reflector.blur * np.sqrt(np.linalg.eigvalsh(detections.cov)[:, -1])
+        near = gap.min(axis=1) < np.maximum(self._p.ekf.min_separation, blur)
+        near |= d2.min(axis=1) <= self._new_gate
+        # one that tells who it is, is new if nobody has told so before
+        anonymous = detections.ids == ANONYMOUS
+        out: NDArray[np.bool_] = (near & anonymous) | told.any(axis=1)
         return out
 
     # --- step 2: re-observed landmarks -------------------------------------------------------

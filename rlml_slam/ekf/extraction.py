@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +39,9 @@ def measure(observation: Observation, params: EkfParameters) -> Measured | None:
         detections = _spikes(observation, params)
     if detections is None:
         return None
+    if params.ekf.landmark_sigma > 0.0:
+        cov = detections.cov + params.ekf.landmark_sigma**2 * np.eye(2)
+        detections = dataclasses.replace(detections, cov=cov)
     z, R = to_polar(detections.points, detections.cov)
     R[:, 0, 0] += (params.ekf.range_noise * z[:, 0]) ** 2
     return Measured(z, R, detections)

@@ -19,7 +19,7 @@ from rlml_slam.ros.bag import BagWriter
 from rlml_slam.ros.messages import make_bag
 from rlml_slam.ros.simulated import TRUE_REFLECTORS
 from rlml_slam.se2 import Array
-from rlml_slam.tools import carmen, mrclam, victoria_park
+from rlml_slam.tools import carmen, convert_lego, mrclam, victoria_park
 from rlml_slam.tools.tum import Trajectory
 from rlml_slam.types import Detections, Odometry, Scan
 
@@ -44,7 +44,7 @@ class Recording:
 
 
 def add_parser(subparsers: Any) -> None:
-    """Declare ``rlml convert carmen``, ``mrclam`` and ``victoria-park``."""
+    """Declare ``rlml convert carmen``, ``mrclam``, ``victoria-park`` and ``lego``."""
     parser = subparsers.add_parser('convert', help='recorded data sets become bags')
     kinds = parser.add_subparsers(dest='kind', metavar='FORMAT', required=True)
 
@@ -68,7 +68,10 @@ def add_parser(subparsers: Any) -> None:
     park = kinds.add_parser('victoria-park', help='Victoria Park: tree trunks become reflectors')
     park.add_argument('folder', metavar='DIR', type=Path, help='folder of the .mat files')
 
-    for p in (log, clam, park):
+    lego = kinds.add_parser('lego', help='LEGO robot among cylinders: scans, ticks, camera track')
+    lego.add_argument('folder', metavar='DIR', type=Path, help='folder of the robot4_*.txt files')
+
+    for p in (log, clam, park, lego):
         p.add_argument('bag', metavar='BAG', type=Path, help='folder to be written')
         p.add_argument(
             '--format', choices=('mcap', 'sqlite3'),
@@ -131,10 +134,25 @@ def _read_victoria_park(args: argparse.Namespace) -> tuple[Recording, dict[str, 
     return recording, dict(data.counts)
 
 
+def _read_lego(args: argparse.Namespace) -> tuple[Recording, dict[str, int]]:
+    data = convert_lego.read_lego(args.folder)
+    n = len(data.landmarks)
+    known = Detections(
+        data.odometry[0].stamp, WORLD, data.landmarks, np.zeros((n, 2, 2)),
+        np.arange(n, dtype=np.int64), np.full(n, np.nan),
+    )  # fmt: skip
+    sensors = {convert_lego.LASER_FRAME: convert_lego.T_BASE_LASER}
+    recording = Recording(
+        data.odometry, data.scans, sensors=sensors, truth=data.track, true_reflectors=known
+    )
+    return recording, dict(data.counts)
+
+
 _READERS = {
     'carmen': _read_carmen,
     'mrclam': _read_mrclam,
     'victoria-park': _read_victoria_park,
+    'lego': _read_lego,
 }
 
 

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``rlml study lego``: spikes and EKF on the LEGO robot among cylinders, the note's own task."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rlml_slam import se2
+from rlml_slam.ekf.slam import EkfSlam
+from rlml_slam.maps.occupancy import write_atomically
+from rlml_slam.params import EkfParameters, from_mapping, read_yaml
+from rlml_slam.se2 import Array
+from rlml_slam.tools.ate import align
+from rlml_slam.tools.convert_lego import LASER_FRAME, T_BASE_LASER, Lego, read_lego
+from rlml_slam.types import Odometry, Reflectors, Scan
+
+# what the robot and its laser are like; OFFSET makes the mapped cylinders as far apart as true
+PARAMETERS: dict[str, Any] = {
+    'ekf.extractor': 'spikes',
+    'ekf.sightings': 6,
+    'ekf.min_separation': 0.35,
+    'spikes.threshold': 0.1,
+    'spikes.offset': 0.12,
+    'spikes.max_width': 0.15,
+    'spikes.max_range': 2.0,
+    'spikes.min_beams': 3,
+    'spikes.sigma_range': 0.05,
+    'spikes.sigma_bearing': 0.05,
+    'motion.a': 0.1,
+    'motion.b': 0.01,
+    'motion.c': 0.5,
+    'motion.d': 0.2,
+    'motion.interval': 0.2,
+    'transform_timeout': 1.0,
+}
+SCANNER = np.array([T_BASE_LASER[0], T_BASE_LASER[1], 0.0])
+NEAR = 0.15  # [m] a landmark farther from every cylinder is a false one
+
+
+@dataclass(frozen=True)
+class Result:
+    """Scanner poses (n, 3) and landmarks in the map, and odometry's scanner poses (n, 3)."""
+
+    scanner: Array
+    dead_reckoning: Array
+    reflectors: Reflectors
+
+
+def add_parser(subparsers: Any) -> None:
+    """Declare ``rlml study lego``."""
+    parser = subparsers.add_parser(
+        'lego', help='spikes and EKF on the LEGO robot among cylinders: figures and a picture'
+    )
+    parser.add_argument('folder', metavar='DIR', type=Path, help='folder of the data set')
+    parser.add_argument('--config', type=Path, metavar='YAML', help='parameters that differ')
+    parser.add_argument('--out', type=Path, metavar='PNG', help='picture to be written')
+    parser.add_argument('--json', action='store_true', help='print one JSON object and no more')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the system, print the figures, draw the picture."""
+    data = read_lego(args.folder)
+    result = drive(data, read_yaml(args.config) if args.config else {})
+    figures = judge(data, result)
+    if args.out is not None:
+        write_atomically(args.out, picture(data, result))
+    if args.json:
+        print(json.dumps(figures))
+    else:
+        print('\n'.join(f'{name:<34} {value}' for name, value in figures.items()))
+    return 0
+
+
+def drive(data: Lego, values: dict[str, Any] | None = None) -> Result:
+    """The EKF over the whole drive."""
+    params: EkfParameters = from_mapping({**PARAMETERS, **(values or {})}, EkfParameters)
+    slam = EkfSlam(params)
+    slam.set_sensor_pose(LASER_FRAME, T_BASE_LASER)
+    inputs: list[Odometry | Scan] = [*data.odometry, *data.scans]
+    # odometry before the scan of the same stamp
+    for item in sorted(inputs, key=lambda i: (i.stamp, isinstance(i, Scan))):
+        if isinstance(item, Scan):
+            slam.add_scan(item)
+        else:
+            slam.add_odometry(item)
+    slam.finish()
+    odometry = np.array([o.pose for o in data.odometry])
+    return Result(
+        se2.compose(slam.trajectory()[1], SCANNER),
+        se2.compose(odometry, SCANNER),
+        slam.reflectors(),
+    )
+
+
+def judge(data: Lego, result: Result) -> dict[str, Any]:
+    """Errors [m]; the track and the landmarks are each aligned, rigidly and with a scale.
+
+    The scales tell how much larger the camera's and the arena's metre are than the laser's.
+    """
+    track, points = data.track.poses[:, :2], result.reflectors.points
+    nearest = associate(data, result)
+    found = nearest >= 0
+    position, _ = residual(result.scanner[:, :2], track)
+    scaled, track_scale = residual(result.scanner[:, :2], track, scaled=True)
+    landmark, _ = residual(points[found], data.landmarks[nearest[found]])
+    _, map_scale = residual(points[found], data.landmarks[nearest[found]], scaled=True)
+    return {
+        'cylinders': len(data.landmarks),
+        'cylinders_found': len(np.unique(nearest[found])),
+        'landmarks_false': int(np.sum(~found)),
+        'landmark_rmse_m': round(landmark, 4),
+        'position_rmse_m': round(position, 4),
+        'position_rmse_with_scale_m': round(scaled, 4),
+        'dead_reckoning_rmse_m': round(residual(result.dead_reckoning[:, :2], track)[0], 4),
+        'track_scale': round(track_scale, 4),
+        'arena_scale': round(map_scale, 4),
+    }
+
+
+def associate(data: Lego, result: Result) -> np.ndarray[Any, np.dtype[np.int64]]:
+    """(k,): the cylinder that each landmark is, -1 for none, by the alignment of the track."""
+    T = align(result.scanner[:, :2], data.track.poses[:, :2])
+    gap = np.linalg.norm(
+        se2.transform(T, result.reflectors.points)[:, None] - data.landmarks[None], axis=-1
+    )
+    return np.where(gap.min(axis=1) < NEAR, gap.argmin(axis=1), -1)
+
+
+def residual(points: Array, targets: Array, scaled: bool = False) -> tuple[float, float]:
+    """RMSE [m] after the best rigid alignment (or similarity), and the scale."""
+    T = align(points, targets)
+    p = se2.transform(T, points) - targets.mean(axis=0)
+    q = targets - targets.mean(axis=0)
+    scale = float((p * q).sum() / (p * p).sum()) if scaled else 1.0
+    e = scale * p - q
+    return float(np.sqrt((e**2).sum(axis=1).mean())), scale
+
+
+def picture(data: Lego, result: Result) -> bytes:
+    """Truth, dead reckoning, EKF and its landmarks with 95 % ellipses, in the arena."""
+    # matplotlib takes half a second to import, which other commands need not wait for
+    from matplotlib.figure import Figure
+
+    from rlml_slam.tools.pictures import LIVE, PATH, REFLECTOR, TRUTH, ellipse, png
+
+    track = data.track.poses[:, :2]
+    figure = Figure(figsize=(8, 8), layout='constrained')
+    axes = figure.add_subplot()
+    for poses, colour, name in (
+        (result.dead_reckoning, LIVE, 'dead reckoning'),
+        (result.scanner, PATH, 'EKF'),
+    ):
+        xy = se2.transform(align(poses[:, :2], track), poses[:, :2])
+        axes.plot(*xy.T, color=colour, lw=1.2, label=name)
+    axes.plot(*track.T, color=TRUTH, lw=1.2, ls='--', label='camera track')
+    T = align(result.scanner[:, :2], track)
+    R = se2.rotation(T[2])
+    points = se2.transform(T, result.reflectors.points)
+    axes.plot(*data.landmarks.T, 'o', mfc='none', color=TRUTH, ms=12, label='cylinders')
+    axes.plot(*points.T, '+', color=REFLECTOR, label='landmarks, 95 %')
+    for point, cov in zip(points, result.reflectors.cov, strict=True):
+        patch = ellipse(point, R @ cov @ R.T)
+        patch.set(fill=False, edgecolor=REFLECTOR)
+        axes.add_patch(patch)
+    axes.set(aspect='equal', xlabel='x [m]', ylabel='y [m]')
+    axes.legend(fontsize=8)
+    return png(figure)
