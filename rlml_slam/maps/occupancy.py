@@ -117,7 +117,8 @@ def save(grid: OccupancyGrid, path: str | Path) -> tuple[Path, Path]:
     image = np.full(grid.cells.shape, PGM_UNKNOWN, dtype=np.uint8)
     image[(grid.cells >= 0) & (grid.cells <= 100 * FREE_THRESH)] = PGM_FREE
     image[grid.cells >= 100 * OCCUPIED_THRESH] = PGM_OCCUPIED
-    rows, columns = len(image), image.shape[1]
+    rows = len(image)
+    columns = image.size // max(rows, 1)
     header = f'P5\n# resolution {grid.resolution:g} m\n{columns} {rows}\n255\n'.encode()
     text = (
         f'image: {pgm.name}\nmode: trinary\nresolution: {grid.resolution!r}\n'

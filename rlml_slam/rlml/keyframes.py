@@ -54,8 +54,7 @@ class Sighting:
     @property
     def z(self) -> Array:
         """The fused position (2,)."""
-        z: Array = np.linalg.solve(self.information, self.weighted)
-        return z
+        return np.asarray(np.linalg.solve(self.information, self.weighted), dtype=np.float64)
 
 
 class Interval:

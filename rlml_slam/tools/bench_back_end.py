@@ -110,7 +110,7 @@ def _compare(graph: Graph, solvers: dict[str, Solver], runs: int) -> dict[str, A
             if name in plan and (name == 'rlml' or found[name][0] <= SAME * best):
                 once, final[name] = _once(graph, start, solver, plan[name])
                 times[name].append(once)
-    rows = {}
+    rows: dict[str, dict[str, Any]] = {}
     for name in solvers:
         if times[name]:
             ms = median(r.cpu_ms for r in times[name])

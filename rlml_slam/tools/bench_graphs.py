@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlml_slam import se2
 from rlml_slam.graph.graph import Graph
@@ -73,7 +74,7 @@ def warehouse(poses: int = 1000, reflectors: int = 150, seed: int = 0) -> Graph:
     return graph
 
 
-def _with_edges(truth: Array, pairs: Array, rng: np.random.Generator) -> Graph:
+def _with_edges(truth: Array, pairs: NDArray[np.int64], rng: np.random.Generator) -> Graph:
     graph = Graph()
     graph.add_poses(truth)
     graph.fixed_poses[0] = True

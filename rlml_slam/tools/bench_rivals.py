@@ -31,7 +31,7 @@ class Run:
 
 Solver = Callable[[Graph, int], Run]
 
-# wrappers of g2o own what they wrap: they must outlive the optimiser, whose destructor frees it too
+# wrappers of g2o own what they wrap: they must outlive the optimiser, which frees it as well
 _KEEP: list[Any] = []
 
 
@@ -144,16 +144,16 @@ def run_gtsam(graph: Graph, iterations: int, algorithm: str) -> Run:
         noise = gaussian.Covariance(J @ np.linalg.inv(info) @ J.T)
         bearing = gtsam.Rot2(float(np.arctan2(z[1], z[0])))
         fg.add(gtsam.BearingRangeFactor2D(int(i), int(n + k), bearing, r, noise))
-    for i in np.flatnonzero(graph.fixed_poses):
+    for fixed in np.flatnonzero(graph.fixed_poses):
         exact = gtsam.noiseModel.Constrained.All(3)
-        fg.add(gtsam.PriorFactorPose2(int(i), gtsam.Pose2(*graph.poses[i]), exact))
+        fg.add(gtsam.PriorFactorPose2(int(fixed), gtsam.Pose2(*graph.poses[fixed]), exact))
     options = getattr(gtsam, f'{algorithm}Params')()
     options.setMaxIterations(iterations)
     optimizer = getattr(gtsam, f'{algorithm}Optimizer')(fg, values, options)
     ms, result = timed(optimizer.optimize)
-    for i in range(n):
-        T = result.atPose2(i)
-        graph.poses[i] = [T.x(), T.y(), T.theta()]
+    for pose in range(n):
+        T = result.atPose2(pose)
+        graph.poses[pose] = [T.x(), T.y(), T.theta()]
     for k in range(len(graph.landmarks)):
         graph.landmarks[k] = np.ravel(result.atPoint2(n + k))
     return Run(ms, int(optimizer.iterations()))
@@ -167,7 +167,7 @@ def run_ceres(graph: Graph, iterations: int) -> Run:
     """
     import pyceres
 
-    class Factor(pyceres.CostFunction):  # type: ignore[misc]
+    class Factor(pyceres.CostFunction):
         def __init__(self, function: Any, z: Any, root: Any, sizes: list[int]) -> None:
             pyceres.CostFunction.__init__(self)
             self.set_num_residuals(len(root))

@@ -61,11 +61,11 @@ def read_lego(folder: str | Path) -> Lego:
     stamps = np.array([s.stamp for s in scans], dtype=np.int64)
     if not len(scans) == len(motors) == len(track):
         raise FileFormatError(f'{folder}: scans, motors and reference differ in number of rows')
-    ticks = np.array([v[[0, 4]] for _, v in motors])
+    ticks = np.array([v[[0, 4]] for _, v in motors], dtype=np.float64)
     poses = np.array([[v[0] * MM, v[1] * MM, np.nan] for _, v in track])
     counts = Counter(scans=len(scans), cylinders=len(cylinders))
     return Lego(
-        _odometry(stamps, ticks * METRES_PER_TICK),
+        _odometry(stamps, np.asarray(ticks, dtype=np.float64) * METRES_PER_TICK),
         scans,
         Trajectory(stamps, poses),
         np.array(cylinders)[:, :2] * MM,
