@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlml_slam.errors import FileFormatError
 from rlml_slam.se2 import Array
@@ -98,7 +99,7 @@ def _scan(stamp: int, values: Array) -> Scan:
     )  # fmt: skip
 
 
-def _odometry(stamps: Array, wheels: Array) -> list[Odometry]:
+def _odometry(stamps: NDArray[np.int64], wheels: Array) -> list[Odometry]:
     """Poses of the middle between the wheels, from the ways (n, 2) of the left and right one."""
     step = np.diff(wheels, axis=0)
     turn = (step[:, 1] - step[:, 0]) / WHEEL_BASE
