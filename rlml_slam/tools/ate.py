@@ -49,6 +49,7 @@ class TrajectoryErrors:
             'median_m': float(np.median(d)),
             'std_m': float(d.std()),
             'max_m': float(d.max()),
+            'last_m': float(d[-1]),
         }
         if len(heading):
             out['heading_rmse_deg'] = float(np.sqrt((heading**2).mean()))

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -17,7 +19,6 @@ from rlml_slam.ros.tf import Extrinsics
 from rlml_slam.se2 import Array
 from rlml_slam.tools.record import Truth
 from rlml_slam.tools.tum import Trajectory
-from rlml_slam.types import Detections
 
 TRUTH = 'ground_truth'
 _TF_SAMPLE = 500  # messages of /tf that are searched for a sensor that /tf_static does not place
@@ -26,76 +27,59 @@ _TF_SAMPLE = 500  # messages of /tf that are searched for a sensor that /tf_stat
 class BagInputs:
     """Iterate for (log time [ns], stream of ros/feed.py, message) in log order.
 
-    ``extrinsics`` knows the static transforms of the whole bag from the beginning. Truth on the
-    way is collected for :meth:`truth`; ``refused`` counts what of it cannot be believed.
+    ``topics`` by stream, as ``params`` ask for them; ``extrinsics`` knows the static transforms
+    of the whole bag.
     """
 
     def __init__(self, bag: BagReader, params: Parameters) -> None:
         self._bag = bag
-        self._p = params
+        self.params = params
         self.topics = choose_topics(bag.topics, params.node)
         self.extrinsics = Extrinsics()
-        self.refused = 0
-        self._true: list[tuple[int, Array]] = []
-        self._true_frame = ''
-        self._true_reflectors: Detections | None = None
-        self._truth_topic = _named(bag, TRUTH)
-        self._reflectors_topic = _named(bag, TRUE_REFLECTORS)
         self._read_tf()
-
-    def _read_tf(self) -> None:
-        """Static transforms wherever they are in the bag, and those that /tf begins with."""
-        for topic in ('/tf', '/tf_static'):
-            if topic not in self._bag.topics:
-                continue
-            try:
-                for k, (_, _, message) in enumerate(self._bag.messages([topic])):
-                    if topic == '/tf' and k >= _TF_SAMPLE:
-                        break
-                    self._add_transforms(topic, message)
-            except BagError:
-                pass  # the damage is met again, and told, when the inputs are read
-
-    def _add_transforms(self, topic: str, message: Any) -> None:
-        try:
-            self.extrinsics.add(convert.transforms(message, topic))
-        except InputError:
-            self.refused += 1
 
     def __iter__(self) -> Iterator[tuple[int, str, Any]]:
         stream_of = {topic: stream for stream, topic in self.topics.items()}
-        others = [t for t in (self._truth_topic, self._reflectors_topic) if t is not None]
-        for time, topic, message in self._bag.messages([*stream_of, *others]):
-            if topic in stream_of:
-                yield time, stream_of[topic], message
-                continue
-            try:
-                self._add_truth(topic, message)
-            except InputError:
-                self.refused += 1
+        for time, topic, message in self._bag.messages(stream_of):
+            yield time, stream_of[topic], message
 
-    def _add_truth(self, topic: str, message: Any) -> None:
-        if topic == self._reflectors_topic:
-            self._true_reflectors = convert.detections(message, self._p.reflector, topic)
+    def _all(self, topic: str | None, most: int | None = None) -> Iterator[Any]:
+        """The messages of a topic as far as they can be read, ``most`` at most."""
+        if topic is None or topic not in self._bag.topics:
             return
-        pose = _true_pose(message, topic)
-        if pose is not None:
-            self._true.append((convert.stamp(message, topic), pose))
-            self._true_frame = convert.frame(message.header.frame_id)
+        try:
+            for _, _, message in itertools.islice(self._bag.messages([topic]), most):
+                yield message
+        except BagError:
+            return  # the damage is met again, and told, when the inputs are read
+
+    def _read_tf(self) -> None:
+        """Static transforms wherever they are in the bag, and those that /tf begins with."""
+        for topic, most in (('/tf', _TF_SAMPLE), ('/tf_static', None)):
+            for message in self._all(topic, most):
+                with contextlib.suppress(InputError):
+                    self.extrinsics.add(convert.transforms(message, topic))
 
     def truth(self) -> Truth | None:
-        """The ground truth that was met, None without any."""
-        rows = sorted(self._true, key=lambda row: row[0])
+        """The ground truth of the bag, None without any. What cannot be believed is left out."""
+        topic = _named(self._bag, TRUTH)
+        rows: dict[int, Array] = {}
+        frame = ''
+        for message in self._all(topic):
+            with contextlib.suppress(InputError):
+                rows[convert.stamp(message, TRUTH)] = _true_pose(message)
+                frame = convert.frame(message.header.frame_id)
         if not rows:
             return None
-        stamps = np.array([t for t, _ in rows], dtype=np.int64)
-        first = np.concatenate([[True], np.diff(stamps) > 0])
-        trajectory = Trajectory(stamps[first], np.array([p for _, p in rows])[first])
-        is_map = self._true_frame == self._p.node.map_frame
-        known = self._true_reflectors
-        if known is None or known.frame_id != self._true_frame:
-            return Truth(trajectory, is_map)
-        return Truth(trajectory, is_map, known.ids, known.points)
+        stamps = np.array(sorted(rows), dtype=np.int64)
+        path = Trajectory(stamps, np.array([rows[t] for t in sorted(rows)]))
+        is_map = frame == self.params.node.map_frame
+        for message in self._all(_named(self._bag, TRUE_REFLECTORS)):
+            with contextlib.suppress(InputError):
+                known = convert.detections(message, self.params.reflector, TRUE_REFLECTORS)
+                if known.frame_id == frame:
+                    return Truth(path, is_map, known.ids, known.points)
+        return Truth(path, is_map)
 
 
 def _named(bag: BagReader, name: str) -> str | None:
@@ -104,11 +88,10 @@ def _named(bag: BagReader, name: str) -> str | None:
     return fitting[0] if fitting else None
 
 
-def _true_pose(message: Any, topic: str) -> Array | None:
+def _true_pose(message: Any) -> Array:
     """Pose (3,) of an Odometry, PoseStamped, PoseWithCovarianceStamped or PointStamped."""
     if hasattr(message, 'point'):
         return np.array([message.point.x, message.point.y, np.nan])
-    pose = getattr(message, 'pose', None)
-    if pose is None:
-        return None
-    return convert.planar_pose(getattr(pose, 'pose', pose), f'{topic}: pose')
+    if not hasattr(message, 'pose'):
+        raise InputError(f'{TRUTH}: a message of this type has no pose')
+    return convert.planar_pose(getattr(message.pose, 'pose', message.pose), f'{TRUTH}: pose')

@@ -75,7 +75,8 @@ def _ate_text(f: Mapping[str, float], aligned: bool) -> str:
         f'{f["matched"]:.0f} poses with truth, {f["unmatched"]:.0f} without'
         f'{", after SE(2) alignment" if aligned else ""}',
         f'position       rmse {f["rmse_m"]:.4f} m   mean {f["mean_m"]:.4f}   '
-        f'median {f["median_m"]:.4f}   std {f["std_m"]:.4f}   max {f["max_m"]:.4f}',
+        f'median {f["median_m"]:.4f}   std {f["std_m"]:.4f}   max {f["max_m"]:.4f}   '
+        f'last {f["last_m"]:.4f}',
     ]
     if 'heading_rmse_deg' in f:
         lines.append(f'heading        rmse {f["heading_rmse_deg"]:.4f} deg')

@@ -44,6 +44,7 @@ Table: TypeAlias = Mapping[str, Command | Group]
 COMMANDS: Table = {
     'demo': Command('demo', 'simulator, front end and back end live over DDS, then a report'),
     'replay': Command('replay', 'run the system over a bag: no topics, deterministic'),
+    'live': Command('live_bag', 'play a bag to the live nodes, then a report'),
     'convert': Command('convert', 'recorded data sets become bags'),
     'evaluate': Command('evaluate', 'errors of a trajectory against relations or ground truth'),
     'simulate': Command('simulate', 'write a bag of a drive through a synthetic world'),

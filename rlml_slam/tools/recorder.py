@@ -14,13 +14,14 @@ from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
 from nav_msgs.msg import Odometry, Path
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import LaserScan, PointCloud2
+from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Parameters
 from rlml_slam.ros import convert
 from rlml_slam.ros.associated import read_reflector_map
+from rlml_slam.ros.messages import rclpy_class
 from rlml_slam.ros.sensors import LATCHED
 from rlml_slam.ros.simulated import TRUE_REFLECTORS
 from rlml_slam.se2 import Array
@@ -28,6 +29,7 @@ from rlml_slam.tools.record import FrameLog, Run, Truth
 from rlml_slam.tools.tum import Trajectory
 from rlml_slam.types import Detections, Health, Level, Reflectors
 
+SCAN = ('scan', 'sensor_msgs/msg/LaserScan')
 DEEP = QoSProfile(depth=1000)  # of the small messages, none may be lost
 SENSOR = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 LAST_MAP, PATIENCE = 1.5, 10.0  # [s] for the last map to come; for the last pose at most
@@ -40,17 +42,21 @@ NO_REFLECTORS = Reflectors(
 
 
 class Recorder(Node):
-    """Collects poses, truth, products and diagnostics; every callback may be called directly."""
+    """Collects poses, truth, products and diagnostics; every callback may be called directly.
 
-    def __init__(self, **options: Any) -> None:
-        super().__init__('demo_recorder', **options)
+    ``sensor`` is the (topic, type) whose every message asks for a pose.
+    """
+
+    def __init__(self, sensor: tuple[str, str] = SCAN, **options: Any) -> None:
+        super().__init__('recorder', **options)
+        self._sensor = sensor
         self.frames = FrameLog()
         self.true: dict[int, Array] = {}
         self.latency_ms: list[float] = []
         self.figures: dict[str, dict[str, str]] = {}
-        self.scans = 0
+        self.sensed = 0
         self.distance = 0.0
-        self._scan_heard: dict[int, float] = {}
+        self._sensor_heard: dict[int, float] = {}
         self._health = Health()
         self._began: float | None = None
         self._heard = 0.0
@@ -60,7 +66,7 @@ class Recorder(Node):
         self._true_reflectors: Detections | None = None
         self._keyframes, self._closures = np.zeros((0, 3)), np.zeros((0, 2, 2))
         self._last_true: Array | None = None
-        self._scan: Any = None
+        self._listener: Any = None
         self._settled = time.monotonic() + SETTLE
         listen = self.create_subscription
         listen(PoseWithCovarianceStamped, 'pose', self.on_pose, DEEP)
@@ -73,11 +79,11 @@ class Recorder(Node):
         listen(DiagnosticArray, '/diagnostics', self.on_diagnostics, DEEP)
 
     def is_ready(self) -> bool:
-        """Whether front end and back end are there; from then on scans are listened to.
+        """Whether front end and back end are there; from then on the sensor is listened to.
 
-        The simulator waits for this listener, so that nobody misses the beginning.
+        Its source waits for this listener, so that nobody misses the beginning.
         """
-        if self._scan is not None:
+        if self._listener is not None:
             return True
         now = time.monotonic()
         if not (self.count_publishers('pose') and self.count_publishers('graph')):
@@ -85,16 +91,19 @@ class Recorder(Node):
         if now < self._settled:
             return False
         # bytes: the stamp is all that is wanted of a scan
-        self._scan = self.create_subscription(LaserScan, 'scan', self.on_scan, SENSOR, raw=True)
+        topic, kind = self._sensor
+        self._listener = self.create_subscription(
+            rclpy_class(kind), topic, self.on_sensor, SENSOR, raw=True
+        )
         return True
 
-    def on_scan(self, data: bytes) -> None:
-        """One serialized LaserScan: note when it came."""
+    def on_sensor(self, data: bytes) -> None:
+        """One serialized message that begins with a header: note when it came."""
         # CDR: four bytes of encapsulation, then the header's stamp (int32 sec, uint32 nanosec)
         order = '<' if data[1] & 1 else '>'
         sec, nanosec = struct.unpack_from(f'{order}iI', data, 4)
-        self.scans += 1
-        self._scan_heard[sec * 1_000_000_000 + nanosec] = time.monotonic()
+        self.sensed += 1
+        self._sensor_heard[sec * 1_000_000_000 + nanosec] = time.monotonic()
 
     def on_pose(self, msg: PoseWithCovarianceStamped) -> None:
         """The front end's answer to a scan."""
@@ -103,7 +112,7 @@ class Recorder(Node):
         self._began = now if self._began is None else self._began
         self._heard = now
         self.frames.add_pose(pose.stamp, pose.pose, pose.cov, self._health)
-        heard = self._scan_heard.pop(pose.stamp, None)
+        heard = self._sensor_heard.pop(pose.stamp, None)
         if heard is not None:
             self.latency_ms.append((now - heard) * 1e3)
 
@@ -176,7 +185,7 @@ class Recorder(Node):
         ``since`` is when the last scan was sent; after PATIENCE the answer is yes in any case.
         """
         waited = time.monotonic() - since
-        answered = not self._scan_heard or self.frames.stamps[-1:] >= [max(self._scan_heard)]
+        answered = not self._sensor_heard or self.frames.stamps[-1:] >= [max(self._sensor_heard)]
         return (answered and waited > LAST_MAP) or waited > PATIENCE
 
     def note(self) -> str:

@@ -35,6 +35,7 @@ def test_figures_by_hand():
     assert s['matched'] == 3
     assert_allclose(s['rmse_m'], np.sqrt((0.09 + 0.16) / 3))
     assert_allclose([s['mean_m'], s['median_m'], s['max_m']], [0.7 / 3, 0.3, 0.4])
+    assert_allclose(s['last_m'], 0.4)
     assert_allclose(s['std_m'], np.sqrt(0.25 / 3 - (0.7 / 3) ** 2))
     assert_allclose(s['heading_rmse_deg'], np.degrees(np.sqrt(0.02 / 3)))
 

@@ -15,7 +15,8 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2 or its wheels')
 
-from rlml_slam.tools.demo import node, route_length
+from rlml_slam.tools.demo import route_length
+from rlml_slam.tools.live import node
 from rlml_slam.tools.main import main
 from rlml_slam.tools.tum import read_tum
 
@@ -64,6 +65,19 @@ def test_demo_drives_maps_and_reports(world, tmp_path):
     assert (tmp_path / 'out' / 'report.html').stat().st_size > 50_000
 
 
+def test_bag_over_dds_ends_where_its_replay_does(tmp_path, capsys):
+    """At twice the recording's pace, to be quick; every message of a small bag gets through."""
+    bag, live, replayed = str(ROOT / 'bags' / 'room'), tmp_path / 'live', tmp_path / 'replayed'
+    assert main(['live', bag, '--out', str(live), '--rate', '2', '--json']) == 0
+    f = json.loads(capsys.readouterr().out)
+    assert main(['replay', bag, '--out', str(replayed), '--json']) == 0
+    capsys.readouterr()
+    assert f['scans'] == f['scans_published']
+    paths = [str(folder / 'trajectory.tum') for folder in (live, replayed)]
+    assert main(['evaluate', 'ate', *paths, '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['last_m'] < 0.02
+
+
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_interrupt_ends_all_processes(world, tmp_path, number):
     out = tmp_path / 'out'
@@ -87,7 +101,8 @@ def test_interrupt_ends_all_processes(world, tmp_path, number):
 
 def test_dead_process_is_reported(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(
-        'rlml_slam.tools.demo.node', lambda name, values: ['rlml_slam.nodes.no_such_node']
+        'rlml_slam.tools.live.node',
+        lambda name, values, config=None: ['rlml_slam.nodes.no_such_node'],
     )
     assert main(['demo', '--out', str(tmp_path / 'out')]) == 1
     err = capsys.readouterr().err

@@ -65,8 +65,8 @@ def test_poses_and_truth_become_errors(recorder):
 
 
 def test_scan_is_paired_with_its_pose_by_stamp(recorder):
-    recorder.on_scan(scan(3))
-    assert recorder.scans == 1
+    recorder.on_sensor(scan(3))
+    assert recorder.sensed == 1
     answer = pose(3, 0.0)
     recorder.on_pose(answer)
     assert recorder.latency_ms == []  # 7 ns off: another stamp

@@ -77,9 +77,11 @@ def test_no_such_bag_is_one_line(tmp_path, capsys):
 
 
 def made_scan(stamp):
-    ranges = np.full(90, 2.0, dtype=np.float32)
+    """Half of a room of 4 x 3 m, seen from its middle."""
+    angles = -1.57 + 0.035 * np.arange(90)
+    ranges = np.minimum(2.0 / np.abs(np.cos(angles)), 1.5 / np.abs(np.sin(angles) + 1e-9))
     none = np.zeros(0, np.float32)
-    return Scan(stamp, 'laser', -1.57, 0.035, 0.0, 0.1, 30.0, ranges, none)
+    return Scan(stamp, 'laser', -1.57, 0.035, 0.0, 0.1, 30.0, ranges.astype(np.float32), none)
 
 
 def write_scans(path, stamps):

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A drive over DDS: a source of sensor data, front end and back end as processes, heard here."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import rclpy
+import rclpy.utilities
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+
+from rlml_slam.errors import RlmlError
+from rlml_slam.tools.metrics import distribution
+from rlml_slam.tools.processes import Processes, free_domain
+from rlml_slam.tools.progress import Progress
+from rlml_slam.tools.record import Run
+from rlml_slam.tools.recorder import Recorder
+
+START_TIMEOUT = 90.0  # [s] for three processes to start and to find each other
+SILENCE = 15.0  # [s] without a pose while the source runs: something is broken
+LISTENERS = 2  # of the sensor: front end and recorder; time begins when both are there
+
+
+@dataclass(frozen=True)
+class Source:
+    """What takes the place of a robot: an executable of this package with its parameters.
+
+    ``system`` are parameters of front end and back end, ``config`` their parameter file.
+    ``sensor`` is the (topic, type) whose every message asks for a pose. ``progress`` tells the
+    share of the drive that is done.
+    """
+
+    title: str
+    executable: str
+    parameters: Mapping[str, Any]
+    progress: Callable[[Recorder], float]
+    system: Mapping[str, Any] = field(default_factory=dict)
+    config: Path | None = None
+    sensor: tuple[str, str] = ('scan', 'sensor_msgs/msg/LaserScan')
+
+
+def drive(source: Source, out: Path, quiet: bool) -> Run:
+    """One drive over DDS in a domain of its own; the logs of the processes go to ``out``/log.
+
+    Raises RlmlError if a process dies, never answers or falls silent, with its last words.
+    """
+    domain = free_domain()
+    environment = {'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+    os.environ.update(environment)
+    rclpy.init(args=[], domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        with held_interrupts() as check, Processes(out / 'log', environment) as processes:
+            recorder = Recorder(source.sensor)
+            executor = SingleThreadedExecutor()
+            executor.add_node(recorder)
+            try:
+                _start(processes, source)
+                with Progress('driving', 1.0, quiet) as progress:
+                    for _ in _listen(processes, recorder, executor, source.executable):
+                        check()
+                        progress.update(source.progress(recorder), recorder.note())
+                memory = [processes.peak_rss_mb(name) for name in ('front_end', 'back_end')]
+            finally:
+                executor.shutdown(timeout_sec=1.0)
+                recorder.destroy_node()
+    finally:
+        rclpy.utilities.try_shutdown()
+    if not recorder.frames.stamps:
+        raise RlmlError('the front end never published a pose')
+    result = recorder.run(source.title)
+    result.extra = _live_figures(recorder, memory)
+    return result
+
+
+@contextmanager
+def held_interrupts() -> Iterator[Callable[[], None]]:
+    """SIGINT and SIGTERM are held until the yielded function is called; it raises the interrupt.
+
+    Raised anywhere, it could strike while a child is being started, which nobody would end then.
+    """
+    caught: list[int] = []
+
+    def check() -> None:
+        if caught:
+            raise KeyboardInterrupt
+
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(n, lambda number, _frame: caught.append(number)) for n in numbers]
+    try:
+        yield check
+    finally:
+        for n, handler in zip(numbers, before, strict=True):
+            signal.signal(n, handler)
+
+
+def _start(processes: Processes, source: Source) -> None:
+    """The three nodes; the source waits until the others listen."""
+    for name in ('front_end', 'back_end'):
+        processes.start(name, node(name, source.system, source.config))
+    processes.start(source.executable, node(source.executable, source.parameters))
+
+
+def node(name: str, parameters: Mapping[str, Any], config: Path | None = None) -> list[str]:
+    """Arguments of ``python -m`` for an executable of this package."""
+    words = [f'rlml_slam.nodes.{name}', '--ros-args', '--log-level', 'warn']
+    if config is not None:
+        words += ['--params-file', str(config)]
+    for key, value in parameters.items():
+        words += ['-p', f'{key}:={value}']
+    return words
+
+
+def _listen(
+    processes: Processes, recorder: Recorder, executor: SingleThreadedExecutor, source: str
+) -> Iterator[None]:
+    """Hear the whole drive, bit by bit; RlmlError if a process dies or falls silent."""
+    began = time.monotonic()
+    finished: float | None = None
+    while finished is None or not recorder.has_caught_up(finished):
+        executor.spin_once(timeout_sec=0.1)
+        now = time.monotonic()
+        recorder.is_ready()
+        processes.check('front_end', 'back_end')
+        if finished is None and processes.has_ended(source):
+            finished = now
+        if not recorder.frames.stamps and now - began > START_TIMEOUT:
+            raise RlmlError(f'no pose within {START_TIMEOUT:g} s of the start')
+        if finished is None and recorder.silence(now) > SILENCE:
+            raise RlmlError(f'the front end has been silent for {SILENCE:g} s')
+        yield
+
+
+def _live_figures(recorder: Recorder, memory: Sequence[float | None]) -> dict[str, Any]:
+    """What only a live run has: scans sent, and the time from a scan to its pose."""
+    figures: dict[str, Any] = {'scans_published': recorder.sensed}
+    if recorder.latency_ms:
+        figures['latency_ms'] = distribution(recorder.latency_ms)
+    known = [mb for mb in memory if mb is not None]
+    if known:
+        figures['peak_rss_mb'] = round(sum(known), 1)
+    return figures
