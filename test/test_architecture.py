@@ -119,7 +119,9 @@ sys.exit(main(['replay', '--help']))
 
 def test_nodes_need_no_rosbags():
     """A stock ROS 2 has no rosbags; only bags need it."""
-    for name in ('front_end', 'back_end', 'slam', 'simulator'):
+    for name in (
+        'front_end', 'back_end', 'slam', 'simulator', 'deformable_slam', 'carrier_simulator',
+    ):  # fmt: skip
         seen, todo = set(), [f'rlml_slam.nodes.{name}']
         while todo:
             module = todo.pop()

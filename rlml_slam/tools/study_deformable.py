@@ -9,9 +9,10 @@ import multiprocessing
 import os
 import sys
 import time
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from rich.console import Console
 from rich.markup import escape
@@ -23,6 +24,7 @@ from rlml_slam.deformable.replay_note import replay
 from rlml_slam.deformable.study import RowResult, concatenate, run_row, summarize
 from rlml_slam.errors import ParameterError, RlmlError
 
+Task: TypeAlias = tuple[Row, range]
 CHUNK = 50  # seeds per task: small enough for a moving bar, large enough to be worth sending
 
 
@@ -42,6 +44,14 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         '--replay-note', type=Path, metavar='DIR', help="replay the note's stored noise instead"
     )
+    parser.add_argument(
+        '--window', action='store_true', help="long drives of the node's sliding window instead"
+    )
+    parser.add_argument('--minutes', type=float, default=10.0, help='with --window: of each run')
+    parser.add_argument('--runs', type=int, default=8, help='with --window: per carrier')
+    parser.add_argument(
+        '--anonymous', action='store_true', help='with --window: no ids, and ghosts'
+    )
     parser.set_defaults(run=run)
 
 
@@ -51,6 +61,8 @@ def run(args: argparse.Namespace) -> int:
         replayed = replay(args.replay_note)
         print(json.dumps(replayed)) if args.json else _show_replay(_console(), replayed)
         return 0
+    if args.window:
+        return _run_window(args)
     if args.seeds < 2 or args.jobs < 0 or args.figure_seed < 0:
         raise ParameterError(
             'study deformable: --seeds must be >= 2, --jobs and --figure-seed >= 0'
@@ -73,6 +85,19 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _run_window(args: argparse.Namespace) -> int:
+    from rlml_slam.tools import study_deformable_window as window
+
+    if not 0.5 <= args.minutes <= 1e4 or args.runs < 1 or args.jobs < 0:
+        raise ParameterError(
+            'study deformable --window: --minutes must be 0.5 or more, --runs 1 or more'
+        )
+    results = window.run_all(args.minutes, args.runs, not args.anonymous, args.jobs or _cores())
+    summary = window.summarize(results)
+    print(json.dumps(summary)) if args.json else window.show(_console(), summary)
+    return 0
+
+
 def run_study(rows: tuple[Row, ...], seeds: int, jobs: int) -> dict[Row, RowResult]:
     """Results of ``rows`` over seeds 0 .. seeds-1, whatever the number of processes.
 
@@ -91,14 +116,21 @@ def run_study(rows: tuple[Row, ...], seeds: int, jobs: int) -> dict[Row, RowResu
         bar = progress.add_task('compiling', total=len(rows) * seeds)
         run_row(Row('straight', 'fixed', 'active'), range(1))  # fills the cache for all processes
         progress.update(bar, description='simulating')
-        context = multiprocessing.get_context('spawn')
-        with ProcessPoolExecutor(jobs, mp_context=context) as pool:
-            pending = {pool.submit(run_row, *task): task for task in tasks}
-            for done in as_completed(pending):
-                row, part = pending[done]
-                parts[row][part.start] = done.result()
-                progress.advance(bar, len(part))
+        for (row, part), result in _each(tasks, jobs):
+            parts[row][part.start] = result
+            progress.advance(bar, len(part))
     return {row: concatenate(p for _, p in sorted(parts[row].items())) for row in rows}
+
+
+def _each(tasks: list[Task], jobs: int) -> Iterator[tuple[Task, RowResult]]:
+    """The results as they become ready, from this process where one is enough."""
+    if jobs == 1:
+        yield from ((task, run_row(*task)) for task in tasks)
+        return
+    context = multiprocessing.get_context('spawn')
+    with ProcessPoolExecutor(jobs, mp_context=context) as pool:
+        pending = {pool.submit(run_row, *task): task for task in tasks}
+        yield from ((pending[done], done.result()) for done in as_completed(pending))
 
 
 def _cores() -> int:

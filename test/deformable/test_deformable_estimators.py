@@ -114,9 +114,8 @@ def test_ekf_is_the_textbook_filter(row):
     np.testing.assert_allclose(ekf.cov[0], cov, atol=1e-9)
 
 
-@pytest.mark.parametrize('row', [ROWS[0], ROWS[3]], ids=lambda r: r.name)
-def test_nls_is_the_optimum_that_scipy_finds(row):
-    truth, m = simulate(row, draw(range(1)))
+def test_nls_is_the_optimum_that_scipy_finds():
+    truth, m = simulate(Row('circle', 'changing', 'predetermined'), draw(range(1)))
     nls = run_nls(m, NOISE)
     n = truth.shape[-1]
 
@@ -188,7 +187,7 @@ def test_order_of_the_features_does_not_matter():
 
 
 def test_covariances_account_for_the_errors():
-    seeds = range(500)
+    seeds = range(300)
     for row in (
         Row('straight', 'fixed', 'predetermined'),
         Row('circle', 'changing', 'predetermined'),

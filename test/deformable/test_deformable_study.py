@@ -11,15 +11,17 @@ from rlml_slam.deformable.study import RowResult, concatenate, run_row, summariz
 from rlml_slam.deformable.truth import simulate
 from rlml_slam.errors import FileFormatError, ParameterError
 from rlml_slam.tools import study_deformable
+from rlml_slam.tools import study_deformable_window as window_study
 
 NOTE = Path(__file__).parents[3] / 'shared' / 'data' / 'deformable-note'
+ACTIVE = 60
 needs_note = pytest.mark.skipif(not NOTE.is_dir(), reason=f'{NOTE} is not there')
 
 
 @pytest.fixture(scope='module')
 def results():
-    """500 seeds of the predetermined rows, 100 of the active ones."""
-    return {r: run_row(r, range(500 if r.control == 'predetermined' else 100)) for r in ROWS}
+    """300 seeds of the predetermined rows, 60 of the active ones."""
+    return {r: run_row(r, range(300 if r.control == 'predetermined' else ACTIVE)) for r in ROWS}
 
 
 @pytest.mark.parametrize('row', ROWS[:4], ids=lambda r: r.name)
@@ -38,7 +40,7 @@ def test_nls_beats_ekf_beats_dead_reckoning_over_many_seeds(results, row):
 @pytest.mark.parametrize('row', ROWS[4:], ids=lambda r: r.name)
 def test_active_control_sees_more_and_errs_less(results, row):
     before = results[Row(row.path, row.sensing, 'predetermined')]
-    before = RowResult(*(v[:100] for v in vars(before).values()))
+    before = RowResult(*(v[:ACTIVE] for v in vars(before).values()))
     after = results[row]
     assert after.unseen.mean() < before.unseen.mean() - 3.0
     assert after.ss3('ekf').mean() < before.ss3('ekf').mean()
@@ -139,7 +141,30 @@ def test_command_prints_every_row(capsys):
     assert all(text.count(r.name) >= 4 for r in ROWS[:4])
 
 
+def test_other_processes_give_the_same_result():
+    task = (ROWS[1], range(2))
+    ((_, here),) = study_deformable._each([task], 1)
+    ((_, there),) = study_deformable._each([task], 2)
+    for a, b in zip(vars(here).values(), vars(there).values(), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 @pytest.mark.parametrize('wrong', [('--seeds', '1'), ('--jobs', '-1'), ('--figure-seed', '-3')])
 def test_command_refuses_a_wrong_number(wrong):
     with pytest.raises(ParameterError, match='--seeds must be'):
         command(*wrong)
+
+
+def test_long_drives_are_scored_and_their_claims_hold():
+    """Half a minute each; the figures over 10 minutes are the command's."""
+    results = {'train': [window_study.run_window('train', 0.5, 0, True)]}
+    summary = window_study.summarize(results)
+    assert summary['train']['updates'] == 300
+    assert len(summary['train']['nees_by_minute']) == 1
+    assert [claim for claim, holds in window_study.claims(summary) if not holds] == []
+
+
+@pytest.mark.parametrize('wrong', [('--minutes', '0'), ('--runs', '0')])
+def test_command_refuses_a_wrong_length_of_the_drives(wrong):
+    with pytest.raises(ParameterError, match='--minutes must be'):
+        command('--window', *wrong)

@@ -123,24 +123,24 @@ def test_marginalised_window_gives_what_the_whole_history_gives():
 
 @pytest.mark.parametrize('kind', ['train', 'conveyor'])
 def test_covariances_account_for_the_errors(kind):
-    """16 runs of 10 s, scored at their end: independent samples."""
+    """8 runs of 6 s, scored at their end: independent samples."""
     pose, whole, degrees = [], [], 0
-    for seed in range(16):
-        run = steps(100, seed, kind=kind)
+    for seed in range(8):
+        run = steps(60, seed, kind=kind)
         estimates, owner, _ = follow(run)
         e, P = state_error(estimates[-1], run[-1], owner)
         pose.append(e[:3] @ np.linalg.solve(P[:3, :3], e[:3]))
         whole.append(e @ np.linalg.solve(P, e))
         degrees += len(e)
-    low, high = chi2_bounds(3, 16)
+    low, high = chi2_bounds(3, 8)
     assert low < np.mean(pose) < high
     low, high = chi2_bounds(degrees, 1)
     assert low < sum(whole) < high
 
 
 def test_cost_and_memory_stay_constant():
-    """Nothing grows over 60 s of a conveyor whose features come and go."""
-    run = steps(600, kind='conveyor', ids=False, ghosts=0.05)
+    """Nothing grows over 40 s of a conveyor whose features come and go."""
+    run = steps(400, kind='conveyor', ids=False, ghosts=0.05)
     window = DeformableWindow(Deformable(), Reflector())
     sizes, seconds = [], []
     for s in run:
@@ -149,13 +149,13 @@ def test_cost_and_memory_stay_constant():
         seconds.append(time.process_time() - started)
         sizes.append(sum(a.nbytes for a in (*window._w, *window._prior, window._cov)))
     assert sizes[-1] == sizes[200]
-    early, late = np.median(seconds[100:300]), np.median(seconds[400:])
+    early, late = np.median(seconds[100:200]), np.median(seconds[300:])
     assert late < 1.5 * early + 1e-3
     assert np.percentile(seconds[100:], 99) < 0.01  # the issue's 10 ms; some 3 ms of CPU measured
 
 
 def test_anonymous_features_are_followed_among_ghosts():
-    run = steps(300, ids=False, ghosts=0.1)
+    run = steps(200, ids=False, ghosts=0.1)
     estimates, owner, _ = follow(run)
     last, step = estimates[-1], run[-1]
     found = last.features.points[:, None] - step.points[None]

@@ -104,6 +104,18 @@ def test_processes_follow_a_carrier_within_their_covariances(live, start, kind, 
     assert np.sqrt(np.trace(got.cov[:2, :2])) < 0.5
 
 
+@pytest.mark.parametrize(
+    ('node', 'name', 'value'),
+    [('deformable_slam', 'deformable.suggest', 'loudly'), ('carrier_simulator', 'rate', -1.0)],
+)
+def test_wrong_parameter_is_one_line_and_exit_code_1(start, node, name, value):
+    code, out = start(node, *arguments(**{name: value})).finish()
+    assert code == 1
+    lines = [line for line in out.splitlines() if line]
+    assert len(lines) == 1, out
+    assert f'{name.split(".")[-1]} = ' in lines[0]
+
+
 # --- in this process ------------------------------------------------------------------------
 
 
