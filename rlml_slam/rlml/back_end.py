@@ -119,8 +119,10 @@ class BackEnd:
             since, scanned = interval.motion, interval.scanned
             last = self.keyframes[-1]
             # with scans the front end's motion is the better mean; without, it holds the
-            # reflectors already, which have their own factors
-            delta = se2.between(last.T_local, frame.T_local_base) if scanned else since.delta
+            # reflectors already, which have their own factors; but where odometry knows nothing,
+            # its covariance is so wide that this counts for little and the mean for much
+            ours = scanned or not since.known
+            delta = se2.between(last.T_local, frame.T_local_base) if ours else since.delta
             pose = se2.compose(self.T_map_local, frame.T_local_base)
             index = self.graph.add_pose(pose)
             cov = since.cov + np.diag(np.array(self._p.back_end.edge_floor2))
