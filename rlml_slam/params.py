@@ -442,7 +442,11 @@ class Ekf(Group):
         choices=('plain', 'compressed'),
     )  # fmt: skip
     local_radius: float = param(
-        45.0, 'landmarks nearer than this to the robot are updated at once', 'm', 0.5, 1e4
+        10.0,
+        'landmarks nearer than this, or than the sensor reaches, are updated at once',
+        'm',
+        0.5,
+        1e4,
     )
     local_margin: float = param(
         5.0, 'travel after which the local region is chosen anew', 'm', 0.1, 1e4

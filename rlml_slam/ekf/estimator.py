@@ -55,6 +55,7 @@ class Estimator:
         self.diameters = np.zeros(0)
         self.fates: Counter[str] = Counter()
         self._region: Array | None = None
+        self._radius = self._reach = 0.0
         self._last_stamp: int | None = None
         self._stamps: list[int] = []
         self._poses: list[Array] = []
@@ -73,8 +74,8 @@ class Estimator:
         """The pose at the observation's stamp."""
         began = time.perf_counter()
         self._predict(observation)
-        self._choose_region()
         seen = measure(observation, self._p)
+        self._choose_region(seen)
         k = 0 if seen is None else len(seen.z)
         keys = np.full(k, -1, dtype=np.int64)
         statuses = np.full(k, Status.NEW, dtype=np.int64)
@@ -101,19 +102,27 @@ class Estimator:
         delta = motion.delta + motion.bias_gain * self.filter.x[3]
         self.candidates.move(delta, motion.cov)
 
-    def _choose_region(self) -> None:
-        """Work on the landmarks near the robot; choose them anew when it has gone on."""
+    def _choose_region(self, seen: Measured | None) -> None:
+        """Work on the landmarks near the robot; choose them anew when it has gone on.
+
+        The region holds whatever the sensor has been seen to reach. Lines have no place, so all
+        of them are always worked on.
+        """
         e, f = self._p.ekf, self.filter
-        if e.update == 'plain':
+        if e.update == 'plain' or self.model is not POINT:
             return
+        if seen is not None and len(seen.z):
+            self._reach = max(self._reach, float(seen.z[:, 0].max()))
         here = f.x[:2]
-        if self._region is not None and np.hypot(*(here - self._region)) <= e.local_margin:
+        sigma = 3.0 * float(np.sqrt(np.trace(f.P[:2, :2])))
+        needed = self._reach + sigma
+        region = self._region
+        if region is not None and np.hypot(*(here - region)) + needed <= self._radius:
             return
         f.settle()
         self._region = here.copy()
-        sigma = 3.0 * float(np.sqrt(np.trace(f.P[:2, :2])))
-        far = np.hypot(*(f.points - here).T)
-        f.choose(far <= e.local_radius + sigma)
+        self._radius = max(e.local_radius, needed) + e.local_margin
+        f.choose(np.hypot(*(f.points - here).T) <= self._radius)
 
     # --- data association ----------------------------------------------------------------------
 

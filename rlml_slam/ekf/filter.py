@@ -153,14 +153,20 @@ class Filter:
         assert self._phi is not None
         a, b = self._rows(self.local), self._columns(self._others)
         a0 = a[: self._phi.shape[1]]
-        n = ROBOT + 2 * self.num_landmarks
+        n, before = ROBOT + 2 * self.num_landmarks, len(self._x)
         P_ba0 = self._P[np.ix_(b, a0)]
-        x, P = np.empty(n), np.empty((n, n))
+        x, P = np.empty(n), self._P
+        if n > before:
+            P = np.zeros((n, n))
+            P[:before, :before] = self._P
         x[a], x[b] = self.x, self._x[b] + P_ba0 @ self._theta
-        P_ba = P_ba0 @ self._phi.T
-        bb = self._P[np.ix_(b, b)] - P_ba0 @ self._psi @ P_ba0.T
-        P[np.ix_(b, b)] = 0.5 * (bb + bb.T)
-        P[np.ix_(b, a)] = P_ba
+        # P_bb <- P_bb - P_ba0 Psi P_a0b as G G^T over the whole matrix: half the work, contiguous
+        values, axes = np.linalg.eigh(0.5 * (self._psi + self._psi.T))
+        keep = values > 0.0
+        G = np.zeros((n, int(keep.sum())))
+        G[b] = P_ba0 @ (axes[:, keep] * np.sqrt(values[keep]))
+        P -= G @ G.T
+        P[np.ix_(b, a)] = P_ba = P_ba0 @ self._phi.T
         P[np.ix_(a, b)] = P_ba.T
         P[np.ix_(a, a)] = self.P
         self.x, self.P, self._phi = x, P, None

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole estimator on a drive among landmarks: exact without noise, consistent with it."""
+
+import time
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from rlml_slam import se2
+from rlml_slam.ekf.estimator import Estimator
+from rlml_slam.ekf.filter import Filter
+from rlml_slam.ekf.models import POINT
+from rlml_slam.params import EkfParameters, from_mapping
+from rlml_slam.types import ANONYMOUS, Detections, Motion, Observation, Status
+
+LANDMARKS = np.array(
+    [[3.0, 2.0], [6.0, -2.0], [9.0, 3.0], [6.0, 7.0], [1.0, 7.0], [-2.0, 4.0], [4.0, 4.5]]
+)
+STEP = np.array([0.15, 0.0, 0.05])  # a circle of radius 3 m
+STEPS = 126  # once around
+Q = np.diag([0.004, 0.002, 0.004]) ** 2
+SIGMA = (0.03, 0.01)
+
+
+def params(**ekf):
+    return from_mapping({f'ekf.{k}': v for k, v in ekf.items()}, EkfParameters)
+
+
+def detections(stamp, pose, ids, rng=None):
+    p = se2.transform(se2.inverse(pose), LANDMARKS)
+    r, b = np.hypot(*p.T), np.arctan2(p[:, 1], p[:, 0])
+    near = np.flatnonzero(r < 8.0)
+    r, b = r[near], b[near]
+    if rng is not None:
+        r = r + SIGMA[0] * rng.standard_normal(len(r))
+        b = b + SIGMA[1] * rng.standard_normal(len(b))
+    R = se2.rotation(b)
+    D = np.zeros((len(r), 2, 2))
+    D[:, 0, 0], D[:, 1, 1] = SIGMA[0] ** 2, (r * SIGMA[1]) ** 2
+    told = near if ids else np.full(len(near), ANONYMOUS)
+    return Detections(
+        stamp,
+        'base_link',
+        r[:, None] * R[:, :, 0],
+        R @ D @ R.transpose(0, 2, 1),
+        told.astype(np.int64),
+        np.full(len(r), np.nan),
+    )
+
+
+def drive(p, rng=None, ids=False, steps=STEPS, q=Q):
+    """Frames and true poses of a drive; the wheels' and the sensor's noise only with ``rng``."""
+    estimator, pose, frames, truth = Estimator(p), np.zeros(3), [], []
+    for k in range(steps):
+        moved = STEP if k else np.zeros(3)
+        if rng is not None and k:
+            moved = moved + np.sqrt(np.diag(q)) * rng.standard_normal(3)
+        pose = se2.compose(pose, moved)
+        motion = Motion(STEP if k else np.zeros(3), q if k else np.zeros((3, 3)))
+        stamp = (k + 1) * 100_000_000
+        seen = detections(stamp, pose, ids, rng)
+        frames.append(estimator.process(Observation(stamp, motion, detections=seen)))
+        truth.append(pose)
+    return estimator, frames, np.array(truth)
+
+
+@pytest.mark.parametrize('association', ['nearest', 'joint'])
+@pytest.mark.parametrize('update', ['plain', 'compressed'])
+def test_without_noise_there_is_no_error(association, update):
+    estimator, frames, truth = drive(
+        params(association=association, update=update, local_radius=0.5, local_margin=0.2)
+    )
+    poses = np.array([f.T_map_base for f in frames])
+    assert np.abs(poses - truth)[:, :2].max() < 1e-9
+    assert np.abs(se2.wrap(poses[:, 2] - truth[:, 2])).max() < 1e-9
+    found = estimator.reflectors().points
+    gap = np.linalg.norm(found[:, None] - LANDMARKS[None], axis=-1)
+    assert len(found) == len(LANDMARKS)
+    assert gap.min(axis=1).max() < 1e-9
+
+
+def test_pose_is_consistent_around_the_first_loop_with_known_associations():
+    runs = 8
+    nees = []
+    for seed in range(runs):
+        _, frames, truth = drive(params(), np.random.default_rng(seed), ids=True)
+        e = np.array([f.T_map_base for f in frames]) - truth
+        e[:, 2] = se2.wrap(e[:, 2])
+        # the first pose is the map's: it has neither error nor covariance
+        nees.append(
+            [
+                float(x @ np.linalg.solve(f.cov_map, x))
+                for x, f in zip(e[1:], frames[1:], strict=True)
+            ]
+        )
+    # the poses of a run are correlated, so the bound is that of one pose per quarter of a loop
+    dof = 3 * runs * 4
+    low, high = chi2.ppf([0.025, 0.975], dof) / (runs * 4)
+    assert low < np.mean(nees) < high
+
+
+def test_anonymous_detections_find_every_landmark_and_no_other():
+    estimator, frames, truth = drive(params(), np.random.default_rng(3))
+    found = estimator.reflectors()
+    gap = np.linalg.norm(found.points[:, None] - LANDMARKS[None], axis=-1)
+    assert sorted(gap.argmin(axis=1)) == list(range(len(LANDMARKS)))
+    # three sigmas of the odometry's drift until a landmark is first seen, and more
+    assert gap.min(axis=1).max() < 0.3
+    assert np.hypot(*(frames[-1].T_map_base - truth[-1])[:2]) < 0.3
+    assert sum((f.statuses == Status.USED).sum() for f in frames) > 400
+
+
+def test_landmark_enters_the_state_with_its_nth_sighting():
+    _, frames, _ = drive(params(sightings=4), steps=5)
+    assert [int((f.landmarks >= 0).sum()) for f in frames][:3] == [0, 0, 0]
+    assert (frames[3].landmarks >= 0).all()
+    assert (frames[3].statuses == Status.NEW).all()
+    assert (frames[4].statuses == Status.USED).all()
+
+
+def test_ghost_never_enters_the_state():
+    estimator = Estimator(params(candidate_timeout=0.5))
+    for k in range(40):
+        stamp = (k + 1) * 100_000_000
+        seen = detections(stamp, np.zeros(3), False)
+        if k % 7 == 0:
+            ghost = np.array([[-3.0, -3.0 + 0.001 * k]])
+            seen = Detections(
+                stamp, 'base_link', np.concatenate([seen.points, ghost]),
+                np.concatenate([seen.cov, seen.cov[:1]]), np.append(seen.ids, ANONYMOUS),
+                np.append(seen.diameters, np.nan),
+            )  # fmt: skip
+        still = Motion(np.zeros(3), np.zeros((3, 3)))
+        estimator.process(Observation(stamp, still, detections=seen))
+    assert np.hypot(*(estimator.reflectors().points - [-3.0, -3.0]).T).min() > 2.0
+
+
+def test_500_landmarks_take_less_than_20_ms_per_update():
+    """Local region of 60 landmarks of 500, 10 of them seen per scan, against the plain filter."""
+    rng = np.random.default_rng(0)
+    R = np.diag([1e-4, 1e-5])
+
+    def made():
+        f = Filter(np.zeros(3), np.diag([1e-4, 1e-4, 1e-6]), 0.01, POINT)
+        for _ in range(500):
+            f.augment(np.array([rng.uniform(1.0, 60.0), rng.uniform(-np.pi, np.pi)]), R)
+        return f
+
+    def spent(f, slots):
+        times = []
+        for _ in range(5):
+            began = time.process_time()
+            f.predict(Motion(np.array([0.1, 0.0, 0.01]), Q))
+            for slot in slots:
+                h = POINT.observe(f.x[:3], f.points[slot][None])[0][0]
+                f.update(int(slot), h, R)
+            times.append(time.process_time() - began)
+        return min(times)
+
+    plain, postponed = made(), made()
+    near = np.hypot(*(postponed.points - postponed.x[:2]).T)
+    postponed.choose(near <= np.sort(near)[60])
+    quick, slow = spent(postponed, range(10)), spent(plain, range(10))
+    began = time.process_time()
+    postponed.settle()
+    settled = time.process_time() - began
+    print(
+        f'postponed {1e3 * quick:.2f} ms, plain {1e3 * slow:.1f} ms, settle {1e3 * settled:.1f} ms'
+    )
+    assert quick < 0.02
+    assert quick < 0.2 * slow
