@@ -54,30 +54,43 @@ def drive(source: Source, out: Path, quiet: bool) -> Run:
     """
     domain = free_domain()
     environment = {'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
-    os.environ.update(environment)
-    rclpy.init(args=[], domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        with held_interrupts() as check, Processes(out / 'log', environment) as processes:
-            recorder = Recorder(source.sensor)
-            executor = SingleThreadedExecutor()
-            executor.add_node(recorder)
-            try:
-                _start(processes, source)
-                with Progress('driving', 1.0, quiet) as progress:
-                    for _ in _listen(processes, recorder, executor, source.executable):
-                        check()
-                        progress.update(source.progress(recorder), recorder.note())
-                memory = [processes.peak_rss_mb(name) for name in ('front_end', 'back_end')]
-            finally:
-                executor.shutdown(timeout_sec=1.0)
-                recorder.destroy_node()
-    finally:
-        rclpy.utilities.try_shutdown()
+    with (
+        own_domain(domain, environment),
+        held_interrupts() as check,
+        Processes(out / 'log', environment) as processes,
+    ):
+        recorder = Recorder(source.sensor)
+        executor = SingleThreadedExecutor()
+        executor.add_node(recorder)
+        try:
+            _start(processes, source)
+            with Progress('driving', 1.0, quiet) as progress:
+                for _ in _listen(processes, recorder, executor, source.executable):
+                    check()
+                    progress.update(source.progress(recorder), recorder.note())
+            memory = [processes.peak_rss_mb(name) for name in ('front_end', 'back_end')]
+        finally:
+            executor.shutdown(timeout_sec=1.0)
+            recorder.destroy_node()
     if not recorder.frames.stamps:
         raise RlmlError('the front end never published a pose')
     result = recorder.run(source.title)
     result.extra = _live_figures(recorder, memory)
     return result
+
+
+@contextmanager
+def own_domain(domain: int, environment: Mapping[str, str]) -> Iterator[None]:
+    """ROS in this process, in that domain alone; the environment is as before afterwards."""
+    before = dict(os.environ)
+    os.environ.update(environment)
+    rclpy.init(args=[], domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        yield
+    finally:
+        rclpy.utilities.try_shutdown()
+        os.environ.clear()
+        os.environ.update(before)
 
 
 @contextmanager
