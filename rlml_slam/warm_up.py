@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 
 import rlml_slam
 
+OTHER_SYSTEMS = ('deformable', 'ekf')  # compiled when they are first used
 OUTER = ('ros', 'nodes', 'tools')  # tiers without kernels
 
 
@@ -23,10 +24,11 @@ def core_modules() -> Iterator[str]:
             yield module.name
 
 
-def import_core() -> None:
-    """Import every module of the core."""
+def import_core(also_others: bool = True) -> None:
+    """Import every module of the core; without ``also_others``, those of the main job alone."""
     for name in core_modules():
-        importlib.import_module(name)
+        if also_others or name.split('.')[1] not in OTHER_SYSTEMS:
+            importlib.import_module(name)
 
 
 def loaded() -> list[tuple[str, Callable[[], None]]]:

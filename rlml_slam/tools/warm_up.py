@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``rlml warm-up``: compile every kernel and say how long each module took."""
+"""Compile the kernels of the main job (``--all``: of every system), with the time of each."""
 
 from __future__ import annotations
 
+import sys
 import time
 
 from rlml_slam import warm_up
@@ -10,7 +11,7 @@ from rlml_slam import warm_up
 
 def main() -> None:
     """Compile what is not yet cached."""
-    warm_up.import_core()
+    warm_up.import_core('--all' in sys.argv)
     began = time.perf_counter()
     modules = warm_up.loaded()
     for k, (name, compile_module) in enumerate(modules, 1):
