@@ -1,0 +1,364 @@
+# SPDX-License-Identifier: Apache-2.0
+import math
+
+import numpy as np
+import pytest
+from differences import central_differences
+
+from rlml_slam import se2
+from rlml_slam.motion import SECOND, STILL, MotionBuffer, compose_motion, integrate
+from rlml_slam.params import MotionNoise
+from rlml_slam.types import Imu, Motion, Odometry
+
+NOISE = MotionNoise()
+MS = SECOND // 1000
+T0 = 10 * SECOND
+
+
+def path(t):
+    """A smooth path (3,) with both turns and straights."""
+    return np.array([0.8 * t, 0.3 * math.sin(t), 0.4 * math.sin(0.9 * t)])
+
+
+def filled(pose_at=path, rate=50, duration=4.0, imu=None, imu_rate=100, noise=NOISE, memory=60.0):
+    """A buffer with odometry of ``pose_at``(t [s]) and yaw rates of ``imu``(t) from T0 on."""
+    buffer = MotionBuffer(noise, memory)
+    for k in range(round(duration * rate) + 1):
+        t = k / rate
+        buffer.add_odometry(Odometry(T0 + round(t * SECOND), np.asarray(pose_at(t), dtype=float)))
+    if imu is not None:
+        for k in range(round(duration * imu_rate) + 1):
+            t = k / imu_rate
+            buffer.add_imu(Imu(T0 + round(t * SECOND), float(imu(t))))
+    return buffer
+
+
+def line(v, w=0.0):
+    return lambda t: se2.exp(np.array([v * t, 0.0, w * t]))
+
+
+def chained(v, w, dt, noise=None):
+    """Eq. 7 to 9 as the notes have them, on dense matrices, one interval after another."""
+    X, P = np.zeros(3), np.zeros((3, 3))
+    for k in range(len(v)):
+        h, th = dt[k], X[2] + 0.5 * w[k] * dt[k]
+        d = v[k] * h
+        G_x = np.array([[1.0, 0.0, -d * math.sin(th)], [0.0, 1.0, d * math.cos(th)], [0, 0, 1.0]])
+        G_u = np.array(
+            [
+                [h * math.cos(th), -0.5 * d * h * math.sin(th), -h * math.sin(th)],
+                [h * math.sin(th), 0.5 * d * h * math.cos(th), h * math.cos(th)],
+                [0.0, h, 0.0],
+            ]
+        )
+        X = X + np.array([d * math.cos(th), d * math.sin(th), w[k] * h])
+        if noise is not None:
+            P = G_x @ P @ G_x.T + G_u @ np.diag(noise[:, k]) @ G_u.T
+    return X, P
+
+
+# --- eq. 5 to 9 --------------------------------------------------------------------------------
+
+
+def test_integration_is_equations_7_to_9():
+    rng = np.random.default_rng(0)
+    v, w, dt = rng.normal(0.5, 1.0, 9), rng.normal(0.0, 2.0, 9), rng.uniform(0.01, 0.3, 9)
+    noise = rng.uniform(0.0, 0.1, (3, 9))
+    out = integrate(v, w, dt, noise[0], noise[1], noise[2], np.zeros(9))
+    X, P = chained(v, w, dt, noise)
+    np.testing.assert_allclose(out[0], X, rtol=1e-12)
+    np.testing.assert_allclose(out[1:4], P, rtol=1e-10, atol=1e-15)
+    np.testing.assert_array_equal(out[4], 0.0)
+
+
+def test_control_jacobian_is_that_of_the_midpoint_model():
+    v, w, dt = np.array([0.7, 1.1]), np.array([0.9, -1.3]), np.array([0.2, 0.3])
+    zero = np.zeros(2)
+
+    def moved(u):
+        return integrate(u[:2], u[2:], dt, zero, zero, zero, zero)[0]
+
+    J = central_differences(moved, np.concatenate([v, w]))
+    var = np.array([0.03, 0.05, 0.02, 0.04])
+    P = integrate(v, w, dt, var[:2], var[2:], zero, zero)[1:4]
+    # 1e-9 is what central differences leave
+    np.testing.assert_allclose(P, J @ np.diag(var) @ J.T, atol=1e-9)
+
+
+def test_bias_gain_is_the_derivative_by_the_gyros_bias():
+    rng = np.random.default_rng(1)
+    v, w, dt = rng.normal(0.5, 1.0, 7), rng.normal(0.0, 1.0, 7), rng.uniform(0.05, 0.3, 7)
+    gyro = np.array([1.0, 1.0, 0.0, 1.0, 0.0, 0.0, 1.0])
+    zero = np.zeros(7)
+
+    def moved(bias):
+        return integrate(v, w - gyro * bias[0], dt, zero, zero, zero, gyro)[0]
+
+    gain = central_differences(moved, np.zeros(1))[:, 0]
+    out = integrate(v, w, dt, zero, zero, zero, gyro)
+    np.testing.assert_allclose(out[4], gain, atol=1e-8)
+    assert abs(gain[2]) > 0.1
+
+
+def test_covariance_is_that_of_sampled_noise():
+    rng = np.random.default_rng(2)
+    n, samples = 10, 4000
+    v, w, dt = np.full(n, 1.0), np.full(n, 0.7), np.full(n, 0.1)
+    sigma = np.array([0.1, 0.05, 0.05])
+    P = integrate(v, w, dt, *(np.full(n, s * s) for s in sigma), np.zeros(n))[1:4]
+    noise = sigma[:, None, None] * rng.standard_normal((3, samples, n))
+    ends = np.zeros((samples, 3))
+    for k in range(n):
+        vk, wk, sk = v[k] + noise[0, :, k], w[k] + noise[1, :, k], noise[2, :, k]
+        th = ends[:, 2] + 0.5 * wk * dt[k]
+        ends[:, 0] += dt[k] * (vk * np.cos(th) - sk * np.sin(th))
+        ends[:, 1] += dt[k] * (vk * np.sin(th) + sk * np.cos(th))
+        ends[:, 2] += wk * dt[k]
+    # a sampled variance has a relative sigma of sqrt(2 / samples) = 2.2 %; four of them
+    L = np.linalg.inv(np.linalg.cholesky(P))
+    np.testing.assert_allclose(L @ np.cov(ends.T) @ L.T, np.eye(3), atol=0.09)
+
+
+def test_composition_is_the_integration_in_parts():
+    rng = np.random.default_rng(3)
+    rows = np.vstack(
+        [
+            rng.normal(0.5, 1.0, 8), rng.normal(0.0, 2.0, 8), rng.uniform(0.01, 0.3, 8),
+            rng.uniform(0.0, 0.1, (3, 8)), np.ones((1, 8)),
+        ]
+    )  # fmt: skip
+    parts = [integrate(*np.ascontiguousarray(r)) for r in (rows, rows[:, :3], rows[:, 3:])]
+    both, a, b = (Motion(p[0], p[1:4], True, p[4]) for p in parts)
+    c = compose_motion(a, b)
+    np.testing.assert_allclose(c.delta[:2], both.delta[:2], atol=1e-12)
+    assert abs(se2.wrap(c.delta[2] - both.delta[2])) < 1e-12
+    np.testing.assert_allclose(c.cov, both.cov, atol=1e-12)
+    np.testing.assert_allclose(c.bias_gain, both.bias_gain, atol=1e-12)
+
+
+def test_standing_still_is_the_identity_of_composition():
+    m = Motion(np.array([1.0, 0.2, 0.3]), np.diag([1.0, 2.0, 3.0]), bias_gain=np.arange(3.0))
+    for c in (compose_motion(STILL, m), compose_motion(m, STILL)):
+        np.testing.assert_allclose(c.delta, m.delta)
+        np.testing.assert_allclose(c.cov, m.cov)
+        np.testing.assert_allclose(c.bias_gain, m.bias_gain)
+    unknown = Motion(np.zeros(3), np.eye(3), known=False)
+    assert not compose_motion(m, unknown).known
+    assert not compose_motion(unknown, m).known
+
+
+# --- odometry ----------------------------------------------------------------------------------
+
+
+# the midpoint chord differs from the path by O((w dt)^2): 1e-5 at 50 Hz, 100 times that at 5 Hz
+@pytest.mark.parametrize(('rate', 'tolerance'), [(5, 5e-3), (20, 4e-4), (100, 2e-5)])
+def test_motion_follows_the_odometry_at_any_rate(rate, tolerance):
+    buffer = filled(rate=rate)
+    for start, end in [(0.0, 4.0), (0.4, 3.2), (1.0, 1.2)]:
+        m = buffer.motion(T0 + round(start * SECOND), T0 + round(end * SECOND))
+        expected = se2.between(path(start), path(end))
+        # a robot on wheels: the sideways part of the path is not in (v, omega)
+        assert np.abs(m.delta - expected)[2] < tolerance
+        assert m.known
+    arc = filled(line(0.9, 0.8), rate=rate)
+    m = arc.motion(T0 + 333 * MS, T0 + 2777 * MS)
+    np.testing.assert_allclose(m.delta, line(0.9, 0.8)(2.444), atol=tolerance)
+
+
+def test_covariance_does_not_depend_on_the_rates():
+    covs = [
+        filled(line(0.9, 0.5), rate=rate).motion(T0 + 500 * MS, T0 + 3500 * MS).cov
+        for rate in (10, 50, 200)
+    ]
+    # the chords of a coarser rate lie a little elsewhere
+    for cov in covs[1:]:
+        np.testing.assert_allclose(cov, covs[0], rtol=0.01, atol=1e-6)
+
+
+@pytest.mark.parametrize(('v', 'w'), [(0.9, 0.5), (-0.9, 0.5), (0.9, -0.5), (0.0, 0.4)])
+def test_variances_are_those_of_equation_6(v, w):
+    n = NOISE
+    duration = n.interval
+    m = filled(line(v, w)).motion(T0 + SECOND, T0 + SECOND + round(duration * SECOND))
+    # driving backwards does not cancel the noise floor
+    sigma_w = n.c * abs(w) + n.d
+    assert m.cov[2, 2] == pytest.approx((sigma_w * duration) ** 2, rel=1e-9)
+    sigma_v, lateral = n.a * abs(v) + n.b, n.lateral * abs(v)
+    # the turn and the heading's noise mix a little of one into the other
+    swing = abs(v) * duration * (sigma_w * duration)
+    assert m.cov[0, 0] == pytest.approx((sigma_v * duration) ** 2, rel=0.01)
+    assert m.cov[1, 1] == pytest.approx((lateral * duration) ** 2, abs=1.1 * swing**2 + 1e-7)
+
+
+def test_standing_robot_stays_where_it_is_almost_surely():
+    m = filled(lambda t: np.array([3.0, 4.0, 1.0])).motion(T0, T0 + SECOND)
+    np.testing.assert_array_equal(m.delta, 0.0)
+    moving = filled(line(0.01)).motion(T0, T0 + SECOND)
+    assert (np.diag(m.cov)[[0, 2]] < 0.02 * np.diag(moving.cov)[[0, 2]]).all()
+
+
+def test_intervals_compose():
+    buffer = filled(line(0.9, 0.6), imu=lambda t: 0.61)
+    a, b, c = T0 + 210 * MS, T0 + 1003 * MS, T0 + 2777 * MS
+    whole = buffer.motion(a, c)
+    parts = compose_motion(buffer.motion(a, b), buffer.motion(b, c))
+    np.testing.assert_allclose(parts.delta, whole.delta, atol=1e-6)
+    np.testing.assert_allclose(parts.cov, whole.cov, rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(parts.bias_gain, whole.bias_gain, atol=1e-5)
+
+
+def test_no_time_is_no_motion():
+    buffer = filled()
+    for end in (T0 + SECOND, T0):
+        m = buffer.motion(T0 + SECOND, end)
+        np.testing.assert_array_equal(m.delta, 0.0)
+        np.testing.assert_array_equal(m.cov, 0.0)
+
+
+def test_pose_at_interpolates_and_ends_where_odometry_ends():
+    buffer = filled(line(0.9, 0.8))
+    for t in (0.0, 0.02, 1.234, 4.0):
+        pose = buffer.pose_at(T0 + round(t * SECOND))
+        np.testing.assert_allclose(pose, line(0.9, 0.8)(t), atol=1e-9)
+    assert buffer.pose_at(T0 - 1) is None
+    assert buffer.pose_at(T0 + 4 * SECOND + 1) is None
+    assert buffer.covers(T0)
+    assert not buffer.covers(T0 + 5 * SECOND)
+
+
+# --- IMU ---------------------------------------------------------------------------------------
+
+
+def test_turn_rate_is_the_imus_where_there_is_one():
+    buffer = filled(line(1.0, 0.5), imu=lambda t: 0.7)
+    m = buffer.motion(T0 + SECOND, T0 + 2 * SECOND)
+    np.testing.assert_allclose(m.delta, line(1.0, 0.7)(1.0), atol=1e-4)
+    sigma = NOISE.imu_c * 0.7 + NOISE.imu_d
+    assert m.cov[2, 2] == pytest.approx(sigma**2 * NOISE.interval * 1.0, rel=1e-6)
+    assert m.bias_gain[2] == pytest.approx(-1.0)
+    # what wheels and IMU differ by is the bias, as well as both tell
+    assert m.bias == pytest.approx(0.2, rel=1e-6)
+    wheels = NOISE.c * 0.5 + NOISE.d
+    assert m.bias_var == pytest.approx((sigma**2 + wheels**2) * NOISE.interval, rel=1e-6)
+
+
+def test_without_an_imu_nothing_is_said_of_its_bias():
+    m = filled(line(1.0, 0.5)).motion(T0, T0 + SECOND)
+    np.testing.assert_array_equal(m.bias_gain, 0.0)
+    assert m.bias_var == math.inf
+
+
+def test_standing_wheels_show_the_bias_and_the_robot_does_not_turn():
+    m = filled(lambda t: np.zeros(3), imu=lambda t: 0.03).motion(T0 + SECOND, T0 + 2 * SECOND)
+    np.testing.assert_array_equal(m.delta, 0.0)
+    np.testing.assert_array_equal(m.bias_gain, 0.0)
+    assert m.bias == pytest.approx(0.03)
+    assert m.bias_var < 1e-4
+
+
+def test_gap_of_the_imu_is_bridged_by_the_wheels():
+    buffer = filled(line(1.0, 0.5), duration=10.0)
+    for t in (0.0, 1.0, 9.0, 9.5):
+        buffer.add_imu(Imu(T0 + round(t * SECOND), 0.7))
+    m = buffer.motion(T0 + 2 * SECOND, T0 + 3 * SECOND)
+    assert m.delta[2] == pytest.approx(0.5)
+    assert m.bias_gain[2] == 0.0
+
+
+# --- gaps, jumps, ends -------------------------------------------------------------------------
+
+
+def with_gap(gap):
+    buffer = filled(line(1.0), duration=2.0)
+    after = T0 + 2 * SECOND + round(gap * SECOND)
+    for k in range(50):
+        t = 2.0 + gap + k / 50
+        buffer.add_odometry(Odometry(after + k * 20 * MS, line(1.0)(t)))
+    return buffer
+
+
+def test_short_gap_is_interpolated_with_a_guess_of_when():
+    m = with_gap(1.0).motion(T0 + SECOND, T0 + round(3.5 * SECOND))
+    assert m.known
+    np.testing.assert_allclose(m.delta, [2.5, 0.0, 0.0], atol=1e-9)
+    whole = filled(line(1.0)).motion(T0 + SECOND, T0 + round(3.5 * SECOND))
+    assert m.cov[0, 0] > 2.0 * whole.cov[0, 0]
+
+
+def test_motion_across_a_long_gap_is_unknown_and_wide():
+    gap = NOISE.max_gap + 1.0
+    m = with_gap(gap).motion(T0 + 2 * SECOND, T0 + round((2.0 + gap) * SECOND))
+    assert not m.known
+    np.testing.assert_array_equal(m.delta, 0.0)
+    # a speed that is unknown anew in each interval; one that lasts would be gap^2
+    expected = (np.array([NOISE.max_speed, NOISE.max_speed, NOISE.max_turn_rate]) / 5.0) ** 2
+    np.testing.assert_allclose(np.diag(m.cov), expected * NOISE.interval * gap, rtol=1e-9)
+    longer = with_gap(gap).motion(T0 + SECOND, T0 + round((2.5 + gap) * SECOND))
+    assert not longer.known
+
+
+def test_one_sample_that_jumps_away_is_dropped():
+    buffer = filled(line(1.0), duration=1.0)
+    buffer.add_odometry(Odometry(T0 + 1020 * MS, np.array([500.0, 3.0, 1.0])))
+    for k in range(2, 50):
+        buffer.add_odometry(Odometry(T0 + 1000 * MS + k * 20 * MS, line(1.0)(1.0 + k / 50)))
+    m = buffer.motion(T0 + 500 * MS, T0 + 1500 * MS)
+    assert buffer.jumps == 1
+    assert m.known
+    np.testing.assert_allclose(m.delta, [1.0, 0.0, 0.0], atol=1e-9)
+
+
+def test_reset_odometry_is_followed_and_the_motion_across_unknown():
+    buffer = filled(line(1.0), duration=1.0)
+    far = np.array([500.0, 3.0, 1.0])
+    for k in range(1, 50):
+        pose = se2.compose(far, line(1.0)(k / 50))
+        buffer.add_odometry(Odometry(T0 + 1000 * MS + k * 20 * MS, pose))
+    across = buffer.motion(T0 + 900 * MS, T0 + 1200 * MS)
+    assert not across.known
+    assert np.hypot(*across.delta[:2]) < 0.4
+    after = buffer.motion(T0 + 1200 * MS, T0 + 1700 * MS)
+    assert after.known
+    np.testing.assert_allclose(after.delta, [0.5, 0.0, 0.0], atol=1e-9)
+
+
+def test_burst_of_stamps_is_no_jump():
+    buffer = filled(line(1.0), duration=1.0)
+    # 2 cm later by path, 50 us by stamp: a driver that sends what it held back
+    buffer.add_odometry(Odometry(T0 + SECOND + MS // 20, line(1.0)(1.02)))
+    assert buffer.jumps == 0
+    m = buffer.motion(T0 + 500 * MS, T0 + SECOND + MS // 20)
+    assert m.delta[0] == pytest.approx(0.52)
+    assert math.sqrt(m.cov[0, 0]) < 0.2
+
+
+def test_end_of_odometry_is_extrapolated_for_a_moment_only():
+    buffer = filled(line(1.0, 0.5), duration=2.0)
+    end = T0 + 2 * SECOND
+    m = buffer.extrapolate(end - SECOND, end + 100 * MS)
+    assert not m.known
+    np.testing.assert_allclose(m.delta, line(1.0, 0.5)(1.1), atol=1e-4)
+    covered = buffer.motion(end - SECOND, end)
+    assert (np.diag(m.cov) > np.diag(covered.cov)).all()
+    # after longer than that nobody knows: it counts as standing, within a wide covariance
+    m = buffer.extrapolate(end - SECOND, end + SECOND)
+    np.testing.assert_allclose(m.delta, covered.delta, atol=1e-9)
+    assert math.sqrt(np.linalg.eigvalsh(m.cov[:2, :2])[-1]) > NOISE.max_speed / 5.0
+
+
+def test_without_any_odometry_motion_is_unknown():
+    buffer = MotionBuffer(NOISE, 10.0)
+    assert buffer.newest is None
+    for m in (buffer.motion(T0, T0 + SECOND), buffer.extrapolate(T0, T0 + SECOND)):
+        assert not m.known
+        np.testing.assert_array_equal(m.delta, 0.0)
+        assert np.linalg.eigvalsh(m.cov).min() > 0.01
+
+
+def test_old_samples_are_forgotten():
+    buffer = filled(line(1.0), rate=100, duration=20.0, memory=2.0)
+    assert not buffer.covers(T0 + 10 * SECOND)
+    assert buffer.covers(T0 + 18 * SECOND)
+    m = buffer.motion(T0 + 18 * SECOND, T0 + 20 * SECOND)
+    assert m.known
+    np.testing.assert_allclose(m.delta, [2.0, 0.0, 0.0], atol=1e-9)
