@@ -32,7 +32,8 @@ from rlml_slam.types import Detections, Health, Level, Reflectors
 SCAN = ('scan', 'sensor_msgs/msg/LaserScan')
 DEEP = QoSProfile(depth=1000)  # of the small messages, none may be lost
 SENSOR = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
-LAST_MAP, PATIENCE = 1.5, 10.0  # [s] for the last map to come; for the last pose at most
+LAST_MAP = 1_500_000_000  # [ns] of the drive's end that the last published map may lack
+PATIENCE = 15.0  # [s] in which a busy machine may catch up with what was sent
 SETTLE = 1.0  # [s] in which two nodes that are there find each other
 FRAME_TIME = 'wall time of the last frame [ms]'
 NO_REFLECTORS = Reflectors(
@@ -180,13 +181,16 @@ class Recorder(Node):
         return now - self._heard if self._began is not None else 0.0
 
     def has_caught_up(self, since: float) -> bool:
-        """Whether the newest scan has its pose and the map was published after ``since``.
+        """Whether the newest scan has its pose, and the map holds all but the last LAST_MAP.
 
-        ``since`` is when the last scan was sent; after PATIENCE the answer is yes in any case.
+        ``since`` is when the source ended; after PATIENCE the answer is yes in any case.
         """
-        waited = time.monotonic() - since
-        answered = not self._sensor_heard or self.frames.stamps[-1:] >= [max(self._sensor_heard)]
-        return (answered and waited > LAST_MAP) or waited > PATIENCE
+        if time.monotonic() - since > PATIENCE:
+            return True
+        newest = max(self._sensor_heard, default=0)
+        mapped = self._path.stamps[-1] if len(self._path) else 0
+        answered = self.frames.stamps[-1] if self.frames.stamps else 0
+        return answered >= newest and mapped >= answered - LAST_MAP
 
     def note(self) -> str:
         """One line for the progress."""

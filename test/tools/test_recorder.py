@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import time
 
 import numpy as np
 import pytest
@@ -117,3 +118,20 @@ def test_health_and_inputs_are_those_of_the_diagnostics(recorder):
         'scan': {'used': 12, 'late': 1, 'invalid': 0},
         'odom': {'used': 40, 'late': 0, 'invalid': 0},
     }
+
+
+def test_recorder_waits_for_poses_and_for_the_map(recorder):
+    now = time.monotonic()
+    recorder.on_sensor(scan(10))
+    assert not recorder.has_caught_up(now)
+    answer = pose(10, 0.0)
+    answer.header.stamp.nanosec = 7
+    recorder.on_pose(answer)
+    assert not recorder.has_caught_up(now)
+    path = build.path(make, 1, 'map', [8 * SECOND], np.zeros((1, 3)))
+    recorder.on_trajectory(path)
+    assert not recorder.has_caught_up(now)
+    assert recorder.has_caught_up(now - 60.0)
+    path = build.path(make, 1, 'map', [9 * SECOND], np.zeros((1, 3)))
+    recorder.on_trajectory(path)
+    assert recorder.has_caught_up(now)
