@@ -15,6 +15,7 @@ from rlml_slam import __version__
 from rlml_slam.params import (
     CarrierParameters,
     DeformableParameters,
+    EkfParameters,
     Parameters,
     PlayerParameters,
     SimulatorParameters,
@@ -28,6 +29,7 @@ from rlml_slam.tools.config import FILES, parameter_file
 ROOT = Path(__file__).resolve().parents[1]
 ALL = (
     Parameters,
+    EkfParameters,
     DeformableParameters,
     SimulatorParameters,
     CarrierParameters,

@@ -19,6 +19,7 @@ from rlml_slam.params import (
     CarrierParameters,
     Declaration,
     DeformableParameters,
+    EkfParameters,
     Parameters,
     PlayerParameters,
     SimulatorParameters,
@@ -28,6 +29,7 @@ from rlml_slam.params import (
 
 AGGREGATES: tuple[type[Any], ...] = (
     Parameters,
+    EkfParameters,
     DeformableParameters,
     SimulatorParameters,
     CarrierParameters,

@@ -11,6 +11,7 @@ from rlml_slam.params import (
     CarrierParameters,
     Declaration,
     DeformableParameters,
+    EkfParameters,
     Parameters,
     SimulatorParameters,
     declarations,
@@ -20,6 +21,7 @@ FILES: dict[str, tuple[type[Any], str]] = {
     'default.yaml': (Parameters, 'Every parameter of front_end, back_end, slam and `rlml replay`'),
     'simulator.yaml': (SimulatorParameters, 'Every parameter of the simulator'),
     'deformable_slam.yaml': (DeformableParameters, 'Every parameter of deformable_slam'),
+    'ekf_slam.yaml': (EkfParameters, 'Every parameter of ekf_slam and `rlml replay --system ekf`'),
     'carrier_simulator.yaml': (CarrierParameters, 'Every parameter of carrier_simulator'),
 }
 
