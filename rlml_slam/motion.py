@@ -77,7 +77,17 @@ def compose_motion(first: Motion, second: Motion) -> Motion:
     J_a, J_b = se2.compose_jacobians(first.delta, second.delta)
     cov = J_a @ first.cov @ J_a.T + J_b @ second.cov @ J_b.T
     gain = J_a @ first.bias_gain + J_b @ second.bias_gain
-    return Motion(se2.compose(first.delta, second.delta), cov, first.known and second.known, gain)
+    # what the two say of the bias, weighted; the weight of one that says nothing is zero
+    weight = 1.0 / first.bias_var + 1.0 / second.bias_var
+    weighted = first.bias / first.bias_var + second.bias / second.bias_var
+    return Motion(
+        se2.compose(first.delta, second.delta),
+        cov,
+        first.known and second.known,
+        gain,
+        weighted / weight if weight > 0.0 else 0.0,
+        1.0 / weight if weight > 0.0 else math.inf,
+    )
 
 
 STILL = Motion(np.zeros(3), np.zeros((3, 3)))

@@ -136,12 +136,27 @@ def test_composition_is_the_integration_in_parts():
     np.testing.assert_allclose(c.bias_gain, both.bias_gain, atol=1e-12)
 
 
+def test_composition_weighs_what_its_parts_say_of_the_bias():
+    buffer = filled(line(1.0, 0.5), imu=lambda t: 0.6 + 0.1 * t)
+    a, b, c = T0 + SECOND, T0 + 1400 * MS, T0 + 3 * SECOND
+    whole = buffer.motion(a, c)
+    parts = compose_motion(buffer.motion(a, b), buffer.motion(b, c))
+    assert parts.bias == pytest.approx(whole.bias, rel=1e-9)
+    assert parts.bias_var == pytest.approx(whole.bias_var, rel=1e-9)
+    silent = Motion(np.zeros(3), np.zeros((3, 3)))
+    assert compose_motion(silent, silent).bias_var == math.inf
+
+
 def test_standing_still_is_the_identity_of_composition():
-    m = Motion(np.array([1.0, 0.2, 0.3]), np.diag([1.0, 2.0, 3.0]), bias_gain=np.arange(3.0))
+    m = Motion(
+        np.array([1.0, 0.2, 0.3]), np.diag([1.0, 2.0, 3.0]), True, np.arange(3.0), 0.01, 1e-4
+    )
     for c in (compose_motion(STILL, m), compose_motion(m, STILL)):
         np.testing.assert_allclose(c.delta, m.delta)
         np.testing.assert_allclose(c.cov, m.cov)
         np.testing.assert_allclose(c.bias_gain, m.bias_gain)
+        assert c.bias == pytest.approx(m.bias)
+        assert c.bias_var == pytest.approx(m.bias_var)
     unknown = Motion(np.zeros(3), np.eye(3), known=False)
     assert not compose_motion(m, unknown).known
     assert not compose_motion(unknown, m).known

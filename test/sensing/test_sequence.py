@@ -1,0 +1,352 @@
+# SPDX-License-Identifier: Apache-2.0
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rlml_slam import se2
+from rlml_slam.errors import InputError
+from rlml_slam.motion import SECOND, MotionBuffer
+from rlml_slam.params import Node, Parameters
+from rlml_slam.sensing.sequence import PAIRING, PERSISTENT, Sequencer
+from rlml_slam.types import Detections, Imu, Odometry, Scan
+
+MS = SECOND // 1000
+T0 = 10 * SECOND
+SPEED, TURN = 0.8, 0.3
+
+
+def pose_at(stamp):
+    t = (stamp - T0) / SECOND
+    return se2.exp(np.array([SPEED * t, 0.0, TURN * t]))
+
+
+def odometry(stamp):
+    return Odometry(stamp, pose_at(stamp))
+
+
+def scan(stamp, ranges=(2.0, 3.0, np.nan, 4.0), frame='laser', time_increment=0.0):
+    return Scan(
+        stamp, frame, -1.0, 0.5, time_increment, 0.1, 20.0,
+        np.array(ranges, dtype=np.float32), np.zeros(0, dtype=np.float32),
+    )  # fmt: skip
+
+
+def detections(stamp, points=((2.0, 1.0),), frame='laser'):
+    p = np.array(points, dtype=np.float64).reshape(-1, 2)
+    n = len(p)
+    cov = np.tile(np.diag([4e-4, 1e-4]), (n, 1, 1))
+    return Detections(stamp, frame, p, cov, np.full(n, -1), np.full(n, np.nan))
+
+
+def add(sequencer, message):
+    if isinstance(message, Odometry):
+        return sequencer.add_odometry(message)
+    if isinstance(message, Imu):
+        return sequencer.add_imu(message)
+    if isinstance(message, Scan):
+        return sequencer.add_scan(message)
+    return sequencer.add_detections(message)
+
+
+def feed(sequencer, inputs):
+    return [o for m in inputs for o in add(sequencer, m)]
+
+
+def running(until=T0 + 3 * SECOND, **node):
+    """A sequencer with 50 Hz of odometry, which is past its first second."""
+    sequencer = Sequencer(Parameters(node=Node(**node)))
+    feed(sequencer, [odometry(t) for t in range(T0, until + 1, 20 * MS)])
+    return sequencer, until
+
+
+def drive_inputs(seconds=3.0, imu=False):
+    """Odometry at 50 Hz, pairs of scan and detections at 10 Hz, in order of stamps."""
+    out = []
+    for k in range(round(seconds * 50)):
+        stamp = T0 + 20 * MS * k
+        out.append(odometry(stamp))
+        if imu:
+            out.append(Imu(stamp, TURN))
+        if k % 5 == 0:
+            out += [scan(stamp), detections(stamp)]
+    return out
+
+
+# --- order and pairing -------------------------------------------------------------------------
+
+
+def test_observations_come_in_order_of_stamps_once_each():
+    sequencer = Sequencer(Parameters())
+    out = feed(sequencer, drive_inputs()) + sequencer.flush()
+    stamps = [o.stamp for o in out]
+    assert stamps == list(range(T0, T0 + 3 * SECOND, 100 * MS))
+    for o in out:
+        assert o.points is not None
+        assert len(o.detections) == 1
+    assert sequencer.inputs.totals()['scan'] == {'used': 30}
+
+
+def test_order_of_arrival_does_not_matter_within_the_timeout():
+    rng = np.random.default_rng(0)
+    inputs = drive_inputs()
+    odom = [m for m in inputs if isinstance(m, Odometry)]
+    others = [m for m in inputs if not isinstance(m, Odometry)]
+    # odometry in time; the rest up to 80 ms late, in an order of its own
+    late = [(m.stamp + rng.uniform(0, 80 * MS), 1, k, m) for k, m in enumerate(others)]
+    merged = sorted([(m.stamp, 0, k, m) for k, m in enumerate(odom)] + late)
+    a, b = Sequencer(Parameters()), Sequencer(Parameters())
+    x = feed(a, inputs) + a.flush()
+    y = feed(b, [m for *_, m in merged]) + b.flush()
+    assert [o.stamp for o in x] == [o.stamp for o in y]
+    for p, q in zip(x, y, strict=True):
+        np.testing.assert_array_equal(p.motion.delta, q.motion.delta)
+        np.testing.assert_array_equal(p.points, q.points)
+        np.testing.assert_array_equal(p.detections.points, q.detections.points)
+
+
+def test_motion_is_that_between_the_stamps():
+    sequencer = Sequencer(Parameters())
+    out = feed(sequencer, drive_inputs()) + sequencer.flush()
+    np.testing.assert_array_equal(out[0].motion.delta, 0.0)
+    for a, b in itertools.pairwise(out[:-1]):
+        # midpoint chords of 20 ms: (w dt)^2 = 4e-5 of 8 cm
+        expected = se2.between(pose_at(a.stamp), pose_at(b.stamp))
+        np.testing.assert_allclose(b.motion.delta, expected, atol=1e-6)
+        assert b.motion.known
+        np.testing.assert_allclose(b.odom_pose, pose_at(b.stamp), atol=1e-12)
+
+
+@pytest.mark.parametrize('apart', [0, PAIRING])
+def test_scan_and_detections_of_one_instant_are_one_observation(apart):
+    sequencer, t = running()
+    t += 10 * MS
+    out = feed(sequencer, [scan(t), detections(t + apart), odometry(t + 20 * MS)])
+    (o,) = out
+    assert o.stamp == t
+    assert o.points is not None
+    assert o.detections is not None
+
+
+def test_stamps_farther_apart_are_two_observations():
+    sequencer, t = running()
+    inputs = [scan(t), detections(t + PAIRING + 1)]
+    inputs += [odometry(t + k * 20 * MS) for k in range(1, 30)]
+    a, b = feed(sequencer, inputs)
+    assert a.detections is None
+    assert b.points is None
+    assert b.stamp - a.stamp == PAIRING + 1
+
+
+def test_scan_waits_for_odometry_that_covers_its_last_ray():
+    sequencer, t = running()
+    sweep = 50 * MS
+    s = scan(t, ranges=np.full(100, 3.0), time_increment=sweep / 100 / SECOND)
+    assert feed(sequencer, [s, detections(t), odometry(t + 20 * MS), odometry(t + 40 * MS)]) == []
+    (o,) = add(sequencer, odometry(t + 60 * MS))
+    np.testing.assert_allclose(o.sweep, se2.between(pose_at(t), pose_at(t + sweep)), atol=1e-6)
+
+
+def test_lone_scan_waits_for_its_detections_only_if_they_use_to_come():
+    sequencer, t = running()
+    # never paired so far: scan by scan without delay
+    assert len(feed(sequencer, [scan(t), odometry(t + 20 * MS)])) == 1
+    t += 20 * MS
+    assert len(feed(sequencer, [scan(t), detections(t), odometry(t + 20 * MS)])) == 1
+    t += 20 * MS
+    # now they come in pairs: it waits, but not for ever
+    assert feed(sequencer, [scan(t), odometry(t + 20 * MS)]) == []
+    released = feed(sequencer, [odometry(t + k * 20 * MS) for k in range(2, 12)])
+    assert [o.stamp for o in released] == [t]
+
+
+def test_nothing_waits_longer_than_the_timeout():
+    sequencer, t = running(transform_timeout=0.2)
+    # odometry is gone; only scans come
+    out = feed(sequencer, [scan(t + k * 100 * MS) for k in range(1, 8)])
+    assert [o.stamp for o in out] == [t + k * 100 * MS for k in range(1, 5)]
+    assert sequencer.inputs.counts['scan']['waited_out'] == 4
+    assert not out[-1].motion.known
+    assert len(sequencer.flush()) == 3
+
+
+def test_without_odometry_scans_alone_go_through_after_a_second():
+    sequencer = Sequencer(Parameters())
+    inputs = [scan(T0 + k * 100 * MS) for k in range(30)]
+    out = feed(sequencer, inputs) + sequencer.flush()
+    assert len(out) == 30
+    assert all(not o.motion.known and o.odom_pose is None for o in out[1:])
+    sequencer = Sequencer(Parameters(node=Node(use_odom=False)))
+    out = feed(sequencer, [odometry(T0), *inputs]) + sequencer.flush()
+    assert len(out) == 30
+    assert 'odom' not in sequencer.inputs.counts
+
+
+def test_switched_off_inputs_are_not_used():
+    node = Node(use_imu=False, use_reflectors=False, use_scan=False)
+    sequencer = Sequencer(Parameters(node=node))
+    out = feed(sequencer, drive_inputs(imu=True)) + sequencer.flush()
+    assert len(out) == 30
+    assert all(o.points is None and o.scan is None and o.detections is None for o in out)
+    assert set(sequencer.inputs.counts) == {'odom', 'scan'}
+
+
+# --- bad input ---------------------------------------------------------------------------------
+
+
+def test_late_and_duplicate_inputs_are_counted_and_left_out():
+    sequencer, t = running()
+    t += 10 * MS
+    feed(sequencer, [scan(t), detections(t), odometry(t + 20 * MS)])
+    before = sequencer.buffer.newest
+    assert feed(sequencer, [scan(t), scan(t - 50 * MS), detections(t - 50 * MS)]) == []
+    assert feed(sequencer, [odometry(t + 20 * MS), odometry(t)]) == []
+    counts = sequencer.inputs.totals()
+    assert counts['scan'] == {'duplicate': 1, 'late': 1, 'used': 1}
+    assert counts['reflectors'] == {'late': 1, 'used': 1}
+    assert counts['odom']['duplicate'] == counts['odom']['late'] == 1
+    assert sequencer.buffer.newest == before
+
+
+@pytest.mark.parametrize(
+    ('stream', 'bad'),
+    [
+        ('odom', Odometry(T0 + 4 * SECOND, np.array([np.nan, 0.0, 0.0]))),
+        ('odom', Odometry(T0 + 4 * SECOND, np.array([0.0, 0.0]))),
+        ('odom', Odometry(-5, np.zeros(3))),
+        ('imu', Imu(T0 + 4 * SECOND, float('inf'))),
+        ('imu', Imu(0, 0.1)),
+        ('scan', scan(T0 + 4 * SECOND, ranges=())),
+        ('scan', replace(scan(T0 + 4 * SECOND), angle_min=float('nan'))),
+        ('scan', replace(scan(T0 + 4 * SECOND), angle_increment=0.0)),
+        ('scan', replace(scan(T0 + 4 * SECOND), time_increment=float('inf'))),
+        ('reflectors', detections(T0 + 4 * SECOND, ((np.nan, 1.0),))),
+        (
+            'reflectors',
+            replace(detections(T0 + 4 * SECOND), cov=np.full((1, 2, 2), np.inf)),
+        ),
+    ],
+)
+def test_invalid_input_is_counted_and_costs_nothing(stream, bad):
+    sequencer, t = running()
+    assert add(sequencer, bad) == []
+    assert sequencer.inputs.counts[stream]['invalid'] == 1
+    assert stream in sequencer.inputs.last_error
+    assert sequencer.flush() == []
+    (o,) = feed(sequencer, [scan(t), detections(t), odometry(t + 20 * MS)])
+    assert o.motion.known
+
+
+def test_scan_without_a_single_return_is_an_observation_without_points():
+    sequencer, t = running()
+    (o,) = feed(
+        sequencer, [scan(t, ranges=[np.nan, np.inf, -np.inf, 50.0]), detections(t),
+                    odometry(t + 20 * MS)],
+    )  # fmt: skip
+    assert o.points.shape == (0, 2)
+
+
+def test_unknown_frame_is_refused_and_named():
+    sequencer, t = running()
+    # the first frame gets the parameter's pose, another one has none
+    assert len(feed(sequencer, [scan(t), odometry(t + 20 * MS)])) == 1
+    assert feed(sequencer, [scan(t + 20 * MS, frame='attic')]) == []
+    assert sequencer.inputs.counts['scan']['invalid'] == 1
+    assert "'attic'" in sequencer.inputs.last_error
+    sequencer.set_sensor_pose('attic', np.zeros(3))
+    assert len(feed(sequencer, [scan(t + 20 * MS, frame='attic'), odometry(t + 40 * MS)])) == 1
+
+
+def test_detections_are_moved_from_their_sensor_to_the_base():
+    sequencer, t = running(use_scan=False)
+    T = np.array([0.5, 0.2, np.pi / 2])
+    sequencer.set_sensor_pose('mast', T)
+    far = ((2.0, 1.0), (300.0, 0.0))
+    (o,) = feed(sequencer, [detections(t, far, frame='mast')])
+    np.testing.assert_allclose(o.detections.points, [[-0.5, 2.2]], atol=1e-12)
+    np.testing.assert_allclose(o.detections.cov[0], np.diag([1e-4, 4e-4]), atol=1e-15)
+    assert o.detections.frame_id == 'base_link'
+    assert sequencer.inputs.counts['reflectors']['points_too_far'] == 1
+
+
+def test_single_stamps_far_ahead_are_left_out():
+    sequencer, t = running()
+    assert feed(sequencer, [odometry(t + 100 * SECOND), scan(t + 100 * SECOND)]) == []
+    assert sequencer.inputs.counts['odom']['future'] == 1
+    assert sequencer.inputs.counts['scan']['future'] == 1
+    (o,) = feed(sequencer, [scan(t), detections(t), odometry(t + 20 * MS)])
+    assert o.motion.known
+
+
+def test_clock_that_stays_ahead_is_followed():
+    sequencer, t = running()
+    ahead = t + 100 * SECOND
+    feed(sequencer, [odometry(ahead + k * 20 * MS) for k in range(100)])
+    assert sequencer.inputs.counts['odom']['future'] == PERSISTENT - 1
+    s = ahead + 50 * 20 * MS
+    out = feed(sequencer, [scan(s), detections(s), odometry(ahead + 2 * SECOND)])
+    assert [o.stamp for o in out] == [s]
+
+
+def test_clock_that_stays_back_is_an_error():
+    sequencer, t = running(until=T0 + 60 * SECOND)
+    feed(sequencer, [scan(t), odometry(t + 20 * MS)])
+    start = T0 + 20 * SECOND
+    for k in range(PERSISTENT - 1):
+        assert add(sequencer, odometry(start + k * 20 * MS)) == []
+    with pytest.raises(InputError, match=r'clock of odom jumped back by \d+'):
+        add(sequencer, odometry(start + SECOND))
+
+
+# --- long times without observations, and the end of odometry ----------------------------------
+
+
+@pytest.mark.parametrize('gap', [5.0, 31.0])
+def test_motion_carried_over_a_long_time_is_the_direct_motion(gap):
+    params = Parameters()
+    sequencer = Sequencer(params)
+    direct = MotionBuffer(params.motion, 1000.0)
+    first, last = T0 + 2 * SECOND, T0 + 2 * SECOND + round(gap * SECOND)
+    out = []
+    for stamp in range(T0, last + 100 * MS, 20 * MS):
+        direct.add_odometry(odometry(stamp))
+        out += add(sequencer, odometry(stamp))
+        if stamp in (first, last):
+            out += feed(sequencer, [scan(stamp), detections(stamp)])
+    _, b = out + sequencer.flush()
+    expected = direct.motion(first, last)
+    assert b.stamp == last
+    assert b.motion.known
+    np.testing.assert_allclose(b.motion.delta, expected.delta, atol=1e-6)
+    np.testing.assert_allclose(b.motion.cov, expected.cov, rtol=1e-6, atol=1e-9)
+
+
+def test_late_odometry_makes_the_extrapolation_good():
+    sequencer, t = running()
+    out = feed(sequencer, [scan(t), detections(t), odometry(t + 20 * MS)])
+    # odometry stalls while two scans come, then delivers what it held back
+    stamps = [t + 100 * MS, t + 200 * MS]
+    for s in stamps:
+        out += feed(sequencer, [scan(s), detections(s)])
+    out += feed(sequencer, [scan(t + 500 * MS), detections(t + 500 * MS)])
+    assert [o.stamp for o in out] == [t, *stamps]
+    assert not out[1].motion.known
+    assert not out[2].motion.known
+    out += feed(sequencer, [odometry(t + k * 20 * MS) for k in range(2, 27)])
+    assert len(out) == 4
+    total = np.zeros(3)
+    for o in out[1:]:
+        total = se2.compose(total, o.motion.delta)
+    # nothing is counted twice and nothing lost
+    expected = se2.between(pose_at(t), pose_at(t + 500 * MS))
+    np.testing.assert_allclose(total, expected, atol=1e-5)
+
+
+def test_imu_refines_the_motion_between_observations():
+    sequencer = Sequencer(Parameters())
+    out = feed(sequencer, drive_inputs(imu=True)) + sequencer.flush()
+    m = out[15].motion
+    assert m.bias_gain[2] == pytest.approx(-0.1)
+    assert m.bias == pytest.approx(0.0, abs=1e-9)
+    assert np.isfinite(m.bias_var)
