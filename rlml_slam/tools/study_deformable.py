@@ -5,14 +5,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import os
 import sys
 import time
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -23,8 +20,8 @@ from rlml_slam.deformable.experiment import CONTROLS, ROWS, Row
 from rlml_slam.deformable.replay_note import replay
 from rlml_slam.deformable.study import RowResult, concatenate, run_row, summarize
 from rlml_slam.errors import ParameterError, RlmlError
+from rlml_slam.tools.study_jobs import each
 
-Task: TypeAlias = tuple[Row, range]
 CHUNK = 50  # seeds per task: small enough for a moving bar, large enough to be worth sending
 
 
@@ -116,21 +113,10 @@ def run_study(rows: tuple[Row, ...], seeds: int, jobs: int) -> dict[Row, RowResu
         bar = progress.add_task('compiling', total=len(rows) * seeds)
         run_row(Row('straight', 'fixed', 'active'), range(1))  # fills the cache for all processes
         progress.update(bar, description='simulating')
-        for (row, part), result in _each(tasks, jobs):
+        for (row, part), result in each(run_row, tasks, jobs):
             parts[row][part.start] = result
             progress.advance(bar, len(part))
     return {row: concatenate(p for _, p in sorted(parts[row].items())) for row in rows}
-
-
-def _each(tasks: list[Task], jobs: int) -> Iterator[tuple[Task, RowResult]]:
-    """The results as they become ready, from this process where one is enough."""
-    if jobs == 1:
-        yield from ((task, run_row(*task)) for task in tasks)
-        return
-    context = multiprocessing.get_context('spawn')
-    with ProcessPoolExecutor(jobs, mp_context=context) as pool:
-        pending = {pool.submit(run_row, *task): task for task in tasks}
-        yield from ((pending[done], done.result()) for done in as_completed(pending))
 
 
 def _cores() -> int:

@@ -8,10 +8,8 @@ mean over time varies less than one sample does, so one sample's bounds hold for
 
 from __future__ import annotations
 
-import multiprocessing
 import time
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -28,6 +26,7 @@ from rlml_slam.deformable.window import CarrierVelocity, WindowEstimate
 from rlml_slam.params import Carrier, DeformableParameters
 from rlml_slam.se2 import Array, wrap
 from rlml_slam.simulation.carrier import CarrierStep, simulate_carrier, true_features
+from rlml_slam.tools.study_jobs import each
 from rlml_slam.types import Observation
 
 KINDS = ('train', 'conveyor')
@@ -114,13 +113,9 @@ def run_all(minutes: float, runs: int, ids: bool, jobs: int) -> dict[str, list[W
         console=Console(stderr=True),
     ) as progress:  # fmt: skip
         bar = progress.add_task('driving', total=len(tasks))
-        context = multiprocessing.get_context('spawn')
-        with ProcessPoolExecutor(jobs, mp_context=context) as pool:
-            pending = {pool.submit(run_window, *task): task for task in tasks}
-            for finished in as_completed(pending):
-                kind, _, seed, _ = pending[finished]
-                done[kind, seed] = finished.result()
-                progress.advance(bar)
+        for (kind, _, seed, _), run in each(run_window, tasks, jobs):
+            done[kind, seed] = run
+            progress.advance(bar)
     return {kind: [done[kind, seed] for seed in range(runs)] for kind in KINDS}
 
 

@@ -12,6 +12,7 @@ from rlml_slam.deformable.truth import simulate
 from rlml_slam.errors import FileFormatError, ParameterError
 from rlml_slam.tools import study_deformable
 from rlml_slam.tools import study_deformable_window as window_study
+from rlml_slam.tools.study_jobs import each
 
 NOTE = Path(__file__).parents[3] / 'shared' / 'data' / 'deformable-note'
 ACTIVE = 60
@@ -143,8 +144,8 @@ def test_command_prints_every_row(capsys):
 
 def test_other_processes_give_the_same_result():
     task = (ROWS[1], range(2))
-    ((_, here),) = study_deformable._each([task], 1)
-    ((_, there),) = study_deformable._each([task], 2)
+    ((_, here),) = each(run_row, [task], 1)
+    ((_, there),) = each(run_row, [task], 2)
     for a, b in zip(vars(here).values(), vars(there).values(), strict=True):
         np.testing.assert_array_equal(a, b)
 
