@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+from differences import central_differences
+
+from rlml_slam import se2
+from rlml_slam.matching.association import predict
+from rlml_slam.rlml.joint_state import ANCHORS, BIAS, LANDMARKS, JointState
+from rlml_slam.types import Motion
+
+
+def made(seed=0, landmarks=3, theta=0.4):
+    """A state with every correlation there can be."""
+    rng = np.random.default_rng(seed)
+    state = JointState(np.zeros(3), np.zeros((3, 3)), 0.02)
+    n = LANDMARKS + 2 * landmarks
+    state.x = rng.normal(0.0, 2.0, n)
+    state.x[2], state.x[BIAS] = theta, 0.01
+    for a in ANCHORS:
+        state.x[a + 2] = rng.uniform(-3.0, 3.0)
+    A = 0.05 * rng.standard_normal((n, n))
+    state.P = A @ A.T + 1e-4 * np.eye(n)
+    return state
+
+
+def motion(**kw):
+    cov = np.array([[4e-4, 1e-5, 2e-5], [1e-5, 2e-4, 1e-5], [2e-5, 1e-5, 3e-4]])
+    return Motion(np.array([0.3, -0.02, 0.2]), cov, True, np.array([0.01, -0.02, -0.1]), **kw)
+
+
+@pytest.mark.parametrize('theta', [0.0, 0.4, 3.1, -3.1])
+def test_prediction_is_that_of_a_dense_ekf(theta):
+    state = made(theta=theta)
+    x, P, m = state.x.copy(), state.P.copy(), motion()
+
+    def f(v):
+        out = v.copy()
+        out[:3] = se2.compose(v[:3], m.delta + m.bias_gain * v[BIAS])
+        return out
+
+    F = central_differences(f, x, angles=(2,))
+    _, G = se2.compose_jacobians(x[:3], m.delta + m.bias_gain * x[BIAS])
+    Q = np.zeros_like(P)
+    Q[:3, :3] = G @ m.cov @ G.T
+    Q[BIAS, BIAS] = 1e-6
+    state.predict(m, 1e-6)
+    np.testing.assert_allclose(state.x, f(x), atol=1e-12)
+    np.testing.assert_allclose(state.P, F @ P @ F.T + Q, atol=1e-8)
+
+
+def test_update_is_that_of_a_dense_ekf():
+    state = made(1)
+    x, P = state.x.copy(), state.P.copy()
+    index = np.array([2, 0])
+    R = np.diag([4e-4, 1e-4, 2e-4, 3e-4])
+    v = np.array([0.01, -0.02, 0.005, 0.01])
+
+    def h(y):
+        return predict(y[:3], y[LANDMARKS:].reshape(-1, 2)[index])[0].ravel()
+
+    H = central_differences(h, x)
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    keep = np.eye(len(x)) - K @ H
+    columns = state.active(index)
+    state.apply(columns, H[:, columns], R, v)
+    expected = x + K @ v
+    expected[2] = se2.wrap(expected[2])
+    np.testing.assert_allclose(state.x, expected, atol=1e-8)
+    # Joseph's form, which holds for any gain
+    np.testing.assert_allclose(state.P, keep @ P @ keep.T + K @ R @ K.T, atol=1e-9)
+    np.testing.assert_array_equal(state.P, state.P.T)
+    assert np.linalg.eigvalsh(state.P).min() > 0.0
+
+
+def test_bias_is_measured_as_a_scalar_and_an_outlier_is_not():
+    state = made(2)
+    x, P = state.x.copy(), state.P.copy()
+    m = motion(bias=0.03, bias_var=1e-3)
+    state._measure_bias(m.bias, m.bias_var)
+    K = P[:, BIAS] / (P[BIAS, BIAS] + 1e-3)
+    np.testing.assert_allclose(state.x, x + K * (0.03 - x[BIAS]), atol=1e-12)
+    np.testing.assert_allclose(state.P, P - np.outer(K, P[BIAS]), atol=1e-12)
+    x, P = state.x.copy(), state.P.copy()
+    state._measure_bias(5.0, 1e-3)
+    np.testing.assert_array_equal(state.x, x)
+    np.testing.assert_array_equal(state.P, P)
+
+
+def test_motion_that_tells_the_bias_changes_it():
+    silent, told = made(3), made(3)
+    silent.predict(motion(), 0.0)
+    told.predict(motion(bias=0.02, bias_var=1e-5), 0.0)
+    assert told.P[BIAS, BIAS] < silent.P[BIAS, BIAS]
+    assert abs(told.x[BIAS] - 0.02) < abs(silent.x[BIAS] - 0.02)
+
+
+def test_new_landmark_has_the_covariance_of_its_inverse_observation():
+    state = made(4)
+    x, P = state.x.copy(), state.P.copy()
+    z, R = np.array([3.0, -1.0]), np.array([[4e-4, 1e-4], [1e-4, 2e-4]])
+
+    def g(y):
+        return se2.transform(y[:3], z[None])[0]
+
+    G = central_differences(g, x)
+    rot = se2.rotation(x[2])
+    index = state.add_landmark(z, R)
+    assert index == 3
+    assert state.num_landmarks == 4
+    n = len(x)
+    np.testing.assert_allclose(state.landmarks()[3], g(x), atol=1e-12)
+    np.testing.assert_allclose(state.P[n:, :n], G @ P, atol=1e-8)
+    np.testing.assert_allclose(state.P[:n, n:], (G @ P).T, atol=1e-8)
+    np.testing.assert_allclose(state.P[n:, n:], G @ P @ G.T + rot @ R @ rot.T, atol=1e-8)
+    np.testing.assert_array_equal(state.P[:n, :n], P)
+
+
+def test_surveyed_landmark_is_independent_of_all():
+    state = made(5)
+    n = len(state.x)
+    assert state.fix_landmark(np.array([1.0, 2.0]), 1e-4 * np.eye(2)) == 3
+    np.testing.assert_array_equal(state.P[n:, :n], 0.0)
+    np.testing.assert_array_equal(state.landmark_covs()[3], 1e-4 * np.eye(2))
+    np.testing.assert_array_equal(state.landmarks()[3], [1.0, 2.0])
+
+
+def test_clone_is_the_pose_with_all_its_correlations():
+    state = made(6)
+    cov = np.diag([1e-4, 2e-4, 3e-6])
+    state.clone_pose(1, 0.5, cov)
+    a = slice(ANCHORS[1], ANCHORS[1] + 3)
+    np.testing.assert_allclose(state.anchor(1), se2.compose(state.pose, [0.0, 0.0, 0.5]))
+    # to turn on the spot has the identity as its derivative
+    np.testing.assert_array_equal(state.P[a, LANDMARKS:], state.P[:3, LANDMARKS:])
+    np.testing.assert_array_equal(state.P[a, :3], state.P[:3, :3])
+    np.testing.assert_allclose(state.P[a, a], state.P[:3, :3] + cov)
+    np.testing.assert_array_equal(state.P, state.P.T)
+    # the pose seen from its own clone is as uncertain as was added, and no more
+    D = np.zeros((3, len(state.x)))
+    D[:, :3], D[:, a] = np.eye(3), -np.eye(3)
+    np.testing.assert_allclose(D @ state.P @ D.T, cov, atol=1e-15)
+
+
+def test_moved_anchor_is_the_same_anchor():
+    state = made(7)
+    anchor = state.anchor(1)
+    s, t = (slice(a, a + 3) for a in (ANCHORS[1], ANCHORS[0]))
+    P = state.P.copy()
+    state.move_anchor(1, 0)
+    np.testing.assert_array_equal(state.anchor(0), anchor)
+    np.testing.assert_array_equal(state.P[t, t], P[s, s])
+    np.testing.assert_array_equal(state.P[t, LANDMARKS:], P[s, LANDMARKS:])
+    np.testing.assert_array_equal(state.P, state.P.T)
+
+
+def test_marginalisation_is_exact():
+    a, b = made(8, landmarks=4), made(8, landmarks=4)
+    keep = np.array([True, False, True, False])
+    rows = np.r_[0:LANDMARKS, LANDMARKS + np.array([0, 1, 4, 5])]
+    b.remove_landmarks(keep)
+    np.testing.assert_array_equal(b.x, a.x[rows])
+    np.testing.assert_array_equal(b.P, a.P[np.ix_(rows, rows)])
+    # and what is measured of the others afterwards gives the same with it and without
+    R, v = 1e-4 * np.eye(2), np.array([0.01, 0.02])
+    for state, k in ((a, 2), (b, 1)):
+        columns = state.active(np.array([k]))
+        _, J, Rt = predict(state.pose, state.landmarks()[k][None])
+        H = np.hstack([J[0], np.zeros((2, 3)), Rt])
+        state.apply(columns, H, R, v)
+    np.testing.assert_allclose(b.x, a.x[rows], atol=1e-12)
+    np.testing.assert_allclose(b.P, a.P[np.ix_(rows, rows)], atol=1e-12)
+
+
+def test_replacing_keeps_means_and_the_place_of_the_anchors():
+    state = made(9)
+    before = state.x.copy()
+    points = np.array([[1.0, 2.0], [3.0, 4.0]])
+    rng = np.random.default_rng(9)
+    A = 0.1 * rng.standard_normal((7, 7))
+    cov, anchor_cov = A @ A.T + 1e-4 * np.eye(7), np.diag([1e-4, 1e-4, 1e-6])
+    state.replace(points, cov, anchor_cov)
+    np.testing.assert_array_equal(state.x[:LANDMARKS], before[:LANDMARKS])
+    np.testing.assert_array_equal(state.landmarks(), points)
+    np.testing.assert_allclose(state.pose_and_landmarks_cov(), cov)
+    assert np.linalg.eigvalsh(state.P).min() > -1e-12
+    # the relative place of pose and anchor is known but for what was added
+    for a in ANCHORS:
+        J_x, J_a = se2.between_jacobians(state.x[:3], state.x[a : a + 3])
+        J = np.zeros((3, len(state.x)))
+        J[:, :3], J[:, a : a + 3] = J_x, J_a
+        np.testing.assert_allclose(J @ state.P @ J.T, J_a @ anchor_cov @ J_a.T, atol=1e-12)
+
+
+def test_widening_touches_the_pose_alone():
+    state = made(10)
+    P = state.P.copy()
+    state.widen(np.diag([0.1, 0.2, 0.3]))
+    P[:3, :3] += np.diag([0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(state.P, P)
