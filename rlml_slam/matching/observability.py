@@ -102,7 +102,8 @@ def information(submap: Submap, points: Array, pose: Array, params: ScanMatch) -
         np.ascontiguousarray(pose, dtype=np.float64),
     )  # fmt: skip
     # eigenvalues of metres and radians compare at the scan's own lever
-    lever = max(math.sqrt(H[2, 2] / max(H[0, 0] + H[1, 1], 1e-9)), 0.1)
+    # what is taken off for noise can exceed what there is: a diagonal may be negative
+    lever = max(math.sqrt(max(H[2, 2], 0.0) / max(H[0, 0] + H[1, 1], 1e-9)), 0.1)
     unit = np.array([1.0, 1.0, 1.0 / lever])
     values, axes = np.linalg.eigh(H * np.outer(unit, unit))
     values = np.maximum(values - OPEN * max(float(values[-1]), 0.0), 0.0)
