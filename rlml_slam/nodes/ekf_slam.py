@@ -11,17 +11,17 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from rlml_slam import se2, warm_up
+from rlml_slam import warm_up
 from rlml_slam.ekf.estimator import Estimator
-from rlml_slam.errors import MapError, RlmlError
+from rlml_slam.errors import RlmlError
 from rlml_slam.params import EkfParameters
 from rlml_slam.ros import convert
 from rlml_slam.ros.answers import FramePublisher
 from rlml_slam.ros.declare import declare
-from rlml_slam.ros.ekf_products import EkfProducts
+from rlml_slam.ros.ekf_products import EkfProducts, map_to_odom, save
 from rlml_slam.ros.feed import STREAMS
 from rlml_slam.ros.health import HealthPublisher
-from rlml_slam.ros.map_folder import MapFolder, SavedMap
+from rlml_slam.ros.map_folder import MapFolder
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensors import RELIABLE, Sensors, checked
 from rlml_slam.ros.tf import TransformPublisher
@@ -45,9 +45,8 @@ class EkfSlamNode(Node):
         self.tf = TransformPublisher(self)
         self.sensors = Sensors(self, self.params, STREAMS, self.process, self.restart)
         self.health = HealthPublisher(self, self.sensors)
-        self.create_subscription(
-            PoseWithCovarianceStamped, 'initialpose', checked(self, self.start_at), RELIABLE
-        )
+        start = checked(self, self.start_at)
+        self.create_subscription(PoseWithCovarianceStamped, 'initialpose', start, RELIABLE)
         self.create_service(Trigger, '~/save_map', self.save_map)
         self.create_service(Trigger, '~/reset', self.reset)
         self.restart()
@@ -57,19 +56,13 @@ class EkfSlamNode(Node):
         frame, n = self.estimator.process(observation), self.params.node
         self.answers.publish(frame)
         self.health.update(frame)
-        T_odom_base = observation.odom_pose
-        if T_odom_base is None:  # without odometry, odom is the map
-            T_odom_base = frame.T_map_base
-        T_map_odom = se2.compose(frame.T_map_base, se2.inverse(T_odom_base))
-        self.tf.publish(frame.stamp, (n.map_frame, n.odom_frame), T_map_odom)
-        if self.products.is_due(frame.stamp):
-            self.products.publish(self.estimator, frame.stamp)
+        self.tf.publish(frame.stamp, (n.map_frame, n.odom_frame), map_to_odom(frame))
+        self.products.update(self.estimator, frame.stamp)
 
     def start_at(self, msg: PoseWithCovarianceStamped) -> None:
         """Begin anew at a pose of the map."""
         start = convert.pose_estimate(msg, 'initialpose')
         self._begin(start.pose, start.cov)
-        self.get_logger().info(f'begins at {np.round(start.pose, 3).tolist()}')
 
     def restart(self) -> None:
         """Forget everything but a saved map."""
@@ -85,12 +78,8 @@ class EkfSlamNode(Node):
     def save_map(self, _request: Any, response: Any) -> Any:
         """Write landmarks and grid under map_file_name."""
         try:
-            saved = SavedMap(self.estimator.reflectors(), self.estimator.occupancy_grid())
-            if not len(saved.reflectors) and saved.grid is None:
-                raise MapError('there is no map yet')
-            path = self.folder.save(self.params.node.map_file_name, saved)
-            response.success = True
-            response.message = f'{path}: {len(saved.reflectors)} landmarks'
+            name = self.params.node.map_file_name
+            response.success, response.message = True, save(self.estimator, self.folder, name)
         except RlmlError as e:
             response.success, response.message = False, str(e)
         return response

@@ -6,13 +6,20 @@ from __future__ import annotations
 import time
 from typing import Any
 
+import numpy as np
+
+from rlml_slam import se2
 from rlml_slam.ekf.estimator import Estimator
+from rlml_slam.errors import MapError
 from rlml_slam.params import Node
 from rlml_slam.ros import build
 from rlml_slam.ros.associated import build_reflector_map
+from rlml_slam.ros.map_folder import MapFolder, SavedMap
 from rlml_slam.ros.markers import reflector_markers
 from rlml_slam.ros.messages import make_rclpy, rclpy_class
 from rlml_slam.ros.sensors import LATCHED
+from rlml_slam.se2 import Array
+from rlml_slam.types import Frame
 
 MAX_SHARE = 0.1  # of the time may be spent on pictures of the map, however large it grows
 TOPICS = {
@@ -42,6 +49,11 @@ class EkfProducts:
         """Whether the interval has passed."""
         return stamp >= self._next
 
+    def update(self, estimator: Estimator, stamp: int) -> None:
+        """Publish where it is time to."""
+        if self.is_due(stamp):
+            self.publish(estimator, stamp)
+
     def publish(self, estimator: Estimator, stamp: int) -> None:
         """Send everything that there is."""
         began = time.perf_counter()
@@ -58,3 +70,19 @@ class EkfProducts:
 
     def _send(self, topic: str, message: Any) -> None:
         self._publishers[topic].publish(message)
+
+
+def map_to_odom(frame: Frame) -> Array:
+    """T_map_odom (3,) at a frame; without odometry, odom is the map."""
+    T_odom_base = frame.observation.odom_pose
+    if T_odom_base is None:
+        return np.zeros(3)
+    return se2.compose(frame.T_map_base, se2.inverse(T_odom_base))
+
+
+def save(estimator: Estimator, folder: MapFolder, name: str) -> str:
+    """Write landmarks and grid as ``name``; what was written, in words. MapError without a map."""
+    saved = SavedMap(estimator.reflectors(), estimator.occupancy_grid())
+    if not len(saved.reflectors) and saved.grid is None:
+        raise MapError('there is no map yet')
+    return f'{folder.save(name, saved)}: {len(saved.reflectors)} landmarks'

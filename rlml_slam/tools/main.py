@@ -56,7 +56,14 @@ COMMANDS: Table = {
             'deformable': Command(
                 'study_deformable', 'deformable-feature SLAM: EKF against NLS over many seeds'
             ),
-            'lego': Command('study_lego', 'spikes and EKF on the LEGO robot among cylinders'),
+            'ekf': Command(
+                'study_ekf',
+                'RLML, the EKF with each extractor and dead reckoning on the same drives',
+            ),
+            'lego': Command(
+                'study_lego',
+                'spikes and EKF on the LEGO robot among cylinders: figures and a picture',
+            ),
         },
     ),
     'bench': Group(
