@@ -101,7 +101,7 @@ def _positions(system: System, poses: Array, landmarks: Array) -> bool:
             gx[variables[a]['scalar']] += w * (x - p['x'])
             gy[variables[a]['scalar']] += w * (y - p['y'])
             v[variables[a]['address']] += w
-    if factorise(fronts, entries, v, np.empty(size)) >= 0:
+    if factorise(fronts, entries, v, np.empty(size[0]), np.empty(size[1])) >= 0:
         return False
     for g in (gx, gy):
         solve_lower(fronts, entries, v, g)
@@ -140,7 +140,7 @@ def _headings(system: System, state: Array, landmarks: Array, shift: bool) -> bo
     if shift:
         _sightings(sightings, variables, state, landmarks, values, g)
     _priors(system.priors, variables, state, landmarks, values, g, shift)
-    if factorise(fronts, entries, values, np.empty(size)) >= 0:
+    if factorise(fronts, entries, values, np.empty(size[0]), np.empty(size[1])) >= 0:
         return False
     solve_lower(fronts, entries, values, g)
     solve_upper(fronts, entries, values, g)

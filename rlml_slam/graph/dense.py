@@ -62,18 +62,24 @@ def rank_update(
     for k in range(num):
         C0 = C[c + k * ldc + k : c + k * ldc + rows]
         b = a + k
-        for _ in range(depth // 2):
+        p = 0
+        while p + 3 < depth:
             A0 = A[b : b + rows - k]
             A1 = A[b + lda : b + lda + rows - k]
-            x0, x1 = A0[0], A1[0]
+            A2 = A[b + 2 * lda : b + 2 * lda + rows - k]
+            A3 = A[b + 3 * lda : b + 3 * lda + rows - k]
+            x0, x1, x2, x3 = A0[0], A1[0], A2[0], A3[0]
             for i in range(rows - k):
-                C0[i] -= x0 * A0[i] + x1 * A1[i]
-            b += 2 * lda
-        if depth % 2 == 1:
+                C0[i] -= (x0 * A0[i] + x1 * A1[i]) + (x2 * A2[i] + x3 * A3[i])
+            b += 4 * lda
+            p += 4
+        while p < depth:
             A0 = A[b : b + rows - k]
             x0 = A0[0]
             for i in range(rows - k):
                 C0[i] -= x0 * A0[i]
+            b += lda
+            p += 1
 
 
 @part
@@ -88,28 +94,72 @@ def partial_cholesky(F: Array, f: int, width: int, height: int, floor: Array) ->
         at = f + j * height + j
         rows = height - j
         rank_update(F, at, height, num, F, f + j, height, j, rows)
-        for k in range(num):
-            pivot = F[at + k * height + k]
-            if not pivot > floor[j + k]:
-                return False
-            L0 = F[at + k * height + k : at + k * height + rows]
-            scale = 1.0 / math.sqrt(pivot)
-            for i in range(rows - k):
-                L0[i] *= scale
-            for m in range(k + 1, num):
-                x = L0[m - k]
-                L1 = L0[m - k :]
-                C0 = F[at + m * height + m : at + m * height + rows]
-                for i in range(rows - m):
-                    C0[i] -= x * L1[i]
+        if not _pivots(F, at, height, num, floor, j):
+            return False
+        if num == 4:
+            _below_four(F, at, height, rows)
+        else:
+            for k in range(num):
+                L0 = F[at + k * height + num : at + k * height + rows]
+                for m in range(k):
+                    x = F[at + m * height + k]
+                    A0 = F[at + m * height + num : at + m * height + rows]
+                    for i in range(rows - num):
+                        L0[i] -= x * A0[i]
+                scale = 1.0 / F[at + k * height + k]
+                for i in range(rows - num):
+                    L0[i] *= scale
     return True
 
 
 @part
+def _pivots(F: Array, at: int, height: int, num: int, floor: Array, j: int) -> bool:
+    """Cholesky factor of the num by num block at ``at``; False if it is not definite."""
+    for k in range(num):
+        pivot = F[at + k * height + k]
+        if not pivot > floor[j + k]:
+            return False
+        root = math.sqrt(pivot)
+        F[at + k * height + k] = root
+        scale = 1.0 / root
+        for i in range(k + 1, num):
+            F[at + k * height + i] *= scale
+        for m in range(k + 1, num):
+            x = F[at + k * height + m]
+            for i in range(m, num):
+                F[at + m * height + i] -= x * F[at + k * height + i]
+    return True
+
+
+@part
+def _below_four(F: Array, at: int, height: int, rows: int) -> None:
+    """Rows below a factored four by four block: X becomes X L^-T, in one pass."""
+    r0, r1 = 1.0 / F[at], 1.0 / F[at + height + 1]
+    r2, r3 = 1.0 / F[at + 2 * height + 2], 1.0 / F[at + 3 * height + 3]
+    l10, l20, l30 = F[at + 1], F[at + 2], F[at + 3]
+    l21, l31, l32 = F[at + height + 2], F[at + height + 3], F[at + 2 * height + 3]
+    X0 = F[at + 4 : at + rows]
+    X1 = F[at + height + 4 : at + height + rows]
+    X2 = F[at + 2 * height + 4 : at + 2 * height + rows]
+    X3 = F[at + 3 * height + 4 : at + 3 * height + rows]
+    for i in range(rows - 4):
+        x0 = X0[i] * r0
+        x1 = (X1[i] - l10 * x0) * r1
+        x2 = (X2[i] - l20 * x0 - l21 * x1) * r2
+        X3[i] = (X3[i] - l30 * x0 - l31 * x1 - l32 * x2) * r3
+        X0[i] = x0
+        X1[i] = x1
+        X2[i] = x2
+
+
+@part
 def schur_update(F: Array, f: int, width: int, height: int, U: Array, u: int) -> None:
-    """U minus L21 L21^T for the rows below ``width`` of a factored front."""
+    """U = -L21 L21^T for the rows below ``width`` of a factored front."""
     size = height - width
     for j in range(0, size, 4):
         num = min(4, size - j)
         at = u + j * size + j
+        for k in range(num):
+            for i in range(at + k * size, at + k * size + size - j):
+                U[i] = 0.0
         rank_update(U, at, size, num, F, f + width + j, height, width, size - j)

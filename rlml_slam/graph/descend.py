@@ -67,7 +67,16 @@ class _State:
         values = self.system.values
         for _ in range(30):
             values[self.diagonal] += damping * scale
-            if factorise(self.system.fronts, self.system.entries, values, self.system.stack) < 0:
+            if (
+                factorise(
+                    self.system.fronts,
+                    self.system.entries,
+                    values,
+                    self.system.left,
+                    self.system.right,
+                )
+                < 0
+            ):
                 return damping
             damping = max(1e-8, 10.0 * damping)
             self.linearize()

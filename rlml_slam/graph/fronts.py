@@ -15,8 +15,12 @@ SINGULAR = 1e-14
 
 
 @part
-def lay_out(structure: Structure, dims: Ints) -> tuple[Records, Records, int]:
-    """(fronts, entries, size of the update stack) for ``dims`` (n,) rows per variable."""
+def lay_out(structure: Structure, dims: Ints) -> tuple[Records, Records, Ints]:
+    """(fronts, entries, sizes of the two stacks) for ``dims`` (n,) rows per variable.
+
+    A stack holds the update matrices of finished subtrees, those of children and of parents on
+    different sides: so a front is assembled from one side while it grows on the other.
+    """
     order, old_fronts, old_entries = structure.order, structure.fronts, structure.entries
     n, num = len(order), len(old_fronts) - 1
     offset = np.empty(n + 1, np.int64)
@@ -25,11 +29,13 @@ def lay_out(structure: Structure, dims: Ints) -> tuple[Records, Records, int]:
         offset[k + 1] = offset[k] + dims[order[k]]
     fronts = np.empty(num + 1, FRONT)
     entries = np.empty(len(old_entries), ENTRY)
-    pending = np.empty(num + 1, np.int64)
-    depth, top, stack, panel = 0, 0, 0, 0
+    pending = np.empty((2, num + 1), np.int64)
+    count, top, most = np.zeros(2, np.int64), np.zeros(2, np.int64), np.zeros(2, np.int64)
+    panel = 0
     for s in range(num + 1):
         first, start = old_fronts[s]['first'], old_fronts[s]['start']
-        fronts[s]['first'], fronts[s]['start'] = first, start
+        side = old_fronts[s]['side']
+        fronts[s]['first'], fronts[s]['start'], fronts[s]['side'] = first, start, side
         fronts[s]['parent'] = old_fronts[s]['parent']
         fronts[s]['panel'] = panel
         fronts[s]['width'] = fronts[s]['height'] = 0
@@ -47,18 +53,17 @@ def lay_out(structure: Structure, dims: Ints) -> tuple[Records, Records, int]:
         fronts[s]['width'] = width
         fronts[s]['height'] = row
         panel += width * row
-        # the stack holds the update matrices of finished subtrees
-        size = (row - width) * (row - width)
-        stack = max(stack, top + size)
-        while depth > 0 and fronts[pending[depth - 1]]['parent'] == s:
-            depth -= 1
-            c = pending[depth]
+        top[side] += (row - width) * (row - width)
+        most[side] = max(most[side], top[side])
+        pending[side, count[side]] = s
+        count[side] += 1
+        side = 1 - side
+        while count[side] > 0 and fronts[pending[side, count[side] - 1]]['parent'] == s:
+            count[side] -= 1
+            c = pending[side, count[side]]
             below = fronts[c]['height'] - fronts[c]['width']
-            top -= below * below
-        pending[depth] = s
-        depth += 1
-        top += size
-    return fronts, entries, stack
+            top[side] -= below * below
+    return fronts, entries, most
 
 
 @part
@@ -71,89 +76,102 @@ def highest(fronts: Records) -> int:
 
 
 @kernel
-def factorise(fronts: Records, entries: Records, values: Array, stack: Array) -> int:
-    """Cholesky factor in place of the matrix in ``values``; -1, or the supernode that failed."""
+def factorise(fronts: Records, entries: Records, values: Array, left: Array, right: Array) -> int:
+    """Cholesky factor in place of the matrix in ``values``; -1, or the supernode that failed.
+
+    ``left`` and ``right`` are memory of the sizes that lay_out tells.
+    """
     num = len(fronts) - 1
-    pending = np.empty(num + 1, np.int64)
-    base = np.empty(num + 1, np.int64)
+    pending = np.empty((2, num + 1), np.int64)
+    base = np.empty((2, num + 1), np.int64)
+    count, top = np.zeros(2, np.int64), np.zeros(2, np.int64)
     most = highest(fronts)
     floor = np.empty(most)
-    run_from = np.empty(most + 1, np.int64)
-    run_to = np.empty(most + 1, np.int64)
-    depth, top = 0, 0
+    runs = np.empty((2, most + 1), np.int64)
     for s in range(num):
         width, height, at = fronts[s]['width'], fronts[s]['height'], fronts[s]['panel']
         size = height - width
         for j in range(width):
             floor[j] = SINGULAR * values[at + j * (height + 1)]
-        for i in range(top, top + size * size):
-            stack[i] = 0.0
-        bottom = top
-        while depth > 0 and fronts[pending[depth - 1]]['parent'] == s:
-            depth -= 1
-            bottom = base[depth]
-            runs = _runs(fronts, entries, pending[depth], s, run_from, run_to)
-            _extend_add(stack, bottom, run_from, run_to, runs, values, at, width, height, top)
+        side = fronts[s]['side']
+        mine, theirs = (left, right) if side == 0 else (right, left)
+        other, u = 1 - side, top[side]
+        child = count[other] - 1
+        while child >= 0 and fronts[pending[other, child]]['parent'] == s:
+            num_runs = _runs(fronts, entries, pending[other, child], s, runs)
+            _extend_panel(theirs, base[other, child], runs, num_runs, values, at, width, height)
+            child -= 1
         if not partial_cholesky(values, at, width, height, floor):
             return s
-        if size > 0:
-            schur_update(values, at, width, height, stack, top)
-            if bottom < top:
-                for i in range(size * size):
-                    stack[bottom + i] = stack[top + i]
-        pending[depth] = s
-        base[depth] = bottom
-        depth += 1
-        top = bottom + size * size
+        schur_update(values, at, width, height, mine, u)
+        for c in range(count[other] - 1, child, -1):
+            num_runs = _runs(fronts, entries, pending[other, c], s, runs)
+            _extend_below(theirs, base[other, c], runs, num_runs, mine, u, width, size)
+            top[other] = base[other, c]
+        count[other] = child + 1
+        pending[side, count[side]] = s
+        base[side, count[side]] = u
+        count[side] += 1
+        top[side] = u + size * size
     return -1
 
 
 @part
-def _runs(fronts: Records, entries: Records, c: int, s: int, run_from: Ints, run_to: Ints) -> int:
+def _runs(fronts: Records, entries: Records, c: int, s: int, runs: Ints) -> int:
     """Rows below the pivots of front c that stay together in its parent s: number of runs.
 
-    Run r takes rows run_from[r]:run_from[r + 1] of the update matrix to row run_to[r] of s.
+    Run r takes rows runs[0, r]:runs[0, r + 1] of the update matrix to row runs[1, r] of s.
     """
     begin, end = fronts[c]['start'], fronts[c + 1]['start']
     width, start = fronts[c]['width'], fronts[s]['start']
-    runs, next_to = 0, -1
+    num, next_to = 0, -1
     for p in range(begin + fronts[c + 1]['first'] - fronts[c]['first'], end):
         to = entries[start + entries[p]['above']]['local']
         local = entries[p]['local']
         if to != next_to:
-            run_from[runs] = local - width
-            run_to[runs] = to
-            runs += 1
+            runs[0, num] = local - width
+            runs[1, num] = to
+            num += 1
         after = entries[p + 1]['local'] if p + 1 < end else fronts[c]['height']
         next_to = to + after - local
-    run_from[runs] = fronts[c]['height'] - width
-    return runs
+    runs[0, num] = fronts[c]['height'] - width
+    return num
 
 
 @part
-def _extend_add(
-    stack: Array, c: int, run_from: Ints, run_to: Ints, runs: int,
-    values: Array, at: int, width: int, height: int, u: int,
-) -> None:  # fmt: skip
-    """Add the update matrix of a child at stack[c] to the panel at values[at] and to stack[u]."""
-    size = run_from[runs]
-    below = height - width
-    for r in range(runs):
-        for i in range(run_from[r], run_from[r + 1]):
-            column = run_to[r] + i - run_from[r]
-            for q in range(r, runs):
-                a = i if q == r else run_from[q]
-                length = run_from[q + 1] - a
-                row = run_to[q] + a - run_from[q]
-                source = stack[c + i * size + a : c + i * size + a + length]
-                if column < width:
-                    b = at + column * height + row
-                    target = values[b : b + length]
-                else:
-                    b = u + (column - width) * below + row - width
-                    target = stack[b : b + length]
-                for k in range(length):
-                    target[k] += source[k]
+def _extend_panel(
+    stack: Array, c: int, runs: Ints, num: int, values: Array, at: int, width: int, height: int
+) -> None:
+    """Add the columns of a child's update matrix that are pivots here to the panel."""
+    size = runs[0, num]
+    for r in range(num):
+        if runs[1, r] >= width:
+            break
+        last = min(runs[0, r + 1], runs[0, r] + width - runs[1, r])
+        for i in range(runs[0, r], last):
+            column = at + (runs[1, r] + i - runs[0, r]) * height
+            for q in range(r, num):
+                a = i if q == r else runs[0, q]
+                b = column + runs[1, q] + a - runs[0, q]
+                for k in range(runs[0, q + 1] - a):
+                    values[b + k] += stack[c + i * size + a + k]
+
+
+@part
+def _extend_below(
+    stack: Array, c: int, runs: Ints, num: int, target: Array, u: int, width: int, below: int
+) -> None:
+    """Add the other columns of a child's update matrix to the update matrix here."""
+    size = runs[0, num]
+    for r in range(num):
+        first = max(runs[0, r], runs[0, r] + width - runs[1, r])
+        for i in range(first, runs[0, r + 1]):
+            column = u + (runs[1, r] + i - runs[0, r] - width) * below - width
+            for q in range(r, num):
+                a = i if q == r else runs[0, q]
+                b = column + runs[1, q] + a - runs[0, q]
+                for k in range(runs[0, q + 1] - a):
+                    target[b + k] += stack[c + i * size + a + k]
 
 
 @part

@@ -86,7 +86,11 @@ def gauss_newton(
                 misses += 1
         if misses > PATIENCE or not math.isfinite(cost):
             break
-        if fresh and factorise(system.fronts, system.entries, system.values, system.stack) >= 0:
+        if (
+            fresh
+            and factorise(system.fronts, system.entries, system.values, system.left, system.right)
+            >= 0
+        ):
             break
         before = promised
         promised = newton_step(system)

@@ -28,7 +28,7 @@ class Marginals:
     def __init__(self, graph: Graph) -> None:
         self._system = system = system_of(graph)
         linearize(system, graph.poses, graph.landmarks, True)
-        failed = factorise(system.fronts, system.entries, system.values, system.stack)
+        failed = factorise(system.fronts, system.entries, system.values, system.left, system.right)
         num_poses = len(graph.poses)
         if failed >= 0:
             node = int(system.variables[system.structure.order[system.fronts[failed]['first']]][0])

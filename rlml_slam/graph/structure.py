@@ -20,9 +20,12 @@ Ints = NDArray[np.int64]
 Records = NDArray[np.void]
 
 # A supernode: it owns the positions from ``first`` to the next one's; its front is the entries
-# from ``start`` to the next one's; ``parent`` or -1. The panel of its ``width`` own columns of
-# ``height`` rows lies at ``panel`` of the values, column by column. A last record closes the rows.
-FRONT = np.dtype([(k, np.int64) for k in ('first', 'start', 'parent', 'width', 'height', 'panel')])
+# from ``start`` to the next one's; ``parent`` or -1; ``side`` 0 or 1 alternates from parent to
+# child. The panel of its ``width`` own columns of ``height`` rows lies at ``panel`` of the values,
+# column by column. A last record closes the rows.
+FRONT = np.dtype(
+    [(k, np.int64) for k in ('first', 'start', 'parent', 'side', 'width', 'height', 'panel')]
+)
 
 # A block row of a front, own ones first and all ascending: its ``position`` in the elimination
 # order, the entry of the parent's front that is ``above`` it (-1 for own ones), its first row in
@@ -199,10 +202,10 @@ def _merge(parent: Ints, count: Ints, order: Ints, dims: Ints) -> Ints:
         new = zeros[k] + zeros[up] + cols[k] * (rows[up] + cols[k] - rows[k])
         share = new / (wide * (rows[up] + cols[k]))
         if (
-            wide <= 12
-            or (wide <= 48 and share < 0.4)
-            or (wide <= 96 and share < 0.15)
-            or share < 0.05
+            (wide <= 16 and share < 0.45)
+            or (wide <= 48 and share < 0.2)
+            or (wide <= 96 and share < 0.08)
+            or share < 0.03
         ):
             last[k] = up
             cols[up] = wide
@@ -247,10 +250,12 @@ def supernodes(
     begin, front = _fronts(start, neighbours, new_order, position, owner, first, up)
     above, entry = _entries(begin, front, first, up, owner, position, pairs)
     fronts = np.empty(num + 1, FRONT)
-    for s in range(num + 1):
+    for s in range(num, -1, -1):
         fronts[s]['first'] = first[s]
         fronts[s]['start'] = begin[s]
-        fronts[s]['parent'] = up[s] if s < num else -1
+        above_s = up[s] if s < num else -1
+        fronts[s]['parent'] = above_s
+        fronts[s]['side'] = 1 - fronts[above_s]['side'] if above_s >= 0 else 0
     entries = np.empty(len(front), ENTRY)
     for p in range(len(front)):
         entries[p]['position'] = front[p]

@@ -78,8 +78,8 @@ class Tables(NamedTuple):
 class System(NamedTuple):
     """Variables, packed factors, symbolic structure and memory of the normal equations.
 
-    ``values`` holds the panels, ``stack`` the update matrices, ``g`` and ``step`` (rows,) a
-    gradient and a step in the order of elimination.
+    ``values`` holds the panels, ``left`` and ``right`` the update matrices, ``g`` and ``step``
+    (rows,) a gradient and a step in the order of elimination.
     """
 
     variables: Records
@@ -91,7 +91,8 @@ class System(NamedTuple):
     fronts: Records
     entries: Records
     values: Array
-    stack: Array
+    left: Array
+    right: Array
     g: Array
     step: Array
 
@@ -141,10 +142,11 @@ def set_up(tables: Tables) -> tuple[int, System]:
     rows = 0
     for a in range(num):
         rows += dims[a]
+    values = np.empty(fronts[len(fronts) - 1]['panel'])
+    left, right = np.empty(stack[0]), np.empty(stack[1])
     return loose, System(
         variables, edges, sightings, priors, tables.losses, structure, fronts, entries,
-        np.empty(fronts[len(fronts) - 1]['panel']), np.empty(stack), np.empty(rows),
-        np.empty(rows),
+        values, left, right, np.empty(rows), np.empty(rows),
     )  # fmt: skip
 
 

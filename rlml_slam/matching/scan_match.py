@@ -30,9 +30,10 @@ ROBUST = 0.6  # e at which the Geman-McClure weight has fallen to a quarter
 class ScanTerm:
     """The scan term at one pose: cost = sum rho(e_k), unit variance (divide by sigma_s^2).
 
-    ``gradient`` (3,) = J^T W e and ``hessian`` (3, 3) = J^T W J (Gauss-Newton), so the step is
-    -H^-1 g; ``cost`` is half the weighted sum of squares. ``score`` is the mean of M over all end
-    points (0..1), ``inliers`` the number of end points with M > INLIER, ``count`` all of them.
+    ``gradient`` (3,) = J^T W e; ``hessian`` (3, 3) = J^T W J plus the curvature of M where it is
+    downward (on the ridge of a wall), so the step is -H^-1 g; ``cost`` is half the weighted sum
+    of squares. ``score`` is the mean of M over all end points (0..1), ``inliers`` the number of
+    end points with M > INLIER, ``count`` all of them.
     """
 
     cost: float
@@ -79,18 +80,35 @@ def spline_slope(t: float) -> tuple[float, float, float, float]:
 
 
 @kernel
+def spline_curve(t: float) -> tuple[float, float, float, float]:
+    """Second derivative of spline() with respect to t."""
+    return 1.0 - t, 3.0 * t - 2.0, 1.0 - 3.0 * t, t
+
+
+@kernel
 def sample(values: NDArray[np.uint16], column: float, row: float) -> tuple[float, float, float]:
     """M and its slope (dM/dcolumn, dM/drow) [1/cell] at a place in cells from values[0, 0]."""
+    m, m_u, m_v, _, _, _ = sample_curved(values, column, row)
+    return m, m_u, m_v
+
+
+@kernel
+def sample_curved(
+    values: NDArray[np.uint16], column: float, row: float
+) -> tuple[float, float, float, float, float, float]:
+    """M, its slope as sample(), and its second derivatives (uu, uv, vv) [1/cell^2]."""
     u, v = column - 0.5, row - 0.5  # a cell's value is that of its centre
     j, i = int(np.floor(u)), int(np.floor(v))
     if j < 1 or i < 1 or j + 2 >= values.shape[1] or i + 2 >= values.shape[0]:
-        return UNKNOWN, 0.0, 0.0
+        return UNKNOWN, 0.0, 0.0, 0.0, 0.0, 0.0
     tu, tv = u - j, v - i
     a0, a1, a2, a3 = spline(tu)
     d0, d1, d2, d3 = spline_slope(tu)
+    f0, f1, f2, f3 = spline_curve(tu)
     b = spline(tv)
     c = spline_slope(tv)
-    m = m_u = m_v = 0.0
+    g = spline_curve(tv)
+    m = m_u = m_v = m_uu = m_uv = m_vv = 0.0
     for r in range(4):
         p0 = cell(values[i - 1 + r, j - 1])
         p1 = cell(values[i - 1 + r, j])
@@ -101,7 +119,10 @@ def sample(values: NDArray[np.uint16], column: float, row: float) -> tuple[float
         m += b[r] * along
         m_u += b[r] * slope
         m_v += c[r] * along
-    return m, m_u, m_v
+        m_uu += b[r] * (f0 * p0 + f1 * p1 + f2 * p2 + f3 * p3)
+        m_uv += c[r] * slope
+        m_vv += g[r] * along
+    return m, m_u, m_v, m_uu, m_uv, m_vv
 
 
 @kernel
@@ -121,7 +142,11 @@ def accumulate(
     pose: Array,
     out: Array,
 ) -> None:
-    """Scan term into ``out`` (12,): cost, g (3), H upper triangle (6), sum of M, inliers."""
+    """Scan term into ``out`` (12,): cost, g (3), H upper triangle (6), sum of M, inliers.
+
+    H is Newton's, made positive semidefinite point by point: with e far from 0 even at the
+    optimum, J^T J alone misses most of the curvature on the ridge, and steps overshoot.
+    """
     out[:] = 0.0
     x, y = pose[0], pose[1]
     c, s = np.cos(pose[2]), np.sin(pose[2])
@@ -129,29 +154,55 @@ def accumulate(
     for k in range(len(points)):
         px, py = points[k, 0], points[k, 1]
         rx, ry = c * px - s * py, s * px + c * py
-        m, m_u, m_v = sample(values, (x + rx) * scale - corner_j, (y + ry) * scale - corner_i)
+        m, m_u, m_v, m_uu, m_uv, m_vv = sample_curved(
+            values, (x + rx) * scale - corner_j, (y + ry) * scale - corner_i
+        )
         e = 1.0 - m
         # Geman-McClure: rho = e^2 / (1 + e^2/k^2), weight = (1 + e^2/k^2)^-2
         q = 1.0 / (1.0 + e * e / k2)
         w = q * q
-        # slope in the base frame, through the end point's constraint, and back
-        gx, gy = -(c * m_u + s * m_v) * scale, -(c * m_v - s * m_u) * scale
-        hx = constraints[k, 0] * gx + constraints[k, 1] * gy
-        hy = constraints[k, 1] * gx + constraints[k, 2] * gy
-        jx, jy = c * hx - s * hy, s * hx + c * hy
-        jt = -ry * jx + rx * jy
+        # the end point's constraint in the submap frame: P = R C R^T
+        a, b, d = constraints[k, 0], constraints[k, 1], constraints[k, 2]
+        p_xx = c * c * a - 2.0 * c * s * b + s * s * d
+        p_xy = c * s * (a - d) + (c * c - s * s) * b
+        p_yy = s * s * a + 2.0 * c * s * b + c * c * d
+        jx, jy = -(p_xx * m_u + p_xy * m_v) * scale, -(p_xy * m_u + p_yy * m_v) * scale
+        n_xx, n_xy, n_yy = downward(
+            p_xx * p_xx * m_uu + 2.0 * p_xx * p_xy * m_uv + p_xy * p_xy * m_vv,
+            p_xx * p_xy * m_uu + (p_xx * p_yy + p_xy * p_xy) * m_uv + p_xy * p_yy * m_vv,
+            p_xy * p_xy * m_uu + 2.0 * p_xy * p_yy * m_uv + p_yy * p_yy * m_vv,
+        )
+        bend = e * scale * scale
+        h_xx, h_xy = w * (jx * jx + bend * n_xx), w * (jx * jy + bend * n_xy)
+        h_yy = w * (jy * jy + bend * n_yy)
+        # d(x + R p)/d(x, y, theta) = [I, (-ry, rx)]
+        h_xt, h_yt = -ry * h_xx + rx * h_xy, -ry * h_xy + rx * h_yy
         out[0] += 0.5 * e * e * q
         out[1] += w * jx * e
         out[2] += w * jy * e
-        out[3] += w * jt * e
-        out[4] += w * jx * jx
-        out[5] += w * jx * jy
-        out[6] += w * jx * jt
-        out[7] += w * jy * jy
-        out[8] += w * jy * jt
-        out[9] += w * jt * jt
+        out[3] += w * (-ry * jx + rx * jy) * e
+        out[4] += h_xx
+        out[5] += h_xy
+        out[6] += h_xt
+        out[7] += h_yy
+        out[8] += h_yt
+        out[9] += -ry * h_xt + rx * h_yt
         out[10] += m
         out[11] += m > INLIER
+
+
+@kernel
+def downward(a: float, b: float, d: float) -> tuple[float, float, float]:
+    """The positive semidefinite part of -[[a, b], [b, d]], as (a, b, d)."""
+    mean, half = 0.5 * (a + d), 0.5 * (a - d)
+    root = np.sqrt(half * half + b * b)
+    low, high = mean - root, mean + root
+    if low >= 0.0:
+        return 0.0, 0.0, 0.0
+    if high <= 0.0:
+        return -a, -b, -d
+    f = -low / (high - low)
+    return f * (high - a), -f * b, f * (high - d)
 
 
 def linearize(submap: Submap, points: Array, pose: Array) -> ScanTerm:

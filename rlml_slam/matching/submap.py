@@ -21,7 +21,7 @@ from rlml_slam.errors import InputError
 from rlml_slam.matching import surfaces
 from rlml_slam.se2 import Array
 
-P_MIN, P_MAX = 0.1, 0.9
+P_MIN, P_MAX = 0.1, 0.97
 LEVELS = 32767
 STEP = (P_MAX - P_MIN) / (LEVELS - 1)
 MARGIN = 64  # cells of slack when a grid grows, and of free border that kernels may read
@@ -207,7 +207,11 @@ def carve_ray(
     touched: NDArray[np.int64],
     n: int,
 ) -> int:
-    """Miss every cell from (x0, y0) to (x1, y1) [cells], the last one excluded (Amanatides)."""
+    """Miss the cells from (x0, y0) to (x1, y1) [cells], the last two excluded (Amanatides).
+
+    The cell before the end point's is not known to be free: the wall's noise reaches into it, and
+    beams that graze the wall would wear off its near side.
+    """
     j, i = int(np.floor(x0)), int(np.floor(y0))
     dx, dy = x1 - x0, y1 - y0
     left = abs(int(np.floor(x1)) - j) + abs(int(np.floor(y1)) - i)
@@ -218,7 +222,7 @@ def carve_ray(
     next_j = ((j + 1 - x0) if dx > 0 else (x0 - j)) * per_j if dx != 0 else np.inf
     next_i = ((i + 1 - y0) if dy > 0 else (y0 - i)) * per_i if dy != 0 else np.inf
     cell = i * columns + j
-    for _ in range(left):
+    for _ in range(left - 1):
         v = flat[cell]
         if v < TOUCHED:
             flat[cell] = miss[v] | TOUCHED

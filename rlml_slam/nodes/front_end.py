@@ -78,11 +78,12 @@ class FrontEndNode(Node):
         self.answers.begin_session()
 
     def believe(self, msg: PointCloud2) -> None:
-        """Go on from the back end's reflectors where its graph contradicts this end's."""
+        """Go on from the back end's graph where it contradicts this end's pose of now."""
         said = read_belief(msg)
         if said.session == self.answers.session:
             self.front_end.correct(said.T_map_local)
-            if self.front_end.contradicts(said.belief):
+            fresh = said.stamp == self.front_end.newest
+            if fresh and self.front_end.contradicts(said.belief):
                 self.front_end.adopt(said.belief)
 
     def correct(self, msg: PoseWithCovarianceStamped) -> None:

@@ -76,6 +76,11 @@ class FrontEnd:
         """Take over the back end's newest correction of the local frame."""
         self._T_map_local = np.array(T_map_local, dtype=np.float64)
 
+    @property
+    def newest(self) -> int | None:
+        """Stamp of the newest observation, None before the first."""
+        return self._last_stamp
+
     def contradicts(self, belief: Belief) -> bool:
         """Whether the back end's reflectors are not where this end's estimate has them.
 

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from made_rooms import ROOM, built, path, scan, walls
+
+from rlml_slam import se2
+from rlml_slam.errors import InputError
+from rlml_slam.matching import search
+from rlml_slam.matching.submap import P_MAX, P_MIN, Submap
+from rlml_slam.matching.thinning import thin
+
+BOX = walls((-3.0, -2.0), (3.0, -2.0), (3.0, 2.0), (-3.0, 2.0))
+TRUE = np.array([0.4, -0.3, 0.5])
+
+
+@pytest.fixture(scope='module')
+def room() -> Submap:
+    return built(ROOM, path(), sigma=0.01)
+
+
+@pytest.fixture(scope='module')
+def pyramid(room) -> search.Pyramid:
+    return search.Pyramid(room)
+
+
+@pytest.fixture(scope='module')
+def points():
+    return thin(scan(ROOM, TRUE, 360, sigma=0.01), 0.05, 150)
+
+
+def brute_force(pyramid, points, pose, n, thetas):
+    """Sums (angles, rows, columns) of every candidate."""
+    grid = pyramid.levels[0].astype(np.int64)
+    padded = np.pad(grid, n + 200)
+    sums = np.zeros((len(thetas), 2 * n + 1, 2 * n + 1), dtype=np.int64)
+    for a, theta in enumerate(thetas):
+        at = se2.transform(pose + np.array([0.0, 0.0, theta]), points)
+        cells = np.floor(at / pyramid.resolution).astype(int) - pyramid.corner + n + 200
+        for i in range(-n, n + 1):
+            for j in range(-n, n + 1):
+                sums[a, i + n, j + n] = padded[cells[:, 1] + i, cells[:, 0] + j].sum()
+    return sums
+
+
+def score(total, n):
+    return P_MIN + (P_MAX - P_MIN) * total / (255.0 * n)
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_branch_and_bound_equals_brute_force(pyramid, points, seed):
+    rng = np.random.default_rng(seed)
+    pose = TRUE + rng.normal(size=3) * [0.3, 0.3, 0.1]
+    thetas = search.angles(points, pyramid.resolution, 0.15)
+    sums = brute_force(pyramid, points, pose, 9, thetas)
+    found = search.wide(
+        pyramid, points, pose, 9 * pyramid.resolution, 0.15, separation=0.2,
+        separation_angle=0.1, second_share=0.0,
+    )  # fmt: skip
+    assert found.best.score == pytest.approx(score(sums.max(), len(points)), abs=1e-12)
+    # what is near the best is no second candidate
+    a, i, j = np.unravel_index(sums.argmax(), sums.shape)
+    turn = 0.1 / (thetas[1] - thetas[0])
+    turns, rows, columns = np.indices(sums.shape)
+    near = (abs(turns - a) <= turn) & (abs(rows - i) <= 4) & (abs(columns - j) <= 4)
+    best = se2.transform(found.best.pose, points)
+    shift = np.array([j - 9, i - 9]) * pyramid.resolution
+    here = se2.transform(pose + np.array([*shift, thetas[a]]), points)
+    np.testing.assert_allclose(best, here, atol=1e-12)
+    expected = score(np.where(near, -1, sums).max(), len(points))
+    assert found.second.score == pytest.approx(expected, abs=1e-12)
+    assert found.evaluated < 0.5 * sums.size
+
+
+def test_branch_and_bound_finds_the_pose_from_anywhere(pyramid, points):
+    found = search.wide(pyramid, points, np.array([-1.0, 1.0, -2.0]), 3.0, np.pi)
+    error = se2.between(TRUE, found.best.pose)
+    # half a cell and half a step of the angle, and the noise
+    assert np.hypot(error[0], error[1]) < 0.06
+    assert abs(error[2]) < 0.02
+    assert found.best.score > 0.5
+    assert found.second is None or found.second.score < 0.85 * found.best.score
+
+
+def test_symmetric_box_has_a_second_place_as_good(points):
+    submap = built(BOX, np.zeros((1, 3)))
+    pyramid = search.Pyramid(submap)
+    seen = thin(scan(BOX, TRUE, 360), 0.05, 300)
+    found = search.wide(pyramid, seen, np.zeros(3), 1.0, np.pi)
+    opposite = np.array([-TRUE[0], -TRUE[1], TRUE[2] - np.pi])
+    for expected in (TRUE, opposite):
+        errors = [np.abs(se2.between(expected, c.pose)) for c in (found.best, found.second)]
+        assert min(e.max() for e in errors) < 0.08
+    assert found.second.score > 0.9 * found.best.score
+
+
+def test_score_below_the_minimum_is_no_candidate(pyramid):
+    noise = np.random.default_rng(0).uniform(-2, 2, size=(100, 2))
+    assert search.wide(pyramid, noise, np.zeros(3), 0.5, 0.2, min_score=0.6).best is None
+    with pytest.raises(InputError, match='no points'):
+        search.wide(pyramid, np.zeros((0, 2)), np.zeros(3), 0.5, 0.2)
+
+
+def test_levels_bound_the_blocks_below_them(pyramid):
+    for h in range(1, pyramid.depth + 1):
+        low = pyramid.levels[0][: 40 + 2**h, : 40 + 2**h]
+        full = max(low[i, j] for i in range(20, 20 + 2**h) for j in range(20, 20 + 2**h))
+        assert pyramid.levels[h][20, 20] == full
+
+
+def test_search_is_the_same_to_the_last_bit(room, points):
+    results = [
+        search.wide(search.Pyramid(room), points, np.zeros(3), 1.0, np.pi) for _ in range(2)
+    ]
+    assert results[0].best.pose.tobytes() == results[1].best.pose.tobytes()
+    assert results[0].evaluated == results[1].evaluated
+
+
+@pytest.mark.parametrize('stride', [1, 2])
+def test_window_takes_the_best_of_its_lattice(room, points, stride):
+    offset = np.array([2 * stride * room.resolution, -stride * room.resolution, 0.0])
+    found = search.window(room, points, TRUE + offset, 0.2, 0.0, stride=stride)
+    np.testing.assert_allclose(found.pose, TRUE, atol=1e-12)
+    cells = np.floor(se2.transform(TRUE, points) / room.resolution).astype(int) - room.corner
+    p = np.nan_to_num(room.probability()[cells[:, 1], cells[:, 0]], nan=P_MIN)
+    # an unknown cell counts as value 0, one level below P_MIN
+    assert found.score == pytest.approx(p.mean(), abs=1e-4)
+
+
+def test_window_at_the_border_counts_what_is_inside(room):
+    b = room.bounds
+    edge = np.array([[b[2] - 0.01, b[3] - 0.01], [b[0] + 0.01, b[1] + 0.01], [b[2] + 9.0, 0.0]])
+    found = search.window(room, edge, np.zeros(3), 0.5, 0.2)
+    assert P_MIN - 1e-4 <= found.score <= P_MAX
+
+
+def test_prior_decides_where_the_scan_does_not():
+    wall = np.array([[[-30.0, 1.0], [30.0, 1.0]]])
+    submap = built(wall, np.stack([np.linspace(0, 1, 9), np.zeros(9), np.zeros(9)], -1))
+    seen = scan(wall, np.array([0.5, 0.0, 0.0]), 360, max_range=3.0)
+    W = np.diag([100.0, 100.0, 200.0])
+    prior = np.array([0.57, 0.1, 0.0])
+    found = search.window(submap, seen, prior, 0.2, 0.1, W)
+    assert found.pose[0] == prior[0]
+    assert abs(found.pose[1]) <= 0.051
+
+
+def test_loss_of_the_prior_saturates_per_component():
+    W = np.diag([10.0, 20.0, 30.0])
+    assert search.prior_loss(0.0, 0.0, 0.0, W, 3.0) == 0.0
+    assert search.prior_loss(0.3, 0.0, 0.0, W, 3.0) == pytest.approx(0.5)
+    assert search.prior_loss(1e6, 0.15, 0.1, W, 3.0) == pytest.approx(2.0)

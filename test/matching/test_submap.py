@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rlml_slam import params
+from rlml_slam.errors import InputError
+from rlml_slam.matching.submap import P_MAX, P_MIN, STEP, Submap, probability_of, value_of
+
+P = params.Submap(resolution=0.1, p_hit=0.7, p_miss=0.4)
+ORIGIN = np.array([0.05, 0.05])
+
+
+def at(submap: Submap, x: float, y: float) -> float:
+    j = int(np.floor(x / submap.resolution)) - submap.corner[0]
+    i = int(np.floor(y / submap.resolution)) - submap.corner[1]
+    return float(submap.probability()[i, j])
+
+
+def odds(p: float) -> float:
+    return p / (1.0 - p)
+
+
+def test_value_and_probability_are_inverse_and_clamped():
+    p = np.array([0.0, P_MIN, 0.3, 0.7, P_MAX, 1.0])
+    back = probability_of(value_of(p))
+    # a value is rounded to the nearest level
+    np.testing.assert_allclose(back, np.clip(p, P_MIN, P_MAX), atol=0.51 * STEP)
+    assert np.isnan(probability_of(np.zeros(1, dtype=np.uint16)))[0]
+
+
+def test_ray_misses_up_to_the_cell_before_the_hit_and_nothing_else_is_known():
+    submap = Submap(P)
+    submap.insert(np.array([[1.05, 0.05]]), ORIGIN)
+    for x in np.arange(0.05, 0.9, 0.1):
+        assert at(submap, x, 0.05) == pytest.approx(P.p_miss, abs=STEP)
+    assert np.isnan(at(submap, 0.95, 0.05))
+    assert at(submap, 1.05, 0.05) == pytest.approx(P.p_hit, abs=STEP)
+    assert int(np.isfinite(submap.probability()).sum()) == 10
+
+
+@pytest.mark.parametrize('angle', np.linspace(-np.pi, np.pi, 23))
+def test_ray_in_any_direction_is_a_connected_chain_of_cells(angle):
+    submap = Submap(P)
+    end = ORIGIN + 2.03 * np.array([np.cos(angle), np.sin(angle)])
+    submap.insert(end[None], ORIGIN)
+    known = np.argwhere(np.isfinite(submap.probability()))
+    hit = (np.floor(end / 0.1) - submap.corner).astype(int)[::-1]
+    start = (np.floor(ORIGIN / 0.1) - submap.corner).astype(int)[::-1]
+    # every crossed cell once: |di| + |dj| cells before the hit, of which the last is left out
+    assert len(known) == np.abs(hit - start).sum()
+    offset = (known - start)[:, ::-1] @ np.array([-np.sin(angle), np.cos(angle)])
+    assert np.abs(offset).max() <= np.sqrt(0.5) + 1.0
+
+
+def test_hits_and_misses_multiply_the_odds():
+    submap = Submap(P)
+    for _ in range(2):
+        submap.insert(np.array([[1.05, 0.05]]), ORIGIN)
+    expected = odds(P.p_hit) ** 2 / (1.0 + odds(P.p_hit) ** 2)
+    assert at(submap, 1.05, 0.05) == pytest.approx(expected, abs=2 * STEP)
+    expected = odds(P.p_miss) ** 2 / (1.0 + odds(P.p_miss) ** 2)
+    assert at(submap, 0.55, 0.05) == pytest.approx(expected, abs=2 * STEP)
+
+
+def test_probability_stays_between_its_bounds():
+    submap = Submap(P)
+    for _ in range(60):
+        submap.insert(np.array([[1.05, 0.05]]), ORIGIN)
+    assert at(submap, 1.05, 0.05) == pytest.approx(P_MAX, abs=STEP)
+    assert at(submap, 0.55, 0.05) == pytest.approx(P_MIN, abs=STEP)
+
+
+def test_cell_counts_once_per_insertion_and_hits_win():
+    submap = Submap(P)
+    # ten beams through the cell of one hit, three hits in it
+    fan = [[3.05, 0.05 + 1e-3 * k] for k in range(10)]
+    submap.insert(np.array([*fan, [1.05, 0.05], [1.06, 0.05], [1.04, 0.05]]), ORIGIN)
+    assert at(submap, 1.05, 0.05) == pytest.approx(P.p_hit, abs=STEP)
+    assert at(submap, 0.55, 0.05) == pytest.approx(P.p_miss, abs=STEP)
+
+
+def test_growing_grid_changes_none_of_its_cells():
+    once, grown = Submap(P), Submap(P)
+    near = np.array([[1.05, 0.05], [0.35, -0.65]])
+    far = np.array([[-4.35, 2.0], [3.0, -5.0], [0.0, 6.0]])
+    grown.insert(near, ORIGIN)
+    grown.insert(far, ORIGIN)
+    once.insert(far, ORIGIN)
+    once.insert(near, ORIGIN)
+    for x in np.arange(-4.9, 4.0, 0.3):
+        for y in np.arange(-5.4, 6.3, 0.3):
+            inside = []
+            for m in (once, grown):
+                b = m.bounds
+                ok = b[0] <= x < b[2] and b[1] <= y < b[3]
+                inside.append(at(m, x, y) if ok else np.nan)
+            # odds commute up to the rounding of two levels
+            np.testing.assert_allclose(inside[0], inside[1], atol=2 * STEP)
+    assert once.bounds[2] >= 3.0
+    assert grown.insertions == grown.version == 2
+
+
+def test_gap_between_neighbours_on_a_wall_is_filled():
+    submap = Submap(P)
+    wall = np.stack([np.full(5, 2.05), np.linspace(-1.0, 1.0, 5) + 0.05], -1)
+    submap.insert(wall, ORIGIN)
+    inner = [at(submap, 2.05, y) for y in np.arange(-0.45, 0.5, 0.1)]
+    np.testing.assert_allclose(inner, P.p_hit, atol=STEP)
+    lonely = Submap(P)
+    lonely.insert(wall * np.array([1.0, 2.0]), ORIGIN)  # one metre apart: may be a door
+    assert int((lonely.probability() > 0.5).sum()) == 5
+
+
+def test_same_insertions_give_the_same_bytes():
+    rng = np.random.default_rng(3)
+    scans = [rng.normal(size=(200, 2)) * 4 for _ in range(5)]
+    a, b = Submap(P), Submap(P)
+    for m in (a, b):
+        for s in scans:
+            m.insert(s, ORIGIN)
+    assert a.values.tobytes() == b.values.tobytes()
+
+
+def test_scan_without_points_and_bad_values():
+    submap = Submap(P)
+    submap.insert(np.zeros((0, 2)), ORIGIN)
+    assert not np.isfinite(submap.probability()).any()
+    with pytest.raises(InputError, match='not finite'):
+        submap.insert(np.array([[np.nan, 0.0]]), ORIGIN)
+    with pytest.raises(InputError, match='not finite'):
+        submap.insert(np.array([[1.0, 0.0]]), np.array([np.inf, 0.0]))
+    assert submap.insertions == 1

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rlml_slam.matching.surfaces import MAX_GAP, constraints, fill
+
+
+def line(angle: float, n: int = 9, spacing: float = 0.1) -> np.ndarray:
+    direction = np.array([np.cos(angle), np.sin(angle)])
+    return 3.0 * np.array([-direction[1], direction[0]]) + np.outer(
+        np.arange(n) * spacing, direction
+    )
+
+
+@pytest.mark.parametrize('angle', [0.0, 0.4, 1.57, 2.5, -2.0])
+def test_point_on_a_wall_is_held_across_it_only(angle):
+    a, b, c = constraints(line(angle))[4]
+    normal = np.array([-np.sin(angle), np.cos(angle)])
+    np.testing.assert_allclose([[a, b], [b, c]], np.outer(normal, normal), atol=1e-12)
+
+
+def test_point_in_clutter_is_held_both_ways_and_a_lonely_one_not_at_all():
+    clutter = np.random.default_rng(0).uniform(-0.3, 0.3, size=(9, 2))
+    np.testing.assert_array_equal(constraints(clutter)[4], [1.0, 0.0, 1.0])
+    lonely = np.array([[0.0, 0.0], [0.1, 0.0], [5.0, 0.0], [9.0, 0.0], [9.1, 0.0]])
+    np.testing.assert_array_equal(constraints(lonely), np.zeros((5, 3)))
+
+
+def test_gap_is_filled_at_the_spacing_with_shortened_rays():
+    wall = line(0.7, spacing=0.39)
+    filled = fill(wall, 0.05)
+    measured = filled[filled[:, 2] == 0.0]
+    np.testing.assert_array_equal(measured[:, :2], wall)
+    # between points 1 and n - 2 every gap has neighbours on both sides
+    inner = filled[(filled[:, :2] >= wall[1].min()).any(axis=1)]
+    steps = np.hypot(*np.diff(filled[:, :2], axis=0).T)
+    assert len(inner) > len(wall)
+    assert np.sort(steps)[-3] <= 0.05 + 1e-9 < np.sort(steps)[-2]
+    np.testing.assert_allclose(filled[filled[:, 2] > 0.0, 2], 1.0 / 9.0)
+
+
+@pytest.mark.parametrize(
+    'points',
+    [
+        line(0.0, spacing=1.5 * MAX_GAP),  # as wide as a door
+        np.array([[0.0, 0.0], [0.3, 0.3], [0.6, 0.0], [0.9, 0.3], [1.2, 0.0]]),  # not a line
+        line(0.0, spacing=0.04),  # no gap
+        line(0.0, n=2),
+        np.zeros((0, 2)),
+    ],
+)
+def test_what_is_no_gap_in_a_wall_is_not_filled(points):
+    np.testing.assert_array_equal(fill(points, 0.05)[:, :2], points)
