@@ -37,6 +37,10 @@ def run(*factories: Callable[[], Any]) -> int:
         return 1
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except RCLError:
+        # a signal may end the context in the middle of a callback
+        if rclpy.utilities.ok():
+            raise
     except SystemExit as e:
         return int(e.code or 0)
     finally:
