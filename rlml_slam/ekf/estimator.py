@@ -234,6 +234,8 @@ class Estimator:
         began: float,
     ) -> Frame:
         pose, cov = self.filter.pose, self.filter.pose_cov
+        if seen is not None:  # keys and statuses are of what was measured
+            observation = dataclasses.replace(observation, detections=seen.detections)
         health = self.health.judge(
             observation.stamp,
             Evidence(),
