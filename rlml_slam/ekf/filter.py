@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dpstrf
 
 from rlml_slam import se2
 from rlml_slam.ekf.models import Model
@@ -161,10 +162,8 @@ class Filter:
             P[:before, :before] = self._P
         x[a], x[b] = self.x, self._x[b] + P_ba0 @ self._theta
         # P_bb <- P_bb - P_ba0 Psi P_a0b as G G^T over the whole matrix: half the work, contiguous
-        values, axes = np.linalg.eigh(0.5 * (self._psi + self._psi.T))
-        keep = values > 0.0
-        G = np.zeros((n, int(keep.sum())))
-        G[b] = P_ba0 @ (axes[:, keep] * np.sqrt(values[keep]))
+        G = np.zeros((n, len(self._psi)))
+        G[b] = P_ba0 @ _factor(self._psi)
         P -= G @ G.T
         P[np.ix_(b, a)] = P_ba = P_ba0 @ self._phi.T
         P[np.ix_(a, b)] = P_ba.T
@@ -243,3 +242,12 @@ class Filter:
             + H_m @ self.point_covs() @ H_m.transpose(0, 2, 1)
         )
         return out
+
+
+def _factor(M: Array) -> Array:
+    """F with F F^T = M for a positive semidefinite M: pivoted Cholesky."""
+    L, pivots, rank, _ = dpstrf(0.5 * (M + M.T), lower=1)
+    F = np.empty_like(M)
+    F[pivots - 1] = np.tril(L)
+    F[:, rank:] = 0.0
+    return F
