@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The LEGO robot: its files, the camera's view of it, and spikes with the EKF on the real log."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from rlml_slam import se2
+from rlml_slam.errors import FileFormatError
+from rlml_slam.tools.convert_lego import (
+    BEAM,
+    METRES_PER_TICK,
+    MIDDLE,
+    MOUNTING,
+    T_BASE_LASER,
+    WHEEL_BASE,
+    read_lego,
+)
+from rlml_slam.tools.main import main
+from rlml_slam.tools.study_lego import camera_view
+
+SHARED = Path(__file__).resolve().parents[3] / 'shared' / 'data' / 'lego-cylinders'
+real_data = pytest.mark.skipif(not SHARED.is_dir(), reason='the data set is not here')
+
+
+@pytest.fixture
+def folder(tmp_path):
+    # the left wheel stands and the right one goes a quarter circle of radius WHEEL_BASE
+    quarter = 0.5 * np.pi * WHEEL_BASE / METRES_PER_TICK
+    motors = '\n'.join(f'M {t} 500 0 0 0 {700 + k * quarter / 4:.6f} 0' for k, t in
+                       enumerate(range(10, 1010, 200)))  # fmt: skip
+    ranges = ' '.join(['1500'] * MIDDLE + ['0'] + ['2500'] * (659 - MIDDLE))
+    scans = '\n'.join(f'S {t} 660 {ranges}' for t in range(0, 1000, 200))
+    track = '\n'.join(f'P {t} 1000 2000' for t in range(30, 1030, 200))
+    (tmp_path / 'robot4_motors.txt').write_text(motors + '\n')
+    (tmp_path / 'robot4_scan.txt').write_text(scans + '\n')
+    (tmp_path / 'robot4_reference.txt').write_text(track + '\n')
+    (tmp_path / 'robot_arena_landmarks.txt').write_text('L C 1291.0\t1881.0\t55.0\n')
+    return tmp_path
+
+
+def test_ticks_become_the_arc_of_the_middle_between_the_wheels(folder):
+    end = read_lego(folder).odometry[-1].pose
+    r = 0.5 * WHEEL_BASE
+    assert_allclose(end, [r, r, 0.5 * np.pi], atol=1e-8)
+
+
+def test_beams_lie_where_the_course_says(folder):
+    scan = read_lego(folder).scans[0]
+    assert np.isnan(scan.ranges[MIDDLE])  # 0 is no return
+    assert_allclose([scan.ranges[0], scan.ranges[-1]], [1.5, 2.5])
+    k = 100
+    angle = scan.angle_min + k * scan.angle_increment + T_BASE_LASER[2]
+    assert angle == pytest.approx((k - MIDDLE) * BEAM - MOUNTING, abs=1e-12)
+
+
+def test_rows_belong_together(folder):
+    data = read_lego(folder)
+    stamps = [s.stamp for s in data.scans]
+    assert [o.stamp for o in data.odometry] == stamps == data.track.stamps.tolist()
+    assert_allclose(data.track.poses[:, :2], np.tile([1.0, 2.0], (5, 1)))
+    assert_allclose(data.landmarks, [[1.291, 1.881]])
+
+
+def test_files_of_different_length_are_refused(folder):
+    path = folder / 'robot4_reference.txt'
+    path.write_text(''.join(path.read_text().splitlines(keepends=True)[:-1]))
+    with pytest.raises(FileFormatError, match='differ in number of rows'):
+        read_lego(folder)
+
+
+def test_camera_view_finds_scale_and_point():
+    rng = np.random.default_rng(3)
+    scanner = np.column_stack([rng.normal(size=(40, 2)), rng.uniform(-3, 3, 40)])
+    point = np.array([0.05, -0.02])
+    seen = se2.transform(scanner, np.tile(point, (40, 1))[:, None])[:, 0]
+    track = 1.2 * se2.transform(np.array([3.0, -1.0, 2.0]), seen)
+    view = camera_view(scanner, track)
+    assert view.scale == pytest.approx(1.2, abs=1e-12)
+    assert_allclose(view.point, point, atol=1e-12)
+    assert_allclose(view.seen, track, atol=1e-12)
+
+
+@real_data
+def test_all_cylinders_and_no_other_are_found(tmp_path, capsys):
+    out = tmp_path / 'lego.png'
+    assert main(['study', 'lego', str(SHARED), '--out', str(out), '--json']) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures['cylinders_found'] == figures['cylinders'] == 6
+    assert figures['landmarks_false'] == 0
+    assert figures['landmark_rmse_m'] <= 0.02
+    # rigidly 6.5 cm: the camera's metre is larger than that of laser, wheels and map (docs)
+    assert figures['position_rmse_as_camera_m'] <= 0.03
+    assert abs(figures['arena_scale'] - 1.0) < 0.01
+    assert figures['camera_scale'] > 1.07
+    assert out.read_bytes().startswith(b'\x89PNG')
