@@ -105,6 +105,9 @@ class Node(Group):
     base_frame: str = param('base_link', 'frame of the robot; all estimates are of this frame')
     local_frame: str = param('rlml_local', "the front end's continuous frame")
     scan_topic: str = param('scan', 'LaserScan topic')
+    scan_topics: tuple[str, ...] = param(
+        ('',), 'LaserScan topics of several lidars, in the place of scan_topic'
+    )
     odom_topic: str = param('odom', 'Odometry topic')
     imu_topic: str = param('imu', 'Imu topic')
     reflectors_topic: str = param('reflectors', 'PointCloud2 topic of reflector detections')

@@ -24,6 +24,7 @@ from rlml_slam.ros.sensors import checked
 from rlml_slam.ros.services import MapServices
 
 DEPTH = 200  # of the front end's answers: none may be lost while the map is drawn
+SETTLE_PERIOD = 0.1  # [s] between two looks whether the input has fallen silent
 
 
 class BackEndNode(Node):
@@ -43,11 +44,10 @@ class BackEndNode(Node):
             ('reflectors/associated', self.on_associated),
         ):
             self.create_subscription(PointCloud2, topic, checked(self, callback), DEPTH)
-        self.create_timer(
-            self.params.node.transform_publish_period,
-            self.mapper.send_transform,
-            clock=Clock(clock_type=ClockType.STEADY_TIME),
-        )
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        period = self.params.node.transform_publish_period
+        self.create_timer(period, self.mapper.send_transform, clock=steady)
+        self.create_timer(SETTLE_PERIOD, self.mapper.settle, clock=steady)
 
     def on_frame(self, msg: PointCloud2) -> None:
         """Every figure of one of the front end's frames."""
@@ -70,10 +70,13 @@ class BackEndNode(Node):
 
     def figures(self) -> dict[str, object]:
         """Figures for /diagnostics."""
-        graph = self.mapper.back_end.graph
+        graph, tried = self.mapper.back_end.graph, self.mapper.back_end.scans.closures
+        accepted = sum(c.accepted for c in tried)
         return {
             'keyframes': len(graph.poses),
             'edges': len(graph.edges),
+            'closures accepted': accepted,
+            'closures rejected': len(tried) - accepted,
             'frames waiting for the worker': self.mapper.worker.backlog,
             'frames without their points or detections': self.join.incomplete,
         }

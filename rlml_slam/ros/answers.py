@@ -25,6 +25,7 @@ TOPICS = {
     'reflectors/associated': (CLOUD, 50),
     'frames': (CLOUD, 50),
 }
+SHORT = 0.005  # [s] steps of several lidars: too short to tell a speed
 
 
 class FramePublisher:
@@ -42,6 +43,7 @@ class FramePublisher:
         """From now on, the local frame is another one; no two processes share a number."""
         self.session = time.time_ns() // 1000 % 2**32
         self._last: Frame | None = None
+        self._twisted = (np.zeros(3), np.zeros((3, 3)))
 
     def publish(self, frame: Frame) -> None:
         """Send everything of one frame, stamped as the frame."""
@@ -70,8 +72,8 @@ class FramePublisher:
 
     def _twist(self, frame: Frame) -> tuple[Array, Array]:
         """Body twist since the last frame, with the covariance of the motion model."""
-        if self._last is None:
-            return np.zeros(3), np.zeros((3, 3))
-        dt = (frame.stamp - self._last.stamp) * 1e-9
-        step = se2.log(se2.between(self._last.T_local_base, frame.T_local_base))
-        return step / dt, frame.observation.motion.cov / dt**2
+        dt = 0.0 if self._last is None else (frame.stamp - self._last.stamp) * 1e-9
+        if self._last is not None and dt >= SHORT:
+            step = se2.log(se2.between(self._last.T_local_base, frame.T_local_base))
+            self._twisted = (step / dt, frame.observation.motion.cov / dt**2)
+        return self._twisted

@@ -29,7 +29,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 
 from rlml_slam.errors import BagError
 from rlml_slam.params import Node
-from rlml_slam.ros.feed import STREAMS, USED_BY
+from rlml_slam.ros.feed import STREAMS, USED_BY, topics_of
 from rlml_slam.ros.messages import bag_types
 from rlml_slam.ros.salvage import Salvage
 
@@ -228,7 +228,7 @@ def choose_topics(topics: Mapping[str, Topic], node: Node) -> dict[str, str]:
     for stream, (parameter, msgtype, fallback) in STREAMS.items():
         if not getattr(node, USED_BY[stream]):
             continue
-        name = getattr(node, parameter).strip('/')
+        name = topics_of(node, stream)[0].strip('/')
         typed = [t.name for t in topics.values() if t.msgtype == msgtype and t.count]
         fitting = (
             [t for t in typed if t.strip('/') == name]

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any, Generic, Protocol, TypeVar
 
 from rlml_slam.errors import InputError
-from rlml_slam.params import Parameters
+from rlml_slam.params import Node, Parameters
 from rlml_slam.ros import convert
 from rlml_slam.ros.convert import frame
 from rlml_slam.ros.tf import Extrinsics
@@ -30,6 +30,12 @@ USED_BY = {
     'reflectors': 'use_reflectors', 'reflector_poses': 'use_reflectors',
 }  # fmt: skip
 PLACED = ('scan', 'reflectors', 'reflector_poses')  # streams whose sensor has to have a place
+
+
+def topics_of(node: Node, stream: str) -> tuple[str, ...]:
+    """Names of the topics of a stream: one, but of as many scans as there are lidars."""
+    several = tuple(filter(None, node.scan_topics)) if stream == 'scan' else ()
+    return several or (str(getattr(node, STREAMS[stream][0])),)
 
 
 class Target(Protocol[Out]):

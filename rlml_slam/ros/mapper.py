@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
@@ -19,11 +20,13 @@ from rlml_slam.ros.messages import make_rclpy, rclpy_class
 from rlml_slam.ros.products import MapProducts
 from rlml_slam.ros.sensors import LATCHED
 from rlml_slam.ros.tf import TransformPublisher
+from rlml_slam.ros.updates import build_update
 from rlml_slam.ros.worker import Worker
 from rlml_slam.se2 import Array
 from rlml_slam.types import Frame
 
 MAX_BACKLOG = 20  # frames behind which pictures of the map are left out
+IDLE = 0.3  # [s] of the wall clock without a frame, after which the map is brought up to date
 CERTAIN = 1e-6 * np.eye(3)
 
 
@@ -47,12 +50,13 @@ class Mapper:
         self._newest: Frame | None = None
         self._session: int | None = None
         self._sent = 0
+        self._heard = 0.0
         self._tf = TransformPublisher(node)
         kind = rclpy_class('geometry_msgs/msg/PoseWithCovarianceStamped')
         self._correction = node.create_publisher(kind, 'correction', LATCHED)
-        self._belief = node.create_publisher(
-            rclpy_class('sensor_msgs/msg/PointCloud2'), 'belief', 5
-        )
+        cloud = rclpy_class('sensor_msgs/msg/PointCloud2')
+        self._belief = node.create_publisher(cloud, 'belief', 5)
+        self._updates = node.create_publisher(cloud, 'updates', 50)
         self._initialpose = node.create_publisher(kind, 'initialpose', 10)
         if self.saved is not None:
             self.worker.submit(self.publish_map)
@@ -68,15 +72,21 @@ class Mapper:
             self._logger.warning('the front end began anew, and so does the map')
             self.worker.submit(self._forget)
         self._session = record.session
+        self._heard = time.monotonic()
         self.worker.submit(lambda: self._add(record))
 
     def _add(self, record: Record) -> None:
         frame = self._newest = record.frame
         if self.saved is None:
             update = self.back_end.add(frame)
-            if update is not None and update.optimized:
-                self._send_correction()
-                self._send_belief(record)
+            if update is not None:
+                place = self.back_end.graph.poses[update.keyframe, :2]
+                self._updates.publish(
+                    build_update(make_rclpy, frame.stamp, self._p.node.map_frame, place, update)
+                )
+                if update.optimized:
+                    self._send_correction()
+                    self._send_belief(record)
         T_map_base = se2.compose(self.back_end.T_map_local, frame.T_local_base)
         T_odom_base = frame.observation.odom_pose
         if T_odom_base is None:  # without odometry, odom is the front end's local frame
@@ -103,6 +113,15 @@ class Mapper:
     def publish_map(self) -> None:
         """In the worker: send map, trajectory, reflectors and graph now."""
         self.products.publish(self.back_end, self.saved, self.stamp)
+
+    def settle(self) -> None:
+        """Send the map of everything so far where no frame has come for a while."""
+        silent = time.monotonic() - self._heard >= IDLE
+        if silent and self.worker.backlog == 0 and self._is_behind():
+            self.worker.submit(lambda: self.publish_map() if self._is_behind() else None)
+
+    def _is_behind(self) -> bool:
+        return self.saved is None and self._newest is not None and self.products.stamp < self.stamp
 
     def send_transform(self) -> None:
         """Publish map to odom at the newest stamp, if it is a new one."""

@@ -27,7 +27,10 @@ TOPICS = {
 
 
 class MapProducts:
-    """Publishes the map every ``map_update_interval`` of stamps, latched."""
+    """Publishes the map every ``map_update_interval`` of stamps, latched.
+
+    ``stamp`` is that of the newest map that was sent, 0 before the first.
+    """
 
     def __init__(self, node: Any, params: Node) -> None:
         self._p = params
@@ -39,15 +42,17 @@ class MapProducts:
 
     def restart(self) -> None:
         """The next frame is due."""
+        self.stamp = 0
         self._next = 0
+        self._rested = 0.0
 
     def is_due(self, stamp: int) -> bool:
-        """Whether the interval has passed."""
-        return stamp >= self._next
+        """Whether the interval has passed, and the pause that the last map's cost asks for."""
+        return stamp >= self._next and time.monotonic() >= self._rested
 
     def publish(self, back_end: BackEnd, saved: SavedMap | None, stamp: int) -> None:
         """Send everything that there is: of the graph, or of a saved map."""
-        began = time.perf_counter()
+        began = time.monotonic()
         make, frame = make_rclpy, self._p.map_frame
         grid = back_end.occupancy_grid() if saved is None else saved.grid
         reflectors = back_end.reflectors() if saved is None else saved.reflectors
@@ -60,8 +65,9 @@ class MapProducts:
             stamps, poses = back_end.trajectory()
             self._send('trajectory', build.path(make, stamp, frame, stamps.tolist(), poses))
             self._send('graph', graph_markers(make, stamp, frame, back_end.graph))
-        wait = max(self._p.map_update_interval, (time.perf_counter() - began) / MAX_SHARE)
-        self._next = stamp + int(wait * 1e9)
+        self.stamp, self._next = stamp, stamp + int(self._p.map_update_interval * 1e9)
+        now = time.monotonic()
+        self._rested = now + (now - began) * (1.0 / MAX_SHARE - 1.0)
 
     def _send(self, topic: str, message: Any) -> None:
         self._publishers[topic].publish(message)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -31,6 +32,8 @@ def run(*factories: Callable[[], Any]) -> int:
         for factory in factories:
             nodes.append(factory())
             executor.add_node(nodes[-1])
+        # what is there now stays: looking through all of it again and again would hold up poses
+        gc.freeze()
         executor.spin()
     except (RlmlError, NameValidationException, InvalidNodeNameException) as e:
         print(f'rlml_slam: {e}', file=sys.stderr)

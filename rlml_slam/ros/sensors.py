@@ -4,15 +4,18 @@
 from __future__ import annotations
 
 import heapq
+import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from rlml_slam.errors import InputError
 from rlml_slam.params import Parameters
 from rlml_slam.ros.convert import frame
-from rlml_slam.ros.feed import PLACED, STREAMS, USED_BY, Feed
+from rlml_slam.ros.feed import PLACED, STREAMS, USED_BY, Feed, topics_of
 from rlml_slam.ros.messages import rclpy_class
 from rlml_slam.ros.tf import Extrinsics, subscribe_static
 from rlml_slam.sensing.sequence import Sequencer
@@ -20,8 +23,9 @@ from rlml_slam.types import Detections, Observation
 
 TF_PATIENCE = 1_000_000_000  # [ns] of stamps that a sensor's place on /tf_static is waited for
 RELIABLE = QoSProfile(depth=10)
-# deeper than sensor data's 5: a pause of the interpreter must not cost a scan
+# two seconds of a 100 Hz IMU: a pause of the interpreter must not cost a message
 DEPTH = 200
+SILENCE = 1.0  # [s] of the wall clock without any message, after which nothing more is waited for
 SENSOR = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -31,7 +35,8 @@ class Sensors:
 
     Where the clock jumps back by more than the buffer holds, ``restart`` is called and a new
     sequencer begins. Scans and detections wait, in order, until /tf_static tells where their
-    sensor is, but no longer than TF_PATIENCE.
+    sensor is, but no longer than TF_PATIENCE. Where all inputs fall silent, what still waits for
+    odometry is used as it is.
     """
 
     def __init__(
@@ -49,15 +54,22 @@ class Sensors:
         self._begin(Extrinsics())
         self._waits = subscribe_static(node, self._feed.extrinsics)
         self._held: list[tuple[str, Any]] = []
-        self._subscriptions: dict[str, Any] = {}
+        self._queues: list[tuple[str, Any]] = []
+        self._heard = time.monotonic()
         for stream in streams:
-            parameter, msgtype, _ = STREAMS[stream]
             # without scan matching, a scan still asks for a pose at its stamp
             if getattr(params.node, USED_BY[stream]) or stream == 'scan':
-                self._subscriptions[stream] = node.create_subscription(
-                    rclpy_class(msgtype), getattr(params.node, parameter),
-                    lambda msg, stream=stream: self.receive(stream, msg), SENSOR,
-                )  # fmt: skip
+                for topic in topics_of(params.node, stream):
+                    self._subscribe(node, stream, topic)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_timer(0.25 * SILENCE, self.flush_if_silent, clock=steady)
+
+    def _subscribe(self, node: Any, stream: str, topic: str) -> None:
+        index = len(self._queues)
+        subscription = node.create_subscription(
+            rclpy_class(STREAMS[stream][1]), topic, lambda msg: self.receive(index, msg), SENSOR
+        )
+        self._queues.append((stream, subscription))
 
     def _begin(self, extrinsics: Extrinsics) -> None:
         self.sequencer = Sequencer(self._p)
@@ -69,22 +81,38 @@ class Sensors:
         """Where the sensors sit, as far as /tf_static has told."""
         return self._feed.extrinsics
 
-    def receive(self, stream: str, msg: Any) -> None:
-        """One message, and all of the other streams that have arrived as well, by stamp.
+    def receive(self, index: int, msg: Any) -> None:
+        """One message of a queue, and all that have arrived in the others as well, by stamp.
 
         The executor serves the queues in turn. After a pause, scans would overtake the odometry
         that is more frequent and lies in the queue beside theirs.
         """
-        queues = [
-            [(s, msg), *self._taken(s)] if s == stream else self._taken(s)
-            for s in self._subscriptions
-        ]
-        for item in heapq.merge(*queues, key=lambda item: _stamp(item[1])):
-            self.add(*item)
+        self._take({index: [(self._queues[index][0], msg)]})
 
-    def _taken(self, stream: str) -> list[tuple[str, Any]]:
-        """Everything in the queue of a stream, in order of arrival."""
-        subscription = self._subscriptions[stream]
+    def _take(self, first: dict[int, list[tuple[str, Any]]]) -> int:
+        """Use all that has arrived, ``first`` of each queue before the rest; how many.
+
+        Odometry tells that scans before it are complete. It is taken from its queue before them,
+        so that a scan that comes between the two takes is not found to be late.
+        """
+        queues = {k: first.get(k, []) + self._taken(k) for k in reversed(range(len(self._queues)))}
+        count = 0
+        ordered = (queues[k] for k in range(len(self._queues)))
+        for item in heapq.merge(*ordered, key=lambda item: _stamp(item[1])):
+            self.add(*item)
+            count += 1
+        return count
+
+    def flush_if_silent(self) -> None:
+        """Where nothing has come for a while: a pose for the scan that waits for odometry."""
+        if self._take({}) or time.monotonic() - self._heard < SILENCE:
+            return
+        for observation in self.sequencer.flush():
+            self._handle(observation)
+
+    def _taken(self, index: int) -> list[tuple[str, Any]]:
+        """Everything in a queue, in order of arrival."""
+        stream, subscription = self._queues[index]
         out: list[tuple[str, Any]] = []
         with subscription.handle:
             while len(out) < DEPTH:
@@ -96,6 +124,7 @@ class Sensors:
 
     def add(self, stream: str, msg: Any) -> None:
         """One message of a stream."""
+        self._heard = time.monotonic()
         if stream not in PLACED or not self._waits:
             self._use(stream, msg)
             return

@@ -1,18 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One thread for heavy work, so that subscriptions keep draining; jobs run in order."""
+"""One thread for heavy work, so that subscriptions keep draining; jobs run in order.
+
+It runs at a lower priority: on a machine with few cores, the poses of the front end come first.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
+
+NICE = 5  # of the thread
 
 
 class Worker:
     """Runs jobs one after the other. A job that fails is a bug: ``check`` raises its error."""
 
     def __init__(self) -> None:
-        self._pool = ThreadPoolExecutor(max_workers=1)
+        self._pool = ThreadPoolExecutor(max_workers=1, initializer=_step_back)
         self._failed: BaseException | None = None
         self._given = 0
         self._done = 0
@@ -43,3 +51,9 @@ class Worker:
     def close(self) -> None:
         """Finish the running job and forget the others."""
         self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _step_back() -> None:
+    """Lower the priority of this thread, where the system has priorities of threads."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)

@@ -4,6 +4,9 @@
 A scan waits for the odometry that covers its last ray, and for the detections of the same stamp
 where those have come so far; nothing waits longer than ``transform_timeout``. All of it is decided
 by stamps and order of arrival alone, never by a clock, so a replay repeats it exactly.
+
+Several lidars are told apart by their frames. Each scan is an observation of its own; a scan waits
+for those of the others that are due before it, so that no lidar makes another one late.
 """
 
 from __future__ import annotations
@@ -66,6 +69,8 @@ class Sequencer:
         self._default_frame: dict[str, str] = {}
         self._waiting: list[Waiting] = []
         self._newest: dict[str, int] = {}
+        self._newest_of: dict[tuple[str, str], int] = {}
+        self._lidars: dict[str, tuple[int, int]] = {}  # by frame: newest stamp and period
         self._newest_any = -(2**62)
         self._first_any: int | None = None
         # where odometry ended before the last observation: (stamp, motion assumed since)
@@ -108,7 +113,10 @@ class Sequencer:
             self.inputs.count('scan', 'invalid', f'scan at {scan.stamp} ns is empty')
         elif not np.all(np.isfinite(geometry)) or scan.angle_increment == 0.0:
             self.inputs.count('scan', 'invalid', f'scan at {scan.stamp} ns has no valid geometry')
-        elif self._known_frame('scan', scan.frame_id) and self._accept('scan', scan.stamp):
+        elif self._known_frame('scan', scan.frame_id) and self._accept(
+            'scan', scan.stamp, source=scan.frame_id
+        ):
+            self._note_lidar(scan)
             self._wait(scan.stamp, 'scan', scan)
         return self._release()
 
@@ -141,14 +149,23 @@ class Sequencer:
     def _sensor_pose(self, frame_id: str) -> Array:
         return self._sensor_poses.get(frame_id, np.array(self._node.laser_pose))
 
-    def _accept(self, stream: str, stamp: int, valid: bool = True, why: str = '') -> bool:
+    def _note_lidar(self, scan: Scan) -> None:
+        newest, period = self._lidars.get(scan.frame_id, (scan.stamp, 0))
+        if scan.stamp > newest:
+            newest, period = scan.stamp, scan.stamp - newest
+        self._lidars[scan.frame_id] = (newest, period)
+
+    def _accept(
+        self, stream: str, stamp: int, valid: bool = True, why: str = '', source: str = ''
+    ) -> bool:
         """Count and refuse what is invalid, duplicate, or older than what is already used."""
         if not valid or stamp <= 0:
             error = f'{stream} at {stamp} ns: {why or "stamp is not positive"}'
             self.inputs.count(stream, 'invalid', error)
             return False
         newest = self._newest.get(stream)
-        if newest is not None and stamp == newest:
+        newest_of = self._newest_of.get((stream, source))
+        if stamp == newest_of:
             self.inputs.count(stream, 'duplicate')
             return False
         measured = stream in ('scan', 'reflectors')
@@ -164,6 +181,7 @@ class Sequencer:
             return False
         self._strange[stream] = 0
         self._newest[stream] = stamp if newest is None else max(newest, stamp)
+        self._newest_of[stream, source] = stamp if newest_of is None else max(newest_of, stamp)
         self._newest_any = max(self._newest_any, stamp)
         if self._first_any is None:
             self._first_any = stamp
@@ -188,11 +206,17 @@ class Sequencer:
         out = []
         while self._waiting:
             stamp = self._waiting[0][0]
-            group = [w for w in self._waiting if w[0] - stamp <= PAIRING]
+            # one scan and one set of detections; a second lidar's scan is the next observation
+            group: list[Waiting] = []
+            for w in self._waiting:
+                if w[0] - stamp <= PAIRING and w[1] not in [g[1] for g in group]:
+                    group.append(w)
             end = max(self._end(w[2]) for w in group)
             if ready is None and not self._is_ready(stamp, end, group):
                 break
-            del self._waiting[: len(group)]
+            self._waiting = [w for w in self._waiting if not any(w is g for g in group)]
+            if self._last is not None:
+                stamp = max(stamp, self._last + 1)  # two lidars at the very same instant
             out.append(self._observe(stamp, group))
         return out
 
@@ -214,6 +238,8 @@ class Sequencer:
                     return False
             elif newest < end:
                 return False
+        if len(self._lidars) > 1 and self._is_lidar_due(stamp, group):
+            return False
         fresh = self._first_any is None or stamp - self._first_any < SECOND
         if len(group) == 1 and (fresh or stamp - self._paired < SECOND):
             other = 'reflectors' if group[0][1] == 'scan' else 'scan'
@@ -221,6 +247,15 @@ class Sequencer:
             if self._newest.get(other, 0) <= stamp and waited <= self._timeout // 2:
                 return False
         return True
+
+    def _is_lidar_due(self, stamp: int, group: list[Waiting]) -> bool:
+        """Whether another lidar, by its period, still has a scan to send before this one."""
+        here = {w[2].frame_id for w in group if w[1] == 'scan'}
+        return any(
+            newest + period <= stamp + PAIRING and stamp - newest < SECOND
+            for frame_id, (newest, period) in self._lidars.items()
+            if period > 0 and frame_id not in here
+        )
 
     def _observe(self, stamp: int, group: list[Waiting]) -> Observation:
         scan: Scan | None = None

@@ -14,6 +14,7 @@ from rlml_slam.errors import BagError, InputError
 from rlml_slam.params import Parameters
 from rlml_slam.ros import convert
 from rlml_slam.ros.bag import BagReader, choose_topics
+from rlml_slam.ros.feed import topics_of
 from rlml_slam.ros.simulated import TRUE_REFLECTORS
 from rlml_slam.ros.tf import Extrinsics
 from rlml_slam.se2 import Array
@@ -27,21 +28,29 @@ _TF_SAMPLE = 500  # messages of /tf that are searched for a sensor that /tf_stat
 class BagInputs:
     """Iterate for (log time [ns], stream of ros/feed.py, message) in log order.
 
-    ``topics`` by stream, as ``params`` ask for them; ``extrinsics`` knows the static transforms
-    of the whole bag.
+    ``topics`` by stream, as ``params`` ask for them, and ``more_scans`` those of further lidars;
+    ``extrinsics`` knows the static transforms of the whole bag.
     """
 
     def __init__(self, bag: BagReader, params: Parameters) -> None:
         self._bag = bag
         self.params = params
         self.topics = choose_topics(bag.topics, params.node)
+        self.more_scans = [self._scans(t) for t in topics_of(params.node, 'scan')[1:]]
         self.extrinsics = Extrinsics()
         self._read_tf()
 
     def __iter__(self) -> Iterator[tuple[int, str, Any]]:
         stream_of = {topic: stream for stream, topic in self.topics.items()}
+        stream_of |= dict.fromkeys(self.more_scans, 'scan')
         for time, topic, message in self._bag.messages(stream_of):
             yield time, stream_of[topic], message
+
+    def _scans(self, name: str) -> str:
+        topic = _named(self._bag, name.strip('/'))
+        if topic is None:
+            raise BagError(f'{self._bag.path}: no topic {name!r}, which scan_topics names')
+        return topic
 
     def _all(self, topic: str | None, most: int | None = None) -> Iterator[Any]:
         """The messages of a topic as far as they can be read, ``most`` at most."""

@@ -19,7 +19,7 @@ from rlml_slam.tools.summary import summary_text
 
 RATE = 2.0  # simulated seconds per second: two cores keep up with three processes and a recorder
 GYRO_RATE = 50.0  # [Hz] simulated: more would cost CPU time and tell nothing new
-STILL = 3.0  # [s] simulated: standing at the end, in which the last map is published
+STILL = 1.0  # [s] simulated: standing before and after the drive
 
 
 def add_parser(subparsers: Any) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import struct
 import time
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,28 +16,29 @@ from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
 from nav_msgs.msg import Odometry, Path
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Parameters
 from rlml_slam.ros import convert
-from rlml_slam.ros.associated import read_reflector_map
+from rlml_slam.ros.associated import read_associated, read_reflector_map
+from rlml_slam.ros.frames import read_record
 from rlml_slam.ros.messages import rclpy_class
 from rlml_slam.ros.sensors import LATCHED
 from rlml_slam.ros.simulated import TRUE_REFLECTORS
+from rlml_slam.ros.updates import Told, read_update
 from rlml_slam.se2 import Array
 from rlml_slam.tools.record import FrameLog, Run, Truth
 from rlml_slam.tools.tum import Trajectory
-from rlml_slam.types import Detections, Health, Level, Reflectors
+from rlml_slam.types import Detections, Health, Level, Reflectors, Status
 
 SCAN = ('scan', 'sensor_msgs/msg/LaserScan')
 DEEP = QoSProfile(depth=1000)  # of the small messages, none may be lost
 SENSOR = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
-LAST_MAP = 1_500_000_000  # [ns] of the drive's end that the last published map may lack
 PATIENCE = 15.0  # [s] in which a busy machine may catch up with what was sent
-SETTLE = 1.0  # [s] in which two nodes that are there find each other
-FRAME_TIME = 'wall time of the last frame [ms]'
+SETTLE = 0.5  # [s] in which two nodes that are there find each other
 NO_REFLECTORS = Reflectors(
     np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)),
     np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0),
@@ -58,10 +61,14 @@ class Recorder(Node):
         self.sensed = 0
         self.distance = 0.0
         self._sensor_heard: dict[int, float] = {}
-        self._health = Health()
+        self._healths: dict[int, Health] = {}
+        self._answers: dict[int, tuple[Level, float]] = {}
+        self._seen: dict[int, tuple[int, int]] = {}
+        self._updates: list[Told] = []
         self._began: float | None = None
         self._heard = 0.0
         self._path = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)))
+        self._products: dict[str, bytes] = {}
         self._grid: OccupancyGrid | None = None
         self._reflectors = NO_REFLECTORS
         self._true_reflectors: Detections | None = None
@@ -71,13 +78,24 @@ class Recorder(Node):
         self._settled = time.monotonic() + SETTLE
         listen = self.create_subscription
         listen(PoseWithCovarianceStamped, 'pose', self.on_pose, DEEP)
+        listen(PointCloud2, 'frames', self.on_frame, DEEP)
+        listen(PointCloud2, 'reflectors/associated', self.on_associated, DEEP)
+        listen(PointCloud2, 'updates', self.on_update, DEEP)
         listen(Odometry, 'ground_truth', self.on_truth, DEEP)
         listen(PointCloud2, TRUE_REFLECTORS, self.on_true_reflectors, LATCHED)
-        listen(OccupancyGridMsg, 'map', self.on_map, LATCHED)
-        listen(Path, 'trajectory', self.on_trajectory, LATCHED)
         listen(PointCloud2, 'reflector_map_points', self.on_reflectors, LATCHED)
-        listen(MarkerArray, 'graph', self.on_graph, LATCHED)
         listen(DiagnosticArray, '/diagnostics', self.on_diagnostics, DEEP)
+        for topic, (kind, _) in self._large().items():
+            # bytes: only the last one of each is ever looked into
+            listen(kind, topic, partial(self.on_product, topic), LATCHED, raw=True)
+
+    def _large(self) -> dict[str, tuple[Any, Callable[[Any], None]]]:
+        """Products that are large: topic, type and callback."""
+        return {
+            'map': (OccupancyGridMsg, self.on_map),
+            'trajectory': (Path, self.on_trajectory),
+            'graph': (MarkerArray, self.on_graph),
+        }
 
     def is_ready(self) -> bool:
         """Whether front end and back end are there; from then on the sensor is listened to.
@@ -100,11 +118,8 @@ class Recorder(Node):
 
     def on_sensor(self, data: bytes) -> None:
         """One serialized message that begins with a header: note when it came."""
-        # CDR: four bytes of encapsulation, then the header's stamp (int32 sec, uint32 nanosec)
-        order = '<' if data[1] & 1 else '>'
-        sec, nanosec = struct.unpack_from(f'{order}iI', data, 4)
         self.sensed += 1
-        self._sensor_heard[sec * 1_000_000_000 + nanosec] = time.monotonic()
+        self._sensor_heard[stamp_of(data)] = time.monotonic()
 
     def on_pose(self, msg: PoseWithCovarianceStamped) -> None:
         """The front end's answer to a scan."""
@@ -112,10 +127,25 @@ class Recorder(Node):
         pose = convert.pose_estimate(msg)
         self._began = now if self._began is None else self._began
         self._heard = now
-        self.frames.add_pose(pose.stamp, pose.pose, pose.cov, self._health)
+        self.frames.add_pose(pose.stamp, pose.pose, pose.cov)
         heard = self._sensor_heard.pop(pose.stamp, None)
         if heard is not None:
             self.latency_ms.append((now - heard) * 1e3)
+
+    def on_frame(self, msg: PointCloud2) -> None:
+        """What the front end says of one pose: its level of health, and its cost."""
+        frame = read_record(msg).frame
+        self._answers[frame.stamp] = (frame.health.level, frame.wall_ms)
+
+    def on_associated(self, msg: PointCloud2) -> None:
+        """The detections of one pose: how many, and how many were used."""
+        associated = read_associated(msg)
+        used = int(np.sum(associated.statuses == Status.USED))
+        self._seen[associated.detections.stamp] = (len(associated.statuses), used)
+
+    def on_update(self, msg: PointCloud2) -> None:
+        """What one keyframe did, and its cost."""
+        self._updates.append(read_update(msg))
 
     def on_truth(self, msg: Odometry) -> None:
         """Where the robot really is."""
@@ -128,6 +158,10 @@ class Recorder(Node):
     def on_true_reflectors(self, msg: PointCloud2) -> None:
         """Where the reflectors really are."""
         self._true_reflectors = convert.detections(msg, Parameters().reflector, TRUE_REFLECTORS)
+
+    def on_product(self, topic: str, data: bytes) -> None:
+        """The newest map, trajectory or graph, serialized."""
+        self._products[topic] = data
 
     def on_map(self, msg: OccupancyGridMsg) -> None:
         """The newest map."""
@@ -157,15 +191,14 @@ class Recorder(Node):
 
     def on_diagnostics(self, msg: DiagnosticArray) -> None:
         """Health of the front end, and the figures of both nodes."""
+        stamp = msg.header.stamp.sec * 1_000_000_000 + msg.header.stamp.nanosec
         for status in msg.status:
             name = status.name.rsplit('/')[-1]
             self.figures[name] = {v.key: v.value for v in status.values}
             if name == 'front_end':
                 level = status.level[0] if isinstance(status.level, bytes) else status.level
                 reasons = tuple(status.message.split('; ')) if level else ()
-                self._health = Health(Level(min(int(level), 2)), reasons)
-                if self.frames.stamps and FRAME_TIME in self.figures[name]:
-                    self.frames.wall_ms.append(float(self.figures[name][FRAME_TIME]))
+                self._healths[stamp] = Health(Level(min(int(level), 2)), reasons)
 
     def error(self) -> float | None:
         """Position error [m] of the newest pose whose truth is known."""
@@ -181,16 +214,17 @@ class Recorder(Node):
         return now - self._heard if self._began is not None else 0.0
 
     def has_caught_up(self, since: float) -> bool:
-        """Whether the newest scan has its pose, and the map holds all but the last LAST_MAP.
+        """Whether the newest scan has its pose, and the map holds the newest pose.
 
         ``since`` is when the source ended; after PATIENCE the answer is yes in any case.
         """
         if time.monotonic() - since > PATIENCE:
             return True
         newest = max(self._sensor_heard, default=0)
-        mapped = self._path.stamps[-1] if len(self._path) else 0
+        path = self._products.get('trajectory')
+        mapped = stamp_of(path) if path is not None else 0
         answered = self.frames.stamps[-1] if self.frames.stamps else 0
-        return answered >= newest and mapped >= answered - LAST_MAP
+        return mapped >= answered >= newest
 
     def note(self) -> str:
         """One line for the progress."""
@@ -198,13 +232,16 @@ class Recorder(Node):
         parts = [
             f'error {100 * error:.1f} cm' if error is not None else 'no pose yet',
             f'{len(self._reflectors)} reflectors',
-            f'{len(self._keyframes)} keyframes',
-            f'{len(self._closures)} closures',
+            f'{len(self._updates)} keyframes',
+            f'{sum(u.accepted for u in self._updates)} closures',
         ]
         return ', '.join(parts)
 
     def run(self, name: str) -> Run:
         """Everything that was heard."""
+        for topic, (kind, take) in self._large().items():
+            if topic in self._products:
+                take(deserialize_message(self._products[topic], kind))
         stamps = np.array(sorted(self.true), dtype=np.int64)
         truth = None
         if len(stamps):
@@ -215,10 +252,34 @@ class Recorder(Node):
             )
         wall = 0.0 if self._began is None else self._heard - self._began
         return Run(
-            name, self.frames, self.trajectory(), self._reflectors, self._grid,
-            self._keyframes, self._closures, int(self._figure('back_end', 'closures rejected')),
+            name, self._log(), self.trajectory(), self._reflectors, self._grid,
+            self._keyframes, self._closures, sum(u.rejected for u in self._updates),
+            np.array([u.wall_ms for u in self._updates]),
             inputs=self.inputs(), truth=truth, wall_s=wall,
         )  # fmt: skip
+
+    def _log(self) -> FrameLog:
+        """The poses as published, each with its own health, detections and cost."""
+        log, live = FrameLog(), self.frames
+        for stamp, pose, cov in zip(live.stamps, live.poses, live.covs, strict=True):
+            level, wall_ms = self._answers.get(stamp, (Level.OK, None))
+            log.add_pose(stamp, pose, cov, Health(level, self._reasons(stamp, level)))
+            if wall_ms is not None:
+                log.wall_ms.append(wall_ms)
+            seen, used = self._seen.get(stamp, (0, 0))
+            log.seen.append(seen)
+            log.used.append(used)
+        return log
+
+    def _reasons(self, stamp: int, level: Level) -> tuple[str, ...]:
+        """Those of the diagnostics nearest in time that told the same level."""
+        if level is Level.OK:
+            return ()
+        near = min(
+            (t for t, h in self._healths.items() if h.level is level),
+            key=lambda t: abs(t - stamp), default=None,
+        )  # fmt: skip
+        return () if near is None else self._healths[near].reasons
 
     def trajectory(self) -> Trajectory:
         """The newest trajectory, and for the scans before and after it the live poses."""
@@ -231,9 +292,6 @@ class Recorder(Node):
             np.concatenate([live.poses[head], path.poses, live.poses[tail]]),
         )
 
-    def _figure(self, node: str, key: str) -> float:
-        return float(self.figures.get(node, {}).get(key, 0))
-
     def inputs(self, node: str = 'front_end') -> dict[str, dict[str, int]]:
         """What became of a node's inputs, from its diagnostics."""
         out: dict[str, dict[str, int]] = {}
@@ -243,3 +301,11 @@ class Recorder(Node):
                 fate = out.setdefault(stream, {'used': 0, 'late': 0, 'invalid': 0})
                 fate[what] = int(value)
         return out
+
+
+def stamp_of(data: bytes) -> int:
+    """Stamp [ns] of a serialized message that begins with a header."""
+    # CDR: four bytes of encapsulation, then the header's stamp (int32 sec, uint32 nanosec)
+    order = '<' if data[1] & 1 else '>'
+    sec, nanosec = struct.unpack_from(f'{order}iI', data, 4)
+    return int(sec) * 1_000_000_000 + int(nanosec)

@@ -63,6 +63,8 @@ def drive(live, front, back, start=0.0, end=SECONDS):
             continue
         front.sensors.add(stream, msg)
         live.executor.spin_once(timeout_sec=0.0)
+    for observation in front.sensors.sequencer.flush():  # as after a second of silence
+        front.process(observation)
     live.spin_until(lambda: back.health.newest == front.last.stamp)
     live.spin_until(lambda: back.mapper.worker.backlog == 0)
     live.drain()
@@ -73,6 +75,8 @@ def replayed(seconds=SECONDS):
     feed = Feed(Parameters(), slam, slam.sequencer.inputs)
     for stream, msg in room(seconds=seconds):
         feed.add(stream, msg)
+    for observation in slam.sequencer.flush():
+        slam.back_end.add(slam.front_end.process(observation))
     return slam
 
 

@@ -300,3 +300,40 @@ def test_scans_do_not_overtake_odometry_after_a_pause(live, node):
     live.spin_until(lambda: used(node, 'scan') >= sent - 1)
     assert used(node, 'scan', 'waited_out') == used(node, 'scan', 'late') == 0
     assert node.last.observation.motion.known
+
+
+def test_several_lidars_answer_each_on_their_own(live):
+    """A second lidar looks backwards from the same place: its rays are the first one's, turned."""
+    live.listen('pose', 'geometry_msgs/msg/PoseWithCovarianceStamped')
+    node = live.start(FrontEndNode, scan_topics=['front', 'rear/scan'], laser_pose=[0.2, 0.0, 0.0])
+    node.sensors.stop_waiting()
+    assert [node.count_subscribers(t) for t in ('front', 'rear/scan', 'scan')] == [1, 1, 0]
+    place = build.transform(make, SECOND, ('base_link', 'rear'), np.array([0.2, 0.0, np.pi]))
+    node.sensors.extrinsics.add(convert.transforms(make_transforms(place)))
+    live.spin_until(lambda: node.count_subscribers('pose') == 1)
+    sent = []
+    for stream, msg in room(seconds=4.0):
+        node.sensors.add(stream, msg)
+        if stream == 'scan':
+            rear = copy.deepcopy(msg)
+            rear.header.frame_id = 'rear'
+            rear.angle_min -= np.pi
+            rear.angle_max -= np.pi
+            node.sensors.add('scan', rear)
+            sent += [msg, rear]
+    counts = node.sensors.sequencer.inputs.totals()['scan']
+    assert counts['used'] >= len(sent) - 2
+    assert 'late' not in counts
+    assert 'duplicate' not in counts
+    poses = live_frames(live)
+    assert len(poses) == counts['used']
+    np.testing.assert_allclose(node.last.observation.origin, [0.2, 0.0], atol=1e-9)
+    speeds = [m.twist.twist.linear.x for m in live.heard['odometry/filtered']]
+    assert np.max(np.abs(speeds), initial=0.0) < 2.0
+
+
+def make_transforms(*transforms):
+    """What /tf_static would carry, without tf2_msgs."""
+    from types import SimpleNamespace
+
+    return SimpleNamespace(transforms=list(transforms))

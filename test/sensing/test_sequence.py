@@ -350,3 +350,59 @@ def test_imu_refines_the_motion_between_observations():
     assert m.bias_gain[2] == pytest.approx(-0.1)
     assert m.bias == pytest.approx(0.0, abs=1e-9)
     assert np.isfinite(m.bias_var)
+
+
+# --- several lidars ----------------------------------------------------------------------------
+
+
+def two_lidars(offset, delay, seconds=3.0):
+    """Odometry at 50 Hz and two lidars at 10 Hz; the rear one's scans are ``offset`` later.
+
+    The front one's arrive ``delay`` after their stamps, the others at once.
+    """
+    rows = []
+    for k in range(round(seconds * 50)):
+        stamp = T0 + 20 * MS * k
+        rows.append((stamp, 0, odometry(stamp)))
+        if k % 5 == 0:
+            rows.append((stamp + delay, 1, scan(stamp, frame='front')))
+            rows.append((stamp + offset, 2, scan(stamp + offset, (5.0, 6.0), frame='rear')))
+    return [m for *_, m in sorted(rows, key=lambda r: r[:2])]
+
+
+def two_lidar_sequencer():
+    sequencer = Sequencer(Parameters())
+    sequencer.set_sensor_pose('front', np.array([0.3, 0.0, 0.0]))
+    sequencer.set_sensor_pose('rear', np.array([-0.3, 0.0, np.pi]))
+    return sequencer
+
+
+# at once, at the same instant within drivers' rounding, and in between
+@pytest.mark.parametrize('offset', [0, MS, 30 * MS])
+@pytest.mark.parametrize('delay', [0, 90 * MS])
+def test_each_scan_of_two_lidars_is_used_from_its_own_place(offset, delay):
+    sequencer = two_lidar_sequencer()
+    out = feed(sequencer, two_lidars(offset, delay)) + sequencer.flush()
+    # the first period is not known yet: by then the rear lidar's first scan may have been used
+    lost = 1 if delay > offset else 0
+    assert sequencer.inputs.totals()['scan'].get('late', 0) <= lost
+    stamps = [o.stamp for o in out]
+    assert stamps == sorted(set(stamps))
+    for frame, x, n in (('front', 0.3, 4), ('rear', -0.3, 2)):
+        own = [o for o in out if o.scan.frame_id == frame]
+        assert 30 - lost <= len(own) <= 30
+        assert all(abs(o.stamp - o.scan.stamp) <= 1 for o in own)
+        assert all(o.origin[0] == x and len(o.scan.ranges) == n for o in own)
+
+
+def test_silent_lidar_is_not_waited_for():
+    sequencer = two_lidar_sequencer()
+    inputs = two_lidars(30 * MS, 0)
+    half = T0 + SECOND
+    silent = [
+        m for m in inputs if not isinstance(m, Scan) or m.frame_id == 'rear' or m.stamp < half
+    ]
+    out = feed(sequencer, silent) + sequencer.flush()
+    assert [o.scan.frame_id for o in out].count('rear') == 30
+    # while it may still come, the other waits as long as for anything else
+    assert sequencer.inputs.totals()['scan']['waited_out'] <= 10

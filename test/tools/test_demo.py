@@ -61,6 +61,9 @@ def test_demo_drives_maps_and_reports(world, tmp_path):
     # wide: a busy machine may lose messages, which costs accuracy
     assert f['ate_rmse_m'] < 0.1
     assert f['latency_ms']['median'] > 0.0
+    # as in a replay: one figure per scan and per keyframe
+    assert 0.0 < f['front_end_ms']['median'] <= f['front_end_ms']['max']
+    assert 0.0 < f['back_end_ms']['median'] <= f['back_end_ms']['max']
     assert len(read_tum(tmp_path / 'out' / 'trajectory.tum')) == f['scans']
     assert (tmp_path / 'out' / 'report.html').stat().st_size > 50_000
 

@@ -16,11 +16,16 @@ rclpy = pytest.importorskip('rclpy', reason='needs ROS 2 or its wheels')
 from rclpy.serialization import serialize_message  # noqa: E402
 
 from rlml_slam.maps.occupancy import OccupancyGrid  # noqa: E402
+from rlml_slam.motion import STILL  # noqa: E402
+from rlml_slam.rlml.back_end import Update  # noqa: E402
+from rlml_slam.rlml.loop_closure import Closure  # noqa: E402
 from rlml_slam.ros import build  # noqa: E402
 from rlml_slam.ros.associated import build_reflector_map  # noqa: E402
+from rlml_slam.ros.frames import build_record  # noqa: E402
 from rlml_slam.ros.messages import make_rclpy as make  # noqa: E402
+from rlml_slam.ros.updates import build_update  # noqa: E402
 from rlml_slam.tools.recorder import Recorder  # noqa: E402
-from rlml_slam.types import Detections, Health, Level, Scan  # noqa: E402
+from rlml_slam.types import Detections, Frame, Health, Level, Observation, Scan  # noqa: E402
 
 SECOND = 1_000_000_000
 
@@ -50,6 +55,14 @@ def scan(k):
     none = np.zeros(0, np.float32)
     s = Scan(k * SECOND + 7, 'laser', 0.0, 0.1, 0.0, 0.1, 30.0, ranges, none)
     return serialize_message(build.laser_scan(make, s))
+
+
+def frame(k, level, wall_ms):
+    observation = Observation(k * SECOND, STILL)
+    place, cov, none = np.zeros(3), np.eye(3), np.zeros(0, np.int64)
+    return Frame(
+        k * SECOND, observation, place, cov, place, cov, none, none, Health(level), wall_ms=wall_ms
+    )
 
 
 def test_poses_and_truth_become_errors(recorder):
@@ -109,11 +122,15 @@ def test_products_of_the_back_end_are_kept(recorder):
 def test_health_and_inputs_are_those_of_the_diagnostics(recorder):
     figures = {'frames': 3, 'scan used': 12, 'scan late': 1, 'odom used': 40}
     bad = Health(Level.DEGRADED, ('saw 0 of 4', 'no odometry'))
-    recorder.on_diagnostics(build.diagnostics(make, SECOND, 'front_end', bad, figures))
-    recorder.on_pose(pose(1, 0.0))
+    recorder.on_diagnostics(build.diagnostics(make, 2 * SECOND, 'front_end', bad, figures))
+    recorder.on_diagnostics(build.diagnostics(make, 3 * SECOND, 'front_end', Health(), figures))
+    for k, level in ((1, Level.OK), (2, Level.DEGRADED), (3, Level.OK)):
+        recorder.on_pose(pose(k, 0.0))
+        recorder.on_frame(build_record(make, frame(k, level, wall_ms=0.5 * k), 1, 'local'))
     run = recorder.run('drive')
-    assert run.frames.levels == [1]
-    assert run.frames.reasons == [('saw 0 of 4', 'no odometry')]
+    assert run.frames.levels == [0, 1, 0]
+    assert run.frames.reasons == [(), ('saw 0 of 4', 'no odometry'), ()]
+    assert run.frames.wall_ms == [0.5, 1.0, 1.5]
     assert run.inputs == {
         'scan': {'used': 12, 'late': 1, 'invalid': 0},
         'odom': {'used': 40, 'late': 0, 'invalid': 0},
@@ -128,10 +145,24 @@ def test_recorder_waits_for_poses_and_for_the_map(recorder):
     answer.header.stamp.nanosec = 7
     recorder.on_pose(answer)
     assert not recorder.has_caught_up(now)
-    path = build.path(make, 1, 'map', [8 * SECOND], np.zeros((1, 3)))
-    recorder.on_trajectory(path)
-    assert not recorder.has_caught_up(now)
-    assert recorder.has_caught_up(now - 60.0)
-    path = build.path(make, 1, 'map', [9 * SECOND], np.zeros((1, 3)))
-    recorder.on_trajectory(path)
-    assert recorder.has_caught_up(now)
+    for stamp, done in ((9 * SECOND, False), (10 * SECOND + 7, True)):
+        path = build.path(make, stamp, 'map', [stamp], np.zeros((1, 3)))
+        recorder.on_product('trajectory', serialize_message(path))
+        assert recorder.has_caught_up(now) is done
+        assert recorder.has_caught_up(now - 60.0)
+
+
+def test_every_keyframe_tells_its_cost_and_its_closures(recorder):
+    def closure(edge):
+        return Closure(0, 1, np.zeros(3), 0.6, edge, '')
+
+    closures = (closure(-1), closure(5), closure(-1))
+    for k, update in enumerate(
+        (Update(0, np.zeros(3), False, (), 2.0), Update(1, np.zeros(3), True, closures, 7.5))
+    ):
+        place = np.array([1.0, 2.0])
+        recorder.on_update(build_update(make, (k + 1) * SECOND, 'map', place, update))
+    run = recorder.run('drive')
+    assert_array_equal(run.back_end_ms, [2.0, 7.5])
+    assert run.rejected == 2
+    assert '2 keyframes, 1 closures' in recorder.note()
