@@ -117,6 +117,7 @@ class SimulatedTopics:
 
         self._messages = SimulatedMessages(make_rclpy, simulation.parameters)
         self._publishers: dict[str, Any] = {}
+        self.published = dict.fromkeys(TOPICS, 0)
         for topic, (msgtype, depth) in TOPICS.items():
             qos = QoSProfile(depth=depth)
             if topic in SENSOR_TOPICS:
@@ -149,3 +150,4 @@ class SimulatedTopics:
         for event in events:
             topic, message = self._messages(event.message)
             self._publishers[topic].publish(message)
+            self.published[topic] += 1

@@ -96,6 +96,8 @@ TOPICS = (
     Topic('simulator', OUT, 'ground_truth', 'nav_msgs/Odometry', RELIABLE, 'true pose in the map'),
     Topic('simulator', OUT, 'ground_truth_reflectors', CLOUD, LATCHED,
           'true places of the reflectors'),
+    Topic('simulator', OUT, '/diagnostics', 'diagnostic_msgs/DiagnosticArray', RELIABLE,
+          '1 Hz: how many messages were published'),
     Topic('simulator', OUT, '/clock', 'rosgraph_msgs/Clock', RELIABLE, 'simulated time'),
     Topic('simulator', OUT, '/tf_static', 'tf2_msgs/TFMessage', LATCHED, 'base_link to laser'),
 )  # fmt: skip

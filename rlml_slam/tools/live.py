@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,9 +23,11 @@ from rlml_slam.tools.processes import Processes, free_domain
 from rlml_slam.tools.progress import Progress
 from rlml_slam.tools.record import Run
 from rlml_slam.tools.recorder import Recorder
+from rlml_slam.tools.usage import Usage, summary
 
 START_TIMEOUT = 90.0  # [s] for three processes to start and to find each other
 SILENCE = 15.0  # [s] without a pose while the source runs: something is broken
+SYSTEM = ('front_end', 'back_end')
 LISTENERS = 2  # of the sensor: front end and recorder; time begins when both are there
 
 
@@ -64,18 +66,19 @@ def drive(source: Source, out: Path, quiet: bool) -> Run:
         executor.add_node(recorder)
         try:
             _start(processes, source)
+            load = Load(processes)
             with Progress('driving', 1.0, quiet) as progress:
                 for _ in _listen(processes, recorder, executor, source.executable):
                     check()
+                    load.sample(recorder)
                     progress.update(source.progress(recorder), recorder.note())
-            memory = [processes.peak_rss_mb(name) for name in ('front_end', 'back_end')]
         finally:
             executor.shutdown(timeout_sec=1.0)
             recorder.destroy_node()
     if not recorder.frames.stamps:
         raise RlmlError('the front end never published a pose')
     result = recorder.run(source.title)
-    result.extra = _live_figures(recorder, memory)
+    result.extra = _live_figures(recorder, load)
     return result
 
 
@@ -116,7 +119,7 @@ def held_interrupts() -> Iterator[Callable[[], None]]:
 
 def _start(processes: Processes, source: Source) -> None:
     """The three nodes; the source waits until the others listen."""
-    for name in ('front_end', 'back_end'):
+    for name in SYSTEM:
         processes.start(name, node(name, source.system, source.config))
     processes.start(source.executable, node(source.executable, source.parameters))
 
@@ -141,7 +144,7 @@ def _listen(
         executor.spin_once(timeout_sec=0.1)
         now = time.monotonic()
         recorder.is_ready()
-        processes.check('front_end', 'back_end')
+        processes.check(*SYSTEM)
         if finished is None and processes.has_ended(source):
             finished = now
         if not recorder.frames.stamps and now - began > START_TIMEOUT:
@@ -151,12 +154,37 @@ def _listen(
         yield
 
 
-def _live_figures(recorder: Recorder, memory: Sequence[float | None]) -> dict[str, Any]:
-    """What only a live run has: scans sent, and the time from a scan to its pose."""
-    figures: dict[str, Any] = {'scans_published': recorder.sensed}
+class Load:
+    """CPU time and memory of the system's nodes, from the first pose on."""
+
+    def __init__(self, processes: Processes) -> None:
+        self._processes = processes
+        self._samples: dict[str, list[Usage]] = {name: [] for name in SYSTEM}
+        self._due = 0.0
+
+    def sample(self, recorder: Recorder) -> None:
+        """Look once a second while poses come."""
+        now = time.monotonic()
+        if not recorder.frames.stamps or now < self._due:
+            return
+        self._due = now + 1.0
+        for name, samples in self._samples.items():
+            seen = self._processes.usage(name)
+            if seen is not None:
+                samples.append(seen)
+
+    def summary(self) -> dict[str, dict[str, Any]]:
+        """By node; empty where the system does not say."""
+        return {name: summary(samples) for name, samples in self._samples.items() if samples}
+
+
+def _live_figures(recorder: Recorder, load: Load) -> dict[str, Any]:
+    """What only a live run has: scans sent, the time from a scan to its pose, and the load."""
+    figures: dict[str, Any] = {'scans_published': recorder.sent()}
     if recorder.latency_ms:
         figures['latency_ms'] = distribution(recorder.latency_ms)
-    known = [mb for mb in memory if mb is not None]
-    if known:
-        figures['peak_rss_mb'] = round(sum(known), 1)
+    nodes = load.summary()
+    if nodes:
+        figures['nodes'] = nodes
+        figures['peak_rss_mb'] = round(sum(n['peak_rss_mb'] for n in nodes.values()), 1)
     return figures

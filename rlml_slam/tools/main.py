@@ -70,6 +70,7 @@ COMMANDS: Table = {
         'measured speed and quality against other libraries',
         {
             'back-end': Command('bench_back_end', 'the graph solver against other libraries'),
+            'live': Command('bench_live', 'whether the live nodes keep up with a fast laser'),
         },
     ),
     'docs': Command('docs', "the README's tables from the declarations in the code"),

@@ -15,6 +15,7 @@ from pathlib import Path
 from types import TracebackType
 
 from rlml_slam.errors import RlmlError
+from rlml_slam.tools.usage import Usage, usage
 
 GRACE = 5.0  # [s] in which a child has to end after SIGINT
 LAST_LINES = 15  # of a dead child's output are shown
@@ -75,14 +76,9 @@ class Processes:
         text = self._log(name).read_text(encoding='utf-8', errors='replace')
         return '\n'.join(f'  {line}' for line in text.splitlines()[-LAST_LINES:])
 
-    def peak_rss_mb(self, name: str) -> float | None:
-        """Largest resident memory of a running child [MB]; None where the system does not say."""
-        try:
-            status = Path(f'/proc/{self._children[name].pid}/status').read_text()
-        except OSError:
-            return None
-        rows = [line for line in status.splitlines() if line.startswith('VmHWM')]
-        return int(rows[0].split()[1]) * 1024 / 1e6 if rows else None
+    def usage(self, name: str) -> Usage | None:
+        """CPU time and memory of a running child; None where the system does not say."""
+        return usage(self._children[name].pid, time.monotonic())
 
     def stop(self) -> None:
         """End all children: SIGINT first, SIGKILL for those that do not listen."""

@@ -200,6 +200,12 @@ class Recorder(Node):
                 reasons = tuple(status.message.split('; ')) if level else ()
                 self._healths[stamp] = Health(Level(min(int(level), 2)), reasons)
 
+    def sent(self) -> int:
+        """Messages of the sensor that its source says it sent; else those that came here."""
+        key = f'{self._sensor[0]} published'
+        told = [int(f[key]) for f in self.figures.values() if key in f]
+        return told[0] if told else self.sensed
+
     def error(self) -> float | None:
         """Position error [m] of the newest pose whose truth is known."""
         for stamp, pose in zip(
@@ -209,12 +215,17 @@ class Recorder(Node):
                 return float(np.hypot(*(pose - self.true[stamp])[:2]))
         return None
 
+    def elapsed(self) -> float:
+        """Seconds of message time from the first pose to the newest."""
+        stamps = self.frames.stamps
+        return (stamps[-1] - stamps[0]) * 1e-9 if stamps else 0.0
+
     def silence(self, now: float) -> float:
         """Seconds since the last pose, 0 before the first."""
         return now - self._heard if self._began is not None else 0.0
 
     def has_caught_up(self, since: float) -> bool:
-        """Whether the newest scan has its pose, and the map holds the newest pose.
+        """Whether the newest scan has its pose, which is in the map and in the diagnostics.
 
         ``since`` is when the source ended; after PATIENCE the answer is yes in any case.
         """
@@ -224,7 +235,8 @@ class Recorder(Node):
         path = self._products.get('trajectory')
         mapped = stamp_of(path) if path is not None else 0
         answered = self.frames.stamps[-1] if self.frames.stamps else 0
-        return mapped >= answered >= newest
+        told = max(self._healths, default=0)
+        return min(mapped, told) >= answered >= newest
 
     def note(self) -> str:
         """One line for the progress."""

@@ -7,11 +7,13 @@ import os
 import socket
 import time
 
+import numpy as np
 import pytest
 
 from rlml_slam.errors import RlmlError
 from rlml_slam.tools import processes as module
 from rlml_slam.tools.processes import Processes, free_domain
+from rlml_slam.tools.usage import Usage, summary, usage
 
 SLEEPER = 'import time\nprint("ready", flush=True)\ntime.sleep(600)\n'
 STUBBORN = 'import signal, time\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\n' + SLEEPER
@@ -84,7 +86,18 @@ def test_children_get_the_environment(start):
 def test_memory_of_a_running_child_is_known(start):
     children = start('sleeper', SLEEPER)
     wait(lambda: 'ready' in children.last_words('sleeper'))
-    assert 1.0 < children.peak_rss_mb('sleeper') < 500.0
+    used = children.usage('sleeper')
+    assert 1.0 < used.rss_mb <= used.peak_rss_mb < 500.0
+    assert 0.0 <= used.cpu_s < 60.0
+
+
+def test_load_is_the_slope_of_what_was_sampled():
+    samples = [Usage(t, 10.0 + 0.3 * t, 100.0 + 0.5 * t, 150.0) for t in np.arange(20.0)]
+    assert summary(samples) == {
+        'cpu_share': 0.3, 'peak_rss_mb': 150.0, 'rss_growth_mb_per_min': 30.0
+    }  # fmt: skip
+    assert summary(samples[:1])['cpu_share'] is None
+    assert usage(-1, 0.0) is None
 
 
 def test_taken_domain_is_not_free(monkeypatch):

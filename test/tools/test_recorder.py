@@ -148,6 +148,9 @@ def test_recorder_waits_for_poses_and_for_the_map(recorder):
     for stamp, done in ((9 * SECOND, False), (10 * SECOND + 7, True)):
         path = build.path(make, stamp, 'map', [stamp], np.zeros((1, 3)))
         recorder.on_product('trajectory', serialize_message(path))
+        recorder.on_diagnostics(build.diagnostics(make, stamp - 1, 'front_end', Health(), {}))
+        assert not recorder.has_caught_up(now)
+        recorder.on_diagnostics(build.diagnostics(make, stamp, 'front_end', Health(), {}))
         assert recorder.has_caught_up(now) is done
         assert recorder.has_caught_up(now - 60.0)
 
