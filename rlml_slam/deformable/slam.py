@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from rlml_slam.deformable.bridge import bridge
 from rlml_slam.deformable.gyro_bias import GyroBias
 from rlml_slam.deformable.velocity import VelocityHistory
 from rlml_slam.deformable.window import CarrierVelocity, DeformableWindow, WindowEstimate
@@ -30,7 +31,7 @@ class DeformableSlam:
 
     def restart(self) -> None:
         """Forget everything, the announced velocities included."""
-        self._velocities = VelocityHistory()
+        self._velocities = VelocityHistory(self._p.deformable.velocity_timeout)
         self.begin_at(np.array(self._p.node.map_start_pose))
 
     def begin_at(self, pose: Array, cov: Array | None = None) -> None:
@@ -40,6 +41,7 @@ class DeformableSlam:
         self._bias = GyroBias(p.motion)
         self._heading = float(pose[2])
         self._stamp: int | None = None
+        self._wheels: Array | None = None  # raw odometry of the last observation
         self._last_seen: int | None = None  # stamp with a detection of a known feature
         self.estimate: WindowEstimate | None = None
         self.velocity = CarrierVelocity(np.zeros(2))
@@ -81,6 +83,9 @@ class DeformableSlam:
         """Motion since the last observation without the gyro's bias, its covariance regular."""
         dt = 1.0 if self._stamp is None else (observation.stamp - self._stamp) * 1e-9
         motion = self._bias.correct(observation.motion, dt)
+        if not motion.known:
+            motion = bridge(motion, self._wheels, observation.odom_pose, dt, self._p.motion)
+        self._wheels = observation.odom_pose
         floor = self._p.deformable.motion_floor**2 * dt * np.eye(3)
         return replace(motion, cov=motion.cov + floor)
 

@@ -15,10 +15,12 @@ MAX_KEPT = 10_000  # announcements: more than a minute of silence of everything 
 class VelocityHistory:
     """Each velocity holds from its stamp to the next one's; the first one held before it as well.
 
-    Announcements may come in any order. What no later ``mean`` can ask for is forgotten.
+    Announcements may come in any order. What no later ``mean`` can ask for is forgotten. One that
+    has held for more than ``timeout`` seconds is not relied upon.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, timeout: float) -> None:
+        self._timeout = int(timeout * 1e9)
         self._stamps: list[int] = []
         self._velocities: list[CarrierVelocity] = []
 
@@ -41,7 +43,8 @@ class VelocityHistory:
     def mean(self, start: int, end: int) -> CarrierVelocity:
         """Mean velocity from ``start`` to ``end`` > start [ns]; 0 where none was announced.
 
-        Times before ``start`` must not be asked for afterwards.
+        Its sigma is the speed itself for the share of the time after the timeout: the carrier may
+        have stopped, or go another way. Times before ``start`` must not be asked for afterwards.
         """
         if not self._stamps:
             return CarrierVelocity(np.zeros(2))
@@ -51,8 +54,11 @@ class VelocityHistory:
         held = self._velocities[first : last + 1]
         linear = share @ np.stack([v.linear for v in held])
         angular = float(share @ np.array([v.angular for v in held]))
+        trusted_to = np.array(self._stamps[first : last + 1]) + self._timeout
+        late = np.maximum(cuts[1:] - np.maximum(cuts[:-1], trusted_to), 0) / (end - start)
+        sigma = float(late @ np.array([np.hypot(*v.linear) for v in held]))
         self._forget(first)
-        return CarrierVelocity(linear, angular)
+        return CarrierVelocity(linear, angular, sigma)
 
     def _at(self, stamp: int) -> int:
         return max(bisect_right(self._stamps, stamp) - 1, 0)

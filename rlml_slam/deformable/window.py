@@ -34,11 +34,13 @@ SLOTS = 4  # features are given room in steps of this many
 class CarrierVelocity:
     """Nominal velocity of the carrier in the axes of the estimate's frame [m/s, rad/s].
 
-    The linear part is that of the centroid of its features.
+    The linear part is that of the centroid of its features. ``sigma`` [m/s] is by how much a
+    feature's velocity may differ from it all the time, 0 where the velocity is as announced.
     """
 
     linear: Array  # (2,)
     angular: float = 0.0
+    sigma: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -78,9 +80,9 @@ class _Track:
     """Book-keeping of one slot in use."""
 
     key: int
-    id: int
-    sightings: int
-    last_seen: int  # stamp
+    id: int = ANONYMOUS
+    sightings: int = 0
+    last_seen: int = 0  # stamp
 
 
 class DeformableWindow:
@@ -124,8 +126,9 @@ class DeformableWindow:
         else:
             self._advance((stamp - self._stamp) * 1e-9, motion, velocity)
         self._stamp = stamp
-        keys, statuses = self._sight(stamp, detections)
         self._forget(stamp)
+        keys, statuses = self._sight(stamp, detections)
+        self._lead()
         iterations, chi2 = self._optimize()
         return self._estimate(stamp, keys, statuses, iterations, chi2)
 
@@ -141,11 +144,10 @@ class DeformableWindow:
         ):  # fmt: skip
             if not np.all(np.isfinite(value)):
                 raise InputError(f'deformable window: {what} at {stamp} is not finite')
-        for cov in (motion.cov, *detections.cov):
-            if not _is_covariance(cov):
-                raise InputError(
-                    f'deformable window: a covariance at {stamp} is not positive definite'
-                )
+        if not _are_covariances(motion.cov) or not _are_covariances(detections.cov):
+            raise InputError(
+                f'deformable window: a covariance at {stamp} is not positive definite'
+            )
 
     def _allocate(self, slots: int) -> None:
         """Arrays of the window with room for ``slots`` features, all empty."""
@@ -179,7 +181,9 @@ class DeformableWindow:
         k = self._length - 1
         w.delta[k], w.motion_info[k] = motion.delta, _inverse(motion.cov)
         w.translation[k], w.turn[k] = velocity.linear * dt, velocity.angular * dt
-        w.own[k], w.common[k] = self._p.drift**2 * dt, self._p.common_drift**2 * dt
+        lasting = (velocity.sigma * dt) ** 2  # not a random walk: it grows with the time squared
+        w.own[k] = self._p.drift**2 * dt + lasting
+        w.common[k] = self._p.common_drift**2 * dt + lasting
         lives, F = w.active[k], np.empty_like(self._cov)
         carry(
             w.mean[k], lives, w.leads[k], w.delta[k], w.translation[k], w.turn[k],
@@ -199,13 +203,13 @@ class DeformableWindow:
         slots = sorted(self._tracks)
         association = self._associator.associate(detections, self._believed(slots))
         status = np.where(near, association.status, Status.GHOST).astype(np.int64)
+        info = _inverse(detections.cov)
         keys = np.full(len(detections), -1, dtype=np.int64)
-        for i in np.flatnonzero(status == Status.USED).tolist():
-            slot = slots[association.match[i]]
-            self._see(slot, stamp, i, detections)
-            keys[i] = self._tracks[slot].key
-        for i in np.flatnonzero(status == Status.NEW).tolist():
-            keys[i] = self._tracks[self._start_track(stamp, i, detections)].key
+        for i in np.flatnonzero((status == Status.USED) | (status == Status.NEW)).tolist():
+            point, id = detections.points[i], int(detections.ids[i])
+            new = status[i] == Status.NEW
+            slot = self._start_track(point) if new else slots[association.match[i]]
+            keys[i] = self._see(slot, stamp, id, point, info[i])
         return keys, status
 
     def _believed(self, slots: list[int]) -> Believed:
@@ -217,44 +221,56 @@ class DeformableWindow:
             state[:3], state[rows[3:]].reshape(-1, 2), ids, self._cov[np.ix_(rows, rows)]
         )
 
-    def _see(self, slot: int, stamp: int, i: int, detections: Detections) -> None:
+    def _see(self, slot: int, stamp: int, id: int, point: Array, info: Array) -> int:
+        """Enter a sighting of the feature in ``slot``; its key."""
         k, track = self._length - 1, self._tracks[slot]
-        self._w.z[k, slot], self._w.z_info[k, slot] = (
-            detections.points[i],
-            _inverse(detections.cov[i]),
-        )
+        self._w.z[k, slot], self._w.z_info[k, slot] = point, info
         track.sightings += 1
         track.last_seen = stamp
         if track.id == ANONYMOUS:
-            track.id = int(detections.ids[i])
+            track.id = id
+        return track.key
 
-    def _start_track(self, stamp: int, i: int, detections: Detections) -> int:
+    def _start_track(self, point: Array) -> int:
         """A new feature in a slot that no step of the window uses; its slot."""
         free = np.flatnonzero(~self._w.active[: self._length].any(axis=0))
         if len(free) == 0:
             free = np.array([self._w.active.shape[1]])
             self._grow()
-        slot, k = int(free[0]), self._length - 1
-        self._tracks[slot] = _Track(self._next_key, int(detections.ids[i]), 0, stamp)
+        slot, state = int(free[0]), self._w.mean[self._length - 1]
+        self._tracks[slot] = _Track(self._next_key)
         self._next_key += 1
-        self._w.active[k, slot] = True
-        self._w.mean[k, 3 + 2 * slot : 5 + 2 * slot] = transform(
-            self._w.mean[k, :3], detections.points[i : i + 1]
-        )[0]
-        self._see(slot, stamp, i, detections)
+        self._w.active[self._length - 1, slot] = True
+        state[3 + 2 * slot : 5 + 2 * slot] = transform(state[:3], point[None])[0]
         return slot
 
     def _forget(self, stamp: int) -> None:
-        """Drop features that have not been seen for long, candidates sooner."""
+        """Drop features that have not been seen for long, candidates sooner.
+
+        Before the sightings: after a gap in the data, nobody knows where the carrier went.
+        """
         k = self._length - 1
         for slot, track in list(self._tracks.items()):
-            confirmed = track.sightings >= self._reflector.min_sightings
-            patience = self._p.forget_after if confirmed else self._p.candidate_timeout
+            patience = (
+                self._p.forget_after if self._is_confirmed(track) else self._p.candidate_timeout
+            )
             if (stamp - track.last_seen) * 1e-9 > patience:
                 del self._tracks[slot]
-                self._w.active[k, slot] = confirmed = False
+                self._w.active[k, slot] = False
                 self._w.mean[k, 3 + 2 * slot : 5 + 2 * slot] = 0.0
-            self._w.leads[k, slot] = confirmed
+
+    def _lead(self) -> None:
+        """The carrier turns about its confirmed features."""
+        leads = self._w.leads[self._length - 1]
+        leads[:] = False
+        leads[self._confirmed()] = True
+
+    def _confirmed(self) -> list[int]:
+        """Slots of the features that are no candidates any more."""
+        return [slot for slot in sorted(self._tracks) if self._is_confirmed(self._tracks[slot])]
+
+    def _is_confirmed(self, track: _Track) -> bool:
+        return track.sightings >= self._reflector.min_sightings
 
     def _optimize(self) -> tuple[int, float]:
         iterations, cost = optimize_window(
@@ -274,11 +290,7 @@ class DeformableWindow:
         chi2: float,
     ) -> WindowEstimate:
         state = self._w.mean[self._length - 1]
-        slots = [
-            s
-            for s in sorted(self._tracks)
-            if self._tracks[s].sightings >= self._reflector.min_sightings
-        ]
+        slots = self._confirmed()
         rows = _rows(slots)
         joint = self._cov[np.ix_(rows, rows)]
         blocks = [joint[k : k + 2, k : k + 2] for k in range(3, len(rows), 2)]
@@ -300,19 +312,19 @@ def _rows(slots: list[int]) -> NDArray[np.int64]:
     return np.array([0, 1, 2, *features], dtype=np.int64)
 
 
-def _is_covariance(cov: Array) -> bool:
-    """Symmetric and positive definite."""
+def _are_covariances(cov: Array) -> bool:
+    """Whether all of (..., n, n) are symmetric and positive definite."""
     try:
         np.linalg.cholesky(cov)
     except np.linalg.LinAlgError:
         return False
-    return bool(np.allclose(cov, cov.T))
+    return bool(np.allclose(cov, cov.swapaxes(-1, -2)))
 
 
 def _inverse(cov: Array) -> Array:
-    """Information of a covariance, symmetric."""
+    """Information of covariances (..., n, n), symmetric."""
     inverse = np.linalg.inv(cov)
-    symmetric: Array = 0.5 * (inverse + inverse.T)
+    symmetric: Array = 0.5 * (inverse + inverse.swapaxes(-1, -2))
     return symmetric
 
 

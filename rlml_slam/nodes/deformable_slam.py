@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import sys
+import time
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -23,6 +25,8 @@ from rlml_slam.ros.run import run
 from rlml_slam.ros.sensors import RELIABLE, Sensors, checked
 from rlml_slam.types import Observation
 
+KEPT = 6000  # updates whose cost the diagnostics tell: 10 minutes at 10 Hz
+
 
 class DeformableSlamNode(Node):
     """Drives a DeformableSlam with detections; all stamps are those of the input."""
@@ -31,6 +35,7 @@ class DeformableSlamNode(Node):
         super().__init__('deformable_slam', **options)
         p: DeformableParameters = declare(self, DeformableParameters)
         self.slam = DeformableSlam(p)
+        self.cost: deque[tuple[float, float]] = deque(maxlen=KEPT)  # wall and CPU time [s]
         warm_up.compile_loaded()
         self.answers = EstimatePublisher(self, p)
         self.velocity = VelocityInput(self, p.node, self.slam.announce)
@@ -44,11 +49,13 @@ class DeformableSlamNode(Node):
 
     def process(self, observation: Observation) -> None:
         """One observation: estimate and publish."""
+        wall, cpu = time.perf_counter(), time.thread_time()
         self.velocity.drain()
         frame = self.slam.process(observation)
         if self.slam.estimate is not None:
             self.answers.publish(self.slam.estimate, self.slam.velocity)
         self.health.update(frame)
+        self.cost.append((time.perf_counter() - wall, time.thread_time() - cpu))
 
     def start_at(self, msg: PoseWithCovarianceStamped) -> None:
         """Begin anew at a pose of the map."""
@@ -63,7 +70,14 @@ class DeformableSlamNode(Node):
     def figures(self) -> dict[str, object]:
         """Figures for /diagnostics."""
         estimate = self.slam.estimate
-        return {'features': 0 if estimate is None else len(estimate.features.keys)}
+        out: dict[str, object] = {
+            'features': 0 if estimate is None else len(estimate.features.keys)
+        }
+        if self.cost:
+            wall, cpu = 1e3 * np.percentile(self.cost, 99, axis=0)
+            out['wall time of an update, p99 [ms]'] = f'{wall:.2f}'
+            out['CPU time of an update, p99 [ms]'] = f'{cpu:.2f}'
+        return out
 
 
 def main() -> int:

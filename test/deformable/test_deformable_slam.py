@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rlml_slam.deformable.active import offsets
+from rlml_slam.deformable.bridge import bridge
 from rlml_slam.deformable.gyro_bias import GyroBias
 from rlml_slam.deformable.scoring import chi2_bounds
 from rlml_slam.deformable.slam import DeformableSlam
@@ -19,11 +20,13 @@ from rlml_slam.params import (
     DeformableParameters,
     MotionNoise,
     Node,
+    Parameters,
     Reflector,
 )
-from rlml_slam.se2 import exp
+from rlml_slam.se2 import compose, exp, wrap
+from rlml_slam.sensing.sequence import Sequencer
 from rlml_slam.simulation.carrier import simulate_carrier
-from rlml_slam.types import Level, Motion, Observation
+from rlml_slam.types import Level, Motion, Observation, Odometry
 
 SECOND = 1_000_000_000
 STILL = CarrierVelocity(np.zeros(2))
@@ -52,7 +55,7 @@ def drive(run, params=None):
 
 
 def test_velocity_holds_until_the_next_one():
-    history = VelocityHistory()
+    history = VelocityHistory(60.0)
     for stamp, v in ((3, 3.0), (0, 1.0), (1, 2.0), (1, 5.0)):  # out of order; the last one wins
         history.add(stamp * SECOND, CarrierVelocity(np.array([v, -v]), 0.1 * v))
     mean = history.mean(0, 4 * SECOND)  # 1 s at 1, 2 s at 5, 1 s at 3
@@ -63,16 +66,29 @@ def test_velocity_holds_until_the_next_one():
 
 
 def test_first_velocity_held_before_it_and_none_is_standing_still():
-    history = VelocityHistory()
+    history = VelocityHistory(1.0)
     assert history.age(5) is None
     np.testing.assert_array_equal(history.mean(0, 5).linear, [0.0, 0.0])
     history.add(10 * SECOND, CarrierVelocity(np.array([1.0, 0.0])))
-    np.testing.assert_allclose(history.mean(SECOND, 2 * SECOND).linear, [1.0, 0.0])
+    before = history.mean(SECOND, 2 * SECOND)
+    np.testing.assert_allclose(before.linear, [1.0, 0.0])
+    assert before.sigma == 0.0
     assert history.age(SECOND) == 0.0
 
 
+def test_velocity_is_unknown_by_its_own_size_after_the_timeout():
+    history = VelocityHistory(1.0)
+    history.add(SECOND, CarrierVelocity(np.array([3.0, 4.0])))
+    assert history.mean(SECOND, 2 * SECOND).sigma == 0.0
+    assert history.mean(SECOND, 5 * SECOND).sigma == pytest.approx(5.0 * 3 / 4)
+    assert history.mean(4 * SECOND, 5 * SECOND).sigma == pytest.approx(5.0)
+    history.add(9 * SECOND, CarrierVelocity(np.array([1.0, 0.0])))
+    # 4 s of silence, 1 s of the new one's first, 1 s after its timeout
+    assert history.mean(5 * SECOND, 11 * SECOND).sigma == pytest.approx((5.0 * 4 + 1.0 * 1) / 6)
+
+
 def test_history_forgets_what_was_used_and_has_a_limit():
-    history = VelocityHistory()
+    history = VelocityHistory(1.0)
     for k in range(MAX_KEPT + 50):
         history.add(k, STILL)
     assert len(history._stamps) == len(history._velocities) == MAX_KEPT
@@ -193,6 +209,73 @@ def test_unsolvable_window_begins_anew_where_the_robot_is(monkeypatch):
     step = np.linalg.norm(slam.estimate.pose[:2] - answers[-1][1].pose[:2])
     assert step == pytest.approx(np.linalg.norm(run[-1].motion.delta[:2]), abs=1e-6)
     assert np.all(np.diag(frame.cov_map) >= np.diag(answers[-1][1].cov))
+
+
+def with_gap(kind, seed, gap, ids=True):
+    """A drive of 10 s and a ``gap`` of the data at 4 s, as a node hears it; NEES per update."""
+    noise = MotionNoise(
+        a=0.0, b=0.01 / np.sqrt(0.1), c=0.0, d=0.004 / np.sqrt(0.1), lateral=0.01 / np.sqrt(0.1)
+    )  # fmt: skip
+    params = DeformableParameters(motion=noise)
+    sequencer = Sequencer(Parameters(motion=noise, node=params.node))
+    slam, wheels, errors = DeformableSlam(params), np.zeros(3), []
+    run = steps(round(10 * (10 + gap)) + 1, seed, kind=kind, ids=ids)
+    for step, after in pairwise(run):
+        wheels = compose(wheels, step.motion.delta)
+        if 0.0 <= step.stamp / SECOND - 4.0 < gap:
+            continue
+        stamp = SECOND + step.stamp
+        slam.announce(stamp, CarrierVelocity(after.linear, after.angular))
+        ready = sequencer.add_odometry(Odometry(stamp, wheels))
+        ready += sequencer.add_detections(replace(step.detections, stamp=stamp))
+        for observation in ready:
+            frame = slam.process(observation)
+            if observation.stamp == stamp:
+                error = frame.T_map_base - step.pose
+                error[2] = wrap(error[2])
+                errors.append(error @ np.linalg.solve(frame.cov_map, error))
+    return errors, slam
+
+
+@pytest.mark.parametrize(('kind', 'gap'), [('train', 3.0), ('train', 25.0), ('conveyor', 8.0)])
+def test_gap_of_the_data_leaves_the_estimate_consistent(kind, gap):
+    """Right after the gap and 6 s later, over 12 drives: independent samples."""
+    drives = [with_gap(kind, seed, gap)[0] for seed in range(12)]
+    low, high = chi2_bounds(3, 12)
+    # what happened in the gap is a guess, and a generous one
+    assert np.mean([d[40] for d in drives]) < high
+    assert low < np.mean([d[-1] for d in drives]) < high
+
+
+def test_features_unseen_for_long_are_new_ones_even_where_they_are_seen_again():
+    """Nobody knows where the carrier went meanwhile."""
+    _, slam = with_gap('train', 0, 4.5)
+    assert slam.estimate.features.keys.max() == 5
+    _, slam = with_gap('train', 0, 6.0)
+    assert slam.estimate.features.keys.min() == 6
+
+
+def test_bridge_is_what_the_wheels_counted_and_no_more_than_they_can_count():
+    unknown = Motion(np.zeros(3), np.diag([0.4, 0.4, 0.1]), known=False)
+    start, moved = np.array([3.0, 1.0, 0.7]), np.array([12.0, -4.0, 0.9])
+    known = bridge(unknown, start, compose(start, moved), 20.0, MotionNoise())
+    np.testing.assert_allclose(known.delta, moved, atol=1e-12)
+    assert known.known
+    reset = bridge(unknown, start, compose(start, 10.0 * moved), 20.0, MotionNoise())
+    lost = bridge(unknown, None, start, 20.0, MotionNoise())
+    for motion in (reset, lost):
+        assert not motion.known
+        np.testing.assert_allclose(motion.cov, np.diag([80.0, 80.0, 0.1]))
+
+
+def test_unknown_speed_lasts_as_long_as_the_gap():
+    """The noise of an unknown speed does not average out as that of a known one does."""
+    run = steps(30)
+    answers, slam = drive(run[:-1])
+    lost = Motion(np.zeros(3), np.diag([0.4, 0.4, 0.1]), known=False)  # 1 m/s, white, for 4 s
+    slam.process(Observation(run[28].stamp + 4 * SECOND, lost))
+    grown = np.diag(slam.estimate.cov) - np.diag(answers[-1][1].cov)
+    np.testing.assert_allclose(grown, [16.0, 16.0, 0.1], rtol=1e-3)
 
 
 def test_start_pose_is_a_parameter():
