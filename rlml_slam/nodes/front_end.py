@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
-from rlml_slam import warm_up
+from rlml_slam import se2, warm_up
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.front_end import FrontEnd
 from rlml_slam.ros import convert
@@ -25,6 +27,8 @@ from rlml_slam.ros.run import run
 from rlml_slam.ros.sensors import LATCHED, RELIABLE, Sensors, checked
 from rlml_slam.se2 import Array
 from rlml_slam.types import Frame, Observation, Reflectors
+
+RECENT = 1000  # frames that an initialpose may be of: the search for it takes its time
 
 
 class FrontEndNode(Node):
@@ -43,38 +47,52 @@ class FrontEndNode(Node):
         self.create_subscription(pose, 'initialpose', checked(self, self.start_at), RELIABLE)
         self.create_subscription(pose, 'correction', checked(self, self.correct), LATCHED)
         self.create_subscription(PointCloud2, 'belief', checked(self, self.believe), RELIABLE)
+        self.create_subscription(
+            PointCloud2, 'localization_map', checked(self, self.use_map), LATCHED
+        )
         self._map: Reflectors | None = None
-        if self.params.node.mode == 'localization':
-            self.create_subscription(
-                PointCloud2, 'reflector_map_points', checked(self, self.use_map), LATCHED
-            )
+        self._recent: deque[tuple[int, Array]] = deque(maxlen=RECENT)
 
     def process(self, observation: Observation) -> None:
         """One observation: estimate and publish."""
         self.last = self.front_end.process(observation)
+        self._recent.append((self.last.stamp, self.last.T_local_base))
         self.answers.publish(self.last)
         self.health.update(self.last)
 
     def start_at(self, msg: PoseWithCovarianceStamped) -> None:
-        """Begin anew at a pose of the map."""
+        """Begin anew at a pose of the map; one with the stamp of a frame is of that moment."""
         start = convert.pose_estimate(msg, 'initialpose')
-        self._begin(start.pose, start.cov)
-        self.get_logger().info(f'begins at {np.round(start.pose, 3).tolist()}')
+        pose = start.pose
+        for stamp, T_local_base in self._recent:
+            if stamp == start.stamp:
+                moved = se2.between(T_local_base, self.front_end.state.pose)
+                pose = se2.compose(pose, moved)
+        self._begin(pose, start.cov)
+        self.get_logger().info(f'begins at {np.round(pose, 3).tolist()}')
 
     def restart(self) -> None:
         """Forget everything: the clock jumped back."""
         self._begin(np.array(self.params.node.map_start_pose), np.zeros((3, 3)))
 
     def use_map(self, msg: PointCloud2) -> None:
-        """Localise in the saved map that the back end read, from where the robot is now."""
-        self._map = read_reflector_map(msg)
-        self._begin(self.front_end.state.pose, self.front_end.state.pose_cov)
-        self.get_logger().info(f'localizes in a map of {len(self._map)} reflectors')
+        """Localise in the map of the back end from where the robot is; without fields, map."""
+        self._map = read_reflector_map(msg, 'localization_map') if msg.fields else None
+        mode = 'mapping' if self._map is None else 'localization'
+        node = dataclasses.replace(self.params.node, mode=mode)
+        self.front_end = FrontEnd(dataclasses.replace(self.params, node=node))
+        if self.last is None:
+            self.restart()
+        else:
+            self._begin(self.last.T_map_base, self.last.cov_map)
+        known = '' if self._map is None else f' in a map of {len(self._map)} reflectors'
+        self.get_logger().info(f'mode is {mode}{known}')
 
     def _begin(self, pose: Array, cov: Array) -> None:
         self.front_end.reset(pose, cov)
         if self._map is not None:
             self.front_end.use_map(self._map)
+        self._recent.clear()
         self.answers.begin_session()
 
     def believe(self, msg: PointCloud2) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any
 
@@ -12,7 +13,9 @@ from rlml_slam import se2
 from rlml_slam.errors import MapError
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.back_end import BackEnd
+from rlml_slam.rlml.relocalize import Verdict, relocalize
 from rlml_slam.ros import build
+from rlml_slam.ros.associated import build_reflector_map
 from rlml_slam.ros.beliefs import StampedBelief, build_belief
 from rlml_slam.ros.frames import Record
 from rlml_slam.ros.map_folder import MapFolder, SavedMap
@@ -28,12 +31,18 @@ from rlml_slam.types import Frame
 MAX_BACKLOG = 20  # frames behind which pictures of the map are left out
 IDLE = 0.3  # [s] of the wall clock without a frame, after which the map is brought up to date
 CERTAIN = 1e-6 * np.eye(3)
+SAME_PLACE, SAME_TURN = 0.3, 0.1  # [m], [rad] of a scan from where it is believed
+ADVICE = (
+    'drive to a place of the map that looks like no other and call again, or tell the pose on '
+    'initialpose'
+)
 
 
 class Mapper:
     """Frames in; correction, map and map to odom out. ``T_map_odom`` (3,) is None at first.
 
-    In localization mode the graph is left alone: the saved map is published and never changes.
+    While it localizes (``saved`` is there), the graph is left alone: the map that was loaded, or
+    made before, is published and never changes.
     """
 
     def __init__(self, node: Any, params: Parameters) -> None:
@@ -58,8 +67,9 @@ class Mapper:
         self._belief = node.create_publisher(cloud, 'belief', 5)
         self._updates = node.create_publisher(cloud, 'updates', 50)
         self._initialpose = node.create_publisher(kind, 'initialpose', 10)
+        self._localization = node.create_publisher(cloud, 'localization_map', LATCHED)
         if self.saved is not None:
-            self.worker.submit(self.publish_map)
+            self.worker.submit(self._use_saved)
 
     @property
     def stamp(self) -> int:
@@ -69,7 +79,8 @@ class Mapper:
     def add(self, record: Record) -> None:
         """Give one frame to the worker; another session of the front end begins another map."""
         if self._session not in (None, record.session):
-            self._logger.warning('the front end began anew, and so does the map')
+            if self.saved is None:
+                self._logger.warning('the front end began anew, and so does the map')
             self.worker.submit(self._forget)
         self._session = record.session
         self._heard = time.monotonic()
@@ -140,26 +151,90 @@ class Mapper:
 
     def start_at(self, pose: Array) -> None:
         """In the worker: begin anew at a pose of the map, the front end as well."""
-        stamp, frame = self.stamp, self._p.node.map_frame
         self._forget()
-        self._initialpose.publish(
-            build.pose_with_covariance(make_rclpy, stamp, frame, pose, CERTAIN)
-        )
+        self._tell_pose(self.stamp, pose, CERTAIN)
+
+    def _tell_pose(self, stamp: int, pose: Array, cov: Array) -> None:
+        frame = self._p.node.map_frame
+        message = build.pose_with_covariance(make_rclpy, stamp, frame, pose, cov)
+        self._initialpose.publish(message)
 
     def save(self, name: str) -> str:
         """In the worker: write the map; what was written, in words. Raises MapError."""
-        if self.saved is not None:
+        if self._p.node.mode == 'localization':
             raise MapError('in localization mode the map does not change: nothing to save')
-        reflectors, grid = self.back_end.reflectors(), self.back_end.occupancy_grid()
-        if grid is None and len(reflectors) == 0:
+        current = self.current()
+        if current.grid is None and len(current.reflectors) == 0:
             raise MapError('there is no map yet')
-        path = self.folder.save(name, SavedMap(reflectors, grid))
-        return f'{path}: {len(reflectors)} reflectors' + ('' if grid is None else ' and a grid')
+        return f'{self.folder.save(name, current)}: {_content(current)}'
+
+    def current(self) -> SavedMap:
+        """In the worker: the map as it is now."""
+        if self.saved is not None:
+            return self.saved
+        return SavedMap(self.back_end.reflectors(), self.back_end.occupancy_grid())
 
     def load(self, name: str) -> SavedMap:
         """In the worker: localise in another saved map. Raises MapError."""
         if self.saved is None:
             raise MapError('load_map needs mode:=localization')
         self.saved = self.folder.load(name)
-        self.publish_map()
+        self._use_saved()
         return self.saved
+
+    def _use_saved(self) -> None:
+        """Publish the map that never changes, and tell the front end to localize in it."""
+        assert self.saved is not None
+        frame, reflectors = self._p.node.map_frame, self.saved.reflectors
+        message = build_reflector_map(make_rclpy, self.stamp, frame, reflectors)
+        self._localization.publish(message)
+        self.publish_map()
+
+    def localize(self, on: bool) -> str:
+        """In the worker: localise in the map as it is now, or begin a new one; what was done.
+
+        Raises MapError where there is no map yet.
+        """
+        if on == (self.saved is not None):
+            return 'localizes already' if on else 'maps already'
+        if on:
+            current = self.current()
+            if current.grid is None and len(current.reflectors) == 0:
+                raise MapError('there is no map yet: drive through the place first')
+            self.saved = current
+            self._use_saved()
+            return f'localizes in the map as it is now: {_content(current)}'
+        self.saved = None
+        header = build.header(make_rclpy, self.stamp, self._p.node.map_frame)
+        # without fields: no map to localize in
+        self._localization.publish(make_rclpy('sensor_msgs/msg/PointCloud2', header=header))
+        return 'maps: a new map begins where the robot is, in the axes of the old one'
+
+    def relocalize(self) -> tuple[bool, str]:
+        """In the worker: find the newest scan anywhere in the map; whether, and what to do now."""
+        frame = self._newest
+        points = None if frame is None else frame.observation.points
+        found = relocalize(self.current().grid, points, self._p)
+        if frame is None or found.verdict is Verdict.IMPOSSIBLE or found.pose is None:
+            return False, f'not found: {found.why}; {ADVICE}'
+        if found.verdict is Verdict.AMBIGUOUS:
+            return False, f'not sure: {found.why}; {ADVICE}'
+        x, y, theta = found.pose
+        place = f'found at x = {x:.2f} m, y = {y:.2f} m, {math.degrees(theta):.1f}°: {found.why}'
+        away = se2.between(se2.compose(self.back_end.T_map_local, frame.T_local_base), found.pose)
+        distance = math.hypot(away[0], away[1])
+        if self.saved is not None:
+            assert found.cov is not None
+            self._tell_pose(frame.stamp, found.pose, found.cov)
+            return True, f'{place}; {distance:.2f} m from where it was believed'
+        if distance < SAME_PLACE and abs(away[2]) < SAME_TURN:
+            return True, f'{place}; this is where it is believed to be'
+        return False, (
+            f'{place}, {distance:.2f} m from where it is believed; a map in the making cannot '
+            f'jump: call set_localization_mode first, or reset'
+        )
+
+
+def _content(of: SavedMap) -> str:
+    """What is in a map, in words."""
+    return f'{len(of.reflectors)} reflectors' + ('' if of.grid is None else ' and a grid')

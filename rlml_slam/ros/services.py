@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from nav_msgs.srv import GetMap, LoadMap
 from rclpy.task import Future
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import Empty, SetBool, Trigger
 
 from rlml_slam.errors import RlmlError
 from rlml_slam.maps.occupancy import OccupancyGrid
@@ -34,6 +34,9 @@ class MapServices:
             (Trigger, '~/reset', self.reset),
             (GetMap, '~/dynamic_map', self.dynamic_map),
             (SetBool, '~/pause_new_measurements', self.pause),
+            (Trigger, '~/relocalize', self.relocalize),
+            (SetBool, '~/set_localization_mode', self.set_localization_mode),
+            (Empty, 'reinitialize_global_localization', self.reinitialize),
         ):
             node.create_service(kind, name, self._in_worker(answer))
 
@@ -54,7 +57,11 @@ class MapServices:
     def reset(self, _request: Any, response: Any) -> None:
         """Forget the map and begin at map_start_pose; the front end does as well."""
         self._mapper.start_at(np.array(self._p.node.map_start_pose))
-        response.success, response.message = True, 'the map begins anew'
+        localizes = self._mapper.saved is not None
+        response.success = True
+        response.message = (
+            'begins at map_start_pose in the same map' if localizes else 'the map begins anew'
+        )
 
     def pause(self, request: Any, response: Any) -> None:
         """Leave new measurements out of the map, or take them in again."""
@@ -62,10 +69,23 @@ class MapServices:
         response.success = True
         response.message = 'paused' if request.data else 'measurements are used again'
 
+    def relocalize(self, _request: Any, response: Any) -> None:
+        """Find the newest scan anywhere in the map; while localizing, go on from there."""
+        response.success, response.message = self._mapper.relocalize()
+
+    def reinitialize(self, _request: Any, _response: Any) -> None:
+        """The same for those who ask without wanting an answer: it goes to the log."""
+        found, message = self._mapper.relocalize()
+        logger = self._node.get_logger()
+        (logger.info if found else logger.warning)(f'reinitialize_global_localization: {message}')
+
+    def set_localization_mode(self, request: Any, response: Any) -> None:
+        """Localise in the map as it is now, or begin a new one."""
+        self._try(response, lambda: self._mapper.localize(bool(request.data)))
+
     def dynamic_map(self, _request: Any, response: Any) -> None:
         """The grid as it is now."""
-        saved = self._mapper.saved
-        grid = self._mapper.back_end.occupancy_grid() if saved is None else saved.grid
+        grid = self._mapper.current().grid
         if grid is not None:
             response.map = self._message(grid)
 

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from live import LATCHED, room
 from nav_msgs.srv import GetMap, LoadMap
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import Empty, SetBool, Trigger
 
 from rlml_slam import se2
 from rlml_slam.maps import reflector_file
@@ -210,3 +212,75 @@ def test_saved_map_serves_for_localization(live, tmp_path):
     assert loaded.result == LoadMap.Response.RESULT_SUCCESS
     missing = live.call(LoadMap, 'back_end/load_map', LoadMap.Request(map_url='none'))
     assert missing.result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
+
+
+def test_robot_that_was_carried_away_finds_itself_in_its_map(live, tmp_path):
+    """Mapped, then localizing, then told a wrong pose: one call brings it back."""
+    front, back = start(live)
+    drive(live, front, back, end=6.0)
+    call = live.call
+    here = call(Trigger, 'back_end/relocalize', Trigger.Request())
+    assert here.success, here.message
+    assert 'this is where it is believed to be' in here.message
+
+    switched = call(SetBool, 'back_end/set_localization_mode', SetBool.Request(data=True))
+    assert switched.success
+    assert 'reflectors and a grid' in switched.message
+    live.spin_until(lambda: front.front_end._p.node.mode == 'localization')
+    drive(live, front, back, start=6.0, end=9.0)
+    assert back.mapper.back_end.keyframes == []
+
+    wrong = se2.compose(front.last.T_map_base, np.array([1.0, -0.8, 2.0]))
+    front.start_at(build.pose_with_covariance(make, SECOND, 'map', wrong, 1e-4 * np.eye(3)))
+    drive(live, front, back, start=9.0, end=10.0)
+    believed = front.last.T_map_base
+    found = call(Trigger, 'back_end/relocalize', Trigger.Request())
+    assert found.success, found.message
+    session = front.answers.session
+    live.spin_until(
+        lambda: (
+            front.answers.session != session
+            or np.hypot(*(front.front_end.state.pose - believed)[:2]) > 0.5
+        )
+    )
+    slam = replayed(10.0)
+    stamps, poses = slam.trajectory()
+    want = poses[np.flatnonzero(stamps == front.last.stamp)[0]]
+    # a cell of the grid
+    error = se2.between(want, front.front_end.state.pose)
+    assert np.hypot(*error[:2]) < 0.05
+    assert abs(error[2]) < 0.03
+
+    back_to_mapping = call(SetBool, 'back_end/set_localization_mode', SetBool.Request(data=False))
+    assert back_to_mapping.success
+    live.spin_until(lambda: front.front_end._p.node.mode == 'mapping')
+    drive(live, front, back, start=10.0, end=12.0)
+    assert back.mapper.back_end.keyframes
+
+
+def test_place_that_cannot_be_told_is_told_as_such(live):
+    start(live, use_reflectors=False)
+    for request in (True, False):
+        answer = live.call(
+            SetBool, 'back_end/set_localization_mode', SetBool.Request(data=request)
+        )
+        assert answer.success is not request
+        assert answer.message.startswith('there is no map yet' if request else 'maps already')
+    lost = live.call(Trigger, 'back_end/relocalize', Trigger.Request())
+    assert not lost.success
+    assert lost.message.startswith('not found: there is no map')
+    assert 'initialpose' in lost.message
+    live.call(Empty, 'reinitialize_global_localization', Empty.Request())
+
+
+def test_map_in_the_making_does_not_jump(live):
+    front, back = start(live)
+    drive(live, front, back, end=6.0)
+    # as if odometry and scans had lied together
+    back.mapper.back_end.T_map_local = np.array([3.0, 0.0, 0.0])
+    poses = back.mapper.back_end.graph.poses.copy()
+    answer = live.call(Trigger, 'back_end/relocalize', Trigger.Request())
+    assert not answer.success
+    assert re.search(r'(2\.9|3\.0)\d m from where it is believed', answer.message)
+    assert 'set_localization_mode' in answer.message
+    np.testing.assert_array_equal(back.mapper.back_end.graph.poses, poses)

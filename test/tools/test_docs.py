@@ -129,7 +129,9 @@ def test_services_are_those_of_the_node(nodes, name):
         for service, kinds in nodes[name].get_service_names_and_types_by_node(name, '/')
         if not kinds[0].startswith(('rcl_interfaces', 'type_description_interfaces'))
     }
-    told = {(s.name.replace('~', f'/{name}'), s.type) for s in SERVICES if s.node == name}
+    told = {
+        ('/' + s.name.replace('~', name).lstrip('/'), s.type) for s in SERVICES if s.node == name
+    }
     assert found == told
 
 

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where in a whole map a scan was taken, without any idea beforehand; or that it cannot be told.
+
+Every place and heading is searched by branch and bound. The best place counts only where it fits
+well, no other place fits nearly as well, and the scan holds it in every direction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from rlml_slam import params
+from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.matching import observability, search, thinning
+from rlml_slam.matching.scan_match import match
+from rlml_slam.matching.submap import P_MAX, P_MIN, Submap, value_of
+from rlml_slam.params import Parameters
+from rlml_slam.se2 import Array
+
+SEARCHED = 150  # end points of the search; all of them count when its places are compared
+SPREAD = np.array([0.5, 0.5, 0.2])  # [m, m, rad] a refined place lies within this of the found one
+# Share of the best score that the next place may reach. Stricter than a closure's, which other
+# edges may contradict: in a truly symmetric hall, the scores of twins differ by up to 7 %.
+MAX_SECOND = 0.85
+OPEN_SIGMA = 0.5  # [m] a scan that leaves a direction wider than this does not tell the place
+
+
+class Verdict(Enum):
+    """What a search of the whole map says."""
+
+    UNIQUE = 'unique'
+    AMBIGUOUS = 'ambiguous'
+    IMPOSSIBLE = 'impossible'
+
+
+@dataclass(frozen=True)
+class Relocation:
+    """The verdict, and why in words; ``pose`` (3,) and ``cov`` (3, 3), map frame, of the best.
+
+    ``score`` and ``second`` are mean hit probabilities at the best place and the next best one, 0
+    where there is none. The pose is None where no place fits.
+    """
+
+    verdict: Verdict
+    why: str
+    pose: Array | None = None
+    cov: Array | None = None
+    score: float = 0.0
+    second: float = 0.0
+
+
+def relocalize(grid: OccupancyGrid | None, points: Array | None, p: Parameters) -> Relocation:
+    """Search ``points`` (n, 2), end points in the base frame, in a grid of the map frame."""
+    if grid is None or not (grid.cells > 0).any():
+        return Relocation(Verdict.IMPOSSIBLE, 'there is no map of scans yet')
+    if points is None or len(points) < p.scan_match.min_points:
+        return Relocation(Verdict.IMPOSSIBLE, 'the newest frame has no usable scan')
+    submap = submap_of(grid, p.submap)
+    points = thinning.thin(points, p.scan_match.voxel, p.scan_match.max_points)
+    few = thinning.thin(points, p.scan_match.voxel, SEARCHED)
+    middle = 0.5 * (submap.bounds[:2] + submap.bounds[2:])
+    # a robot stands inside of what it has seen
+    reach = 0.5 * float((submap.bounds[2:] - submap.bounds[:2]).max())
+    found = search.wide(
+        search.Pyramid(submap), few, np.array([*middle, 0.0]), reach, np.pi,
+        separation_angle=2.0 * SPREAD[2],
+    )  # fmt: skip
+    places = [_refined(submap, points, c, p) for c in (found.best, found.second) if c is not None]
+    places.sort(key=lambda place: -place[1])
+    least = p.loop_closure.min_score
+    if not places or places[0][1] < least:
+        score = places[0][1] if places else 0.0
+        why = f'no place fits: the best has a score of {score:.2f}, {least:.2f} is asked for'
+        return Relocation(Verdict.IMPOSSIBLE, why, score=score)
+    pose, score = places[0]
+    second = places[1][1] if len(places) > 1 else 0.0
+    cov = _covariance(submap, points, pose, p)
+    sigma = float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]))
+    verdict, why = Verdict.UNIQUE, f'score {score:.2f}, the next best place {second:.2f}'
+    if second > MAX_SECOND * score:
+        verdict, why = Verdict.AMBIGUOUS, f'two places fit alike: {score:.2f} and {second:.2f}'
+    elif sigma > OPEN_SIGMA:
+        verdict, why = Verdict.AMBIGUOUS, f'the scan leaves a direction open by {sigma:.1f} m'
+    return Relocation(verdict, why, pose, cov, score, second)
+
+
+def submap_of(grid: OccupancyGrid, parameters: params.Submap) -> Submap:
+    """A grid of the map as a submap in the map frame; unknown cells stay unknown."""
+    submap = Submap(parameters)
+    submap.resolution = grid.resolution
+    known = np.clip(grid.cells.astype(np.float64), 0.0, 100.0) / 100.0
+    submap.values = np.where(
+        grid.cells < 0, np.uint16(0), value_of(P_MIN + (P_MAX - P_MIN) * known)
+    )
+    x, y = (round(v / grid.resolution) for v in grid.origin)
+    submap.corner = (x, y)
+    return submap
+
+
+def _refined(
+    submap: Submap, points: Array, found: search.Candidate, p: Parameters
+) -> tuple[Array, float]:
+    """Pose and score of a place by scan matching, which the search's lattice only comes near."""
+    weak = np.diag(1.0 / SPREAD**2)
+    result = match(submap, points, found.pose, weak, p.scan_match, searched=False)
+    return result.pose, result.score
+
+
+def _covariance(submap: Submap, points: Array, pose: Array, p: Parameters) -> Array:
+    """Of the pose, with the error of the map that more beams do not lower."""
+    information = observability.information(submap, points, pose, p.scan_match)
+    # a direction that the scan leaves open still needs a regular covariance
+    regular = information + np.diag([1e-2, 1e-2, 1e-2])
+    return np.asarray(np.linalg.inv(regular) + np.diag(p.loop_closure.floor2), dtype=np.float64)
