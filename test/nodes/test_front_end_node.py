@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from live import LATCHED, room
 
+from rlml_slam import se2
 from rlml_slam.errors import ParameterError
 from rlml_slam.nodes.front_end import FrontEndNode
 from rlml_slam.ros import build, convert
@@ -93,8 +94,6 @@ def test_correction_moves_the_map_pose_only(live, node):
     correction = np.array([1.0, -2.0, 0.5])
     node.correct(build.pose_with_covariance(make, SECOND, 'map', correction, np.eye(3)))
     frame = node.front_end.process(node.last.observation)
-    from rlml_slam import se2
-
     np.testing.assert_allclose(
         frame.T_map_base, se2.compose(correction, frame.T_local_base), atol=1e-12
     )
@@ -103,8 +102,19 @@ def test_correction_moves_the_map_pose_only(live, node):
 def test_initialpose_begins_anew_there(live, node):
     feed(node, 2.0)
     start = np.array([5.0, 6.0, 1.0])
-    node.start_at(build.pose_with_covariance(make, SECOND, 'map', start, 0.01 * np.eye(3)))
+    node.start_at(build.pose_with_covariance(make, 99 * SECOND, 'map', start, 0.01 * np.eye(3)))
     np.testing.assert_allclose(node.front_end.state.pose, start)
+
+
+def test_initialpose_of_an_earlier_frame_is_moved_on_to_now(live, node):
+    feed(node, 2.0)
+    live.drain()
+    then = live.heard['odometry/filtered'][-5]
+    moved = se2.between(convert.planar_pose(then.pose.pose, ''), node.last.T_local_base)
+    assert moved[0] > 0.1
+    start, stamp = np.array([5.0, 6.0, 1.0]), convert.stamp(then, '')
+    node.start_at(build.pose_with_covariance(make, stamp, 'map', start, 0.01 * np.eye(3)))
+    np.testing.assert_allclose(node.front_end.state.pose, se2.compose(start, moved), atol=1e-9)
 
 
 def test_diagnostics_tell_health_and_inputs(live, node):
