@@ -8,6 +8,7 @@ import json
 import os
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,10 +45,15 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         '--window', action='store_true', help="long drives of the node's sliding window instead"
     )
-    parser.add_argument('--minutes', type=float, default=10.0, help='with --window: of each run')
-    parser.add_argument('--runs', type=int, default=8, help='with --window: per carrier')
     parser.add_argument(
-        '--anonymous', action='store_true', help='with --window: no ids, and ghosts'
+        '--node', action='store_true', help='drives of deformable_slam itself over DDS instead'
+    )
+    drives = parser.add_argument_group('with --window and --node')
+    drives.add_argument('--minutes', type=float, default=10.0, help='of each drive (default 10)')
+    drives.add_argument('--runs', type=int, help='per carrier (default 8; of the node 1)')
+    drives.add_argument('--anonymous', action='store_true', help='no ids, and ghosts')
+    drives.add_argument(
+        '--rate', type=float, default=4.0, help='of the node: x real time (default 4)'
     )
     parser.set_defaults(run=run)
 
@@ -58,8 +64,8 @@ def run(args: argparse.Namespace) -> int:
         replayed = replay(args.replay_note)
         print(json.dumps(replayed)) if args.json else _show_replay(_console(), replayed)
         return 0
-    if args.window:
-        return _run_window(args)
+    if args.window or args.node:
+        return _run_drives(args)
     if args.seeds < 2 or args.jobs < 0 or args.figure_seed < 0:
         raise ParameterError(
             'study deformable: --seeds must be >= 2, --jobs and --figure-seed >= 0'
@@ -82,17 +88,47 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _run_window(args: argparse.Namespace) -> int:
+def _run_drives(args: argparse.Namespace) -> int:
+    """Long drives beside simulated carriers, of the window in this process or of the node."""
     from rlml_slam.tools import study_deformable_window as window
 
-    if not 0.5 <= args.minutes <= 1e4 or args.runs < 1 or args.jobs < 0:
+    runs = args.runs if args.runs is not None else 1 if args.node else 8
+    if not 0.5 <= args.minutes <= 1e4 or runs < 1 or args.jobs < 0 or not 0.01 <= args.rate <= 1e3:
         raise ParameterError(
-            'study deformable --window: --minutes must be 0.5 or more, --runs 1 or more'
+            'study deformable: --minutes must be 0.5 or more, --runs 1 or more, --rate above 0'
         )
-    results = window.run_all(args.minutes, args.runs, not args.anonymous, args.jobs or _cores())
-    summary = window.summarize(results)
-    print(json.dumps(summary)) if args.json else window.show(_console(), summary)
+    if args.node:
+        from rlml_slam.tools import study_deformable_node as node
+
+        drives = node.run_all(args.minutes, runs, not args.anonymous, args.rate, args.json)
+        summary = node.summarize(drives)
+        claims, lines = node.claims(summary), node.lines
+    else:
+        jobs = args.jobs or _cores()
+        summary = window.summarize(window.run_all(args.minutes, runs, not args.anonymous, jobs))
+        claims, lines = window.claims(summary), window.lines
+    if args.json:
+        print(json.dumps(summary))
+        return 0
+    title = 'deformable_slam over DDS' if args.node else 'The sliding window in this process'
+    table = Table(title=f'{title}, beside a carrier', title_justify='left')
+    table.add_column(f'{args.minutes:g} min at 10 Hz')
+    columns = {f'{kind}, {f["runs"]} drives': lines(f) for kind, f in summary.items()}
+    for name in columns:
+        table.add_column(name, justify='right')
+    for name in next(iter(columns.values())):
+        table.add_row(name, *(column[name] for column in columns.values()))
+    _console().print(table)
+    _show_claims(_console(), [(claim, '', holds) for claim, holds in claims])
     return 0
+
+
+def _show_claims(console: Console, claims: Sequence[tuple[str, str, bool]]) -> None:
+    """How many (claim, figures, whether it holds) hold, and which do not."""
+    failed = [(claim, found) for claim, found, holds in claims if not holds]
+    console.print(f'{len(claims) - len(failed)} of {len(claims)} claims hold')
+    for claim, found in failed:
+        console.print(f'  not shown: {claim}{found and ": "}{found}', markup=False)
 
 
 def run_study(rows: tuple[Row, ...], seeds: int, jobs: int) -> dict[Row, RowResult]:
@@ -141,12 +177,8 @@ def show(console: Console, summary: dict[str, Any]) -> None:
         for line in lines:
             table.add_row(*line)
         console.print(table)
-    failed = [c for c in summary['claims'] if not c['holds']]
-    console.print(
-        f'{len(summary["claims"]) - len(failed)} of {len(summary["claims"])} claims hold'
-    )
-    for c in failed:
-        console.print(f'  not shown: {c["claim"]}, {c["where"]}: {c["found"]}', markup=False)
+    _show_claims(console, [(f'{c["claim"]}, {c["where"]}', c['found'], c['holds'])
+                           for c in summary['claims']])  # fmt: skip
     console.print(f'{summary["seeds"]} seeds, {summary["wall_s"]} s')
 
 

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
-from rich.table import Table
 
 from rlml_slam.deformable.scoring import chi2_bounds
 from rlml_slam.deformable.slam import DeformableSlam
@@ -183,24 +182,8 @@ def claims(summary: dict[str, Any]) -> list[tuple[str, bool]]:
     return out
 
 
-def show(console: Console, summary: dict[str, Any]) -> None:
-    """The table, and what does not hold."""
-    table = Table(title='The sliding window beside a carrier, 10 Hz', title_justify='left')
-    table.add_column('figure')
-    for kind, f in summary.items():
-        table.add_column(f'{kind}, {f["runs"]} runs of {f["updates"]} updates', justify='right')
-    columns = [_lines(f) for f in summary.values()]
-    for name in columns[0]:
-        table.add_row(name, *(column[name] for column in columns))
-    console.print(table)
-    found = claims(summary)
-    console.print(f'{sum(holds for _, holds in found)} of {len(found)} claims hold')
-    for claim, holds in found:
-        if not holds:
-            console.print(f'  not shown: {claim}', markup=False)
-
-
-def _lines(f: dict[str, Any]) -> dict[str, str]:
+def lines(f: dict[str, Any]) -> dict[str, str]:
+    """The table's column of one kind."""
     pose, whole = f['nees_pose_bounds'], f['nees_bounds']
     rmse = f['position_rmse_m_at_end'], 1e3 * f['heading_rmse_rad_at_end']
     return {
