@@ -12,7 +12,14 @@ from typing import Any
 
 from rlml_slam.errors import FileFormatError
 from rlml_slam.maps.occupancy import write_atomically
-from rlml_slam.params import Declaration, Parameters, SimulatorParameters, declarations
+from rlml_slam.params import (
+    CarrierParameters,
+    Declaration,
+    DeformableParameters,
+    Parameters,
+    SimulatorParameters,
+    declarations,
+)
 from rlml_slam.tools.interface import SERVICES, TOPICS
 
 
@@ -70,11 +77,12 @@ def service_table() -> str:
     return _table(('node', 'service', 'type', 'meaning'), rows)
 
 
-def parameter_table(of: type[Any]) -> str:
-    """All parameters of a declaration."""
+def parameter_table(of: type[Any], prefix: str = '') -> str:
+    """All parameters of a declaration, or those whose names begin with ``prefix``."""
     rows = [
         (f'`{d.name}`', f'`{_value(d.default)}`', d.unit, _range(d), d.meaning)
         for d in declarations(of)
+        if d.name.startswith(prefix)
     ]
     return _table(('parameter', 'default', 'unit', 'range', 'meaning'), rows)
 
@@ -108,4 +116,6 @@ TABLES: Mapping[str, Callable[[], str]] = {
     'services': service_table,
     'parameters': lambda: parameter_table(Parameters),
     'simulator parameters': lambda: parameter_table(SimulatorParameters),
+    'deformable parameters': lambda: parameter_table(DeformableParameters, 'deformable.'),
+    'carrier parameters': lambda: parameter_table(CarrierParameters),
 }

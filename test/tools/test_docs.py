@@ -9,11 +9,12 @@ from pathlib import Path
 import pytest
 
 from rlml_slam.errors import FileFormatError
-from rlml_slam.params import Parameters, SimulatorParameters, declarations
+from rlml_slam.params import CarrierParameters, Parameters, SimulatorParameters, declarations
 from rlml_slam.tools.docs import TABLES, filled, parameter_table
 from rlml_slam.tools.interface import SERVICES, TOPICS
 from rlml_slam.tools.main import main
 
+NODES = ('front_end', 'back_end', 'simulator', 'deformable_slam', 'carrier_simulator')
 README = Path(__file__).resolve().parents[2] / 'README.md'
 # what every node of rclpy has
 OF_EVERY_NODE = {'/rosout', '/parameter_events'}
@@ -24,7 +25,7 @@ def test_readme_is_up_to_date():
     assert filled(text) == text, 'run: rlml docs --write README.md'
 
 
-@pytest.mark.parametrize('of', [Parameters, SimulatorParameters])
+@pytest.mark.parametrize('of', [Parameters, SimulatorParameters, CarrierParameters])
 def test_every_parameter_has_its_row(of):
     rows = parameter_table(of).splitlines()[2:]
     assert [row.split('`')[1] for row in rows] == [d.name for d in declarations(of)]
@@ -59,6 +60,8 @@ def nodes():
     from rclpy.parameter import Parameter
 
     from rlml_slam.nodes.back_end import BackEndNode
+    from rlml_slam.nodes.carrier_simulator import CarrierSimulatorNode
+    from rlml_slam.nodes.deformable_slam import DeformableSlamNode
     from rlml_slam.nodes.front_end import FrontEndNode
     from rlml_slam.nodes.simulator import SimulatorNode
 
@@ -67,10 +70,13 @@ def nodes():
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=10 + os.getpid() % 90)
     drive = [Parameter('drive', value='cmd_vel')]
+    suggest = [Parameter('deformable.suggest', value='differential')]
     made = [
         FrontEndNode(context=context),
         BackEndNode(context=context),
         SimulatorNode(context=context, parameter_overrides=drive),
+        DeformableSlamNode(context=context, parameter_overrides=suggest),
+        CarrierSimulatorNode(context=context),
     ]
     yield {node.get_name(): node for node in made}
     for node in made:
@@ -97,7 +103,7 @@ def quality(info):
     return ', '.join(words)
 
 
-@pytest.mark.parametrize('name', ['front_end', 'back_end', 'simulator'])
+@pytest.mark.parametrize('name', NODES)
 @pytest.mark.parametrize('direction', ['pub', 'sub'])
 def test_topics_are_those_of_the_node(nodes, name, direction):
     node = nodes[name]
@@ -122,7 +128,7 @@ def test_topics_are_those_of_the_node(nodes, name, direction):
     assert found == told
 
 
-@pytest.mark.parametrize('name', ['front_end', 'back_end', 'simulator'])
+@pytest.mark.parametrize('name', NODES)
 def test_services_are_those_of_the_node(nodes, name):
     found = {
         (service, kinds[0].replace('/srv/', '/'))
