@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import sys
 import time
-from collections import deque
 from typing import Any
 
 import numpy as np
@@ -35,7 +34,8 @@ class DeformableSlamNode(Node):
         super().__init__('deformable_slam', **options)
         p: DeformableParameters = declare(self, DeformableParameters)
         self.slam = DeformableSlam(p)
-        self.cost: deque[tuple[float, float]] = deque(maxlen=KEPT)  # wall and CPU time [s]
+        self._cost = np.zeros((KEPT, 2))  # wall and CPU time of an update [s]
+        self._updates = 0
         warm_up.compile_loaded()
         self.answers = EstimatePublisher(self, p)
         self.velocity = VelocityInput(self, p.node, self.slam.announce)
@@ -55,7 +55,9 @@ class DeformableSlamNode(Node):
         if self.slam.estimate is not None:
             self.answers.publish(self.slam.estimate, self.slam.velocity)
         self.health.update(frame)
-        self.cost.append((time.perf_counter() - wall, time.thread_time() - cpu))
+        spent = time.perf_counter() - wall, time.thread_time() - cpu
+        self._cost[self._updates % KEPT] = spent
+        self._updates += 1
 
     def start_at(self, msg: PoseWithCovarianceStamped) -> None:
         """Begin anew at a pose of the map."""
@@ -73,8 +75,8 @@ class DeformableSlamNode(Node):
         out: dict[str, object] = {
             'features': 0 if estimate is None else len(estimate.features.keys)
         }
-        if self.cost:
-            wall, cpu = 1e3 * np.percentile(self.cost, 99, axis=0)
+        if self._updates:
+            wall, cpu = 1e3 * np.percentile(self._cost[: self._updates], 99, axis=0)
             out['wall time of an update, p99 [ms]'] = f'{wall:.2f}'
             out['CPU time of an update, p99 [ms]'] = f'{cpu:.2f}'
         return out

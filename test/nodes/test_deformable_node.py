@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from rclpy.qos import QoSProfile
 
-from rlml_slam import se2
 from rlml_slam.deformable.scoring import chi2_bounds
 from rlml_slam.deformable.window import CarrierVelocity
 from rlml_slam.nodes.deformable_slam import DeformableSlamNode
@@ -21,23 +20,17 @@ from rlml_slam.ros.deformable_answers import build_velocity, read_features
 from rlml_slam.ros.deformable_simulated import CarrierMessages
 from rlml_slam.ros.messages import make_rclpy as make
 from rlml_slam.simulation.carrier import simulate_carrier
+from rlml_slam.tools import study_deformable_node as study
 
 SECOND = 1_000_000_000
-SECONDS = 12.0
+SECONDS = 12
 DEEP = QoSProfile(depth=2000)
 TOPICS = {
     'pose': 'geometry_msgs/msg/PoseWithCovarianceStamped',
     'features': 'sensor_msgs/msg/PointCloud2',
     'markers': 'visualization_msgs/msg/MarkerArray',
     'cmd_vel_suggested': 'geometry_msgs/msg/Twist',
-    'ground_truth': 'nav_msgs/msg/Odometry',
-    'ground_truth_features': 'sensor_msgs/msg/PointCloud2',
 }
-# the simulator's odometry in terms of the node's: sigma per sqrt(s) over sqrt(interval)
-NOISE = {
-    'motion.a': 0.0, 'motion.b': 0.01 / math.sqrt(0.1), 'motion.c': 0.0,
-    'motion.d': 0.004 / math.sqrt(0.1), 'motion.lateral': 0.01 / math.sqrt(0.1),
-}  # fmt: skip
 
 
 def arguments(**values):
@@ -48,60 +41,24 @@ def by_stamp(messages):
     return {convert.stamp(m, ''): m for m in messages}
 
 
-def chi2_of(error, cov):
-    return float(error @ np.linalg.solve(cov, error))
-
-
-@pytest.mark.parametrize(('kind', 'ids'), [('train', 'true'), ('conveyor', 'false')])
-def test_processes_follow_a_carrier_within_their_covariances(live, start, kind, ids):
-    """Simulator and node over DDS: pose and features against the truth of the same stamps."""
-    topics = ('pose', 'features', 'ground_truth', 'ground_truth_features')
-    for topic in topics:
-        live.listen(topic, TOPICS[topic], DEEP)
-    live.listen('reflectors', TOPICS['features'])  # time begins when the ear hears as well
-    node = start('deformable_slam', *arguments(**NOISE))
-    live.spin_until(lambda: live.ear.count_publishers('features') == 1, timeout=60.0)
-    simulator = start(
-        'carrier_simulator',
-        *arguments(rate=4.0, duration=SECONDS, wait_for_subscribers=2, **{
-            'carrier.kind': kind, 'carrier.ids': ids,
-        }),
-    )  # fmt: skip
-    end = SECOND + int(SECONDS) * SECOND
-    live.spin_until(
-        lambda: live.heard['pose'] and convert.stamp(live.heard['pose'][-1], '') == end,
-        timeout=60.0,
-    )
-    live.spin_until(lambda: convert.stamp(live.heard['features'][-1], '') == end)
-    assert simulator.finish()[0] == 0
-    node.interrupt()
-    code, out = node.finish()
-    assert code == 0, out
-    pose, features, truth, true_features = (by_stamp(live.heard[topic]) for topic in topics)
+@pytest.mark.parametrize(('kind', 'ids'), [('train', True), ('conveyor', False)])
+def test_processes_follow_a_carrier_within_their_covariances(kind, ids):
+    """Simulator and node over DDS, as ``rlml study deformable --node`` judges them."""
+    heard = []
+    drive = study.run_node(kind, SECONDS / 60.0, 0, ids, 4.0, heard.append)
     # one answer per detections, at most a few of which were lost by best effort
-    assert len(pose) > 9.5 * SECONDS
-    assert pose.keys() == features.keys()
-    of_pose, of_features = [], []
-    for stamp in sorted(pose.keys() & truth.keys() & true_features.keys()):
-        got = convert.pose_estimate(pose[stamp])
-        error = got.pose - convert.pose_estimate(truth[stamp]).pose
-        error[2] = se2.wrap(error[2])
-        of_pose.append(chi2_of(error, got.cov))
-        assert np.hypot(*error[:2]) < 4.0 * np.sqrt(np.trace(got.cov[:2, :2]))
-        found = read_features(features[stamp])
-        assert np.all((found.ids >= 0) == (ids == 'true'))
-        existing = convert.detections(true_features[stamp], convert.Reflector()).points
-        for point, cov in zip(found.points, found.cov, strict=True):
-            nearest = existing[np.argmin(np.linalg.norm(existing - point, axis=-1))]
-            of_features.append(chi2_of(point - nearest, cov))
-    assert len(of_pose) > 9.0 * SECONDS
+    assert drive.asked == 10 * SECONDS + 1
+    assert 0.95 * drive.asked < drive.answered <= drive.asked
+    assert heard[-1] > 0.95
+    assert len(drive.pose) > 0.9 * drive.asked
+    assert len(drive.features) > 4 * len(drive.pose)
     # the mean over a run varies less than one sample, whose 99.9 % bounds these are
-    low, high = chi2_bounds(3, 1)
-    assert low < np.mean(of_pose) < high
-    low, high = chi2_bounds(2, 1)
-    assert low < np.mean(of_features) < high
-    assert len(of_features) > 4 * len(of_pose)
-    assert np.sqrt(np.trace(got.cov[:2, :2])) < 0.5
+    summary = study.summarize({kind: [drive]})
+    found = dict(study.claims(summary))
+    assert found[f'{kind}: NEES of the pose is consistent']
+    assert found[f'{kind}: NEES of the features is consistent']
+    assert found[f'{kind}: memory grows by less than 4 MB']
+    assert np.percentile(drive.pose, 99) < chi2_bounds(3, 1, 0.9999)[1]
 
 
 @pytest.mark.parametrize(
@@ -137,8 +94,8 @@ def feed(node, count=30, skip=(), **settings):
 
 
 def start_node(live, **values):
-    node = live.start(DeformableSlamNode, **{k.replace('.', '__'): v for k, v in NOISE.items()},
-                      **values)  # fmt: skip
+    noise = {k.replace('.', '__'): v for k, v in study.noise_parameters().items()}
+    node = live.start(DeformableSlamNode, **noise, **values)
     node.sensors.stop_waiting()
     return node
 
@@ -212,7 +169,9 @@ def test_diagnostics_are_ok_where_nothing_is_missing(live):
     node.health.publish()
     status = diagnosis(live)
     assert (status.level, status.message) == (b'\x00', 'OK')
-    assert {v.key: v.value for v in status.values}['features'] == '6'
+    values = {v.key: v.value for v in status.values}
+    assert values['features'] == '6'
+    assert 0.0 < float(values['CPU time of an update, p99 [ms]']) < 100.0
 
 
 def test_velocity_in_the_robots_axes_is_turned_into_the_maps(live):
