@@ -175,14 +175,19 @@ def noise_parameters() -> dict[str, float]:
 
 
 def judge(ear: Ear) -> tuple[int, Array, Array, dict[str, str]]:
-    """Number of answers, normalised errors of those whose truth was heard, last diagnostics."""
+    """Number of answers, normalised errors of those whose truth was heard, last diagnostics.
+
+    An anonymous feature is compared with the nearest true one as long as it is in the sensor's
+    reach: beyond, what it is the estimate of may have left the conveyor.
+    """
     truth = {
         convert.stamp(m, ''): convert.planar_pose(m.pose.pose, 'ground_truth')
         for m in ear.messages('ground_truth')
     }
-    pose = []
+    pose, at = [], dict[int, Array]()
     for m in ear.messages('pose'):
         got = convert.pose_estimate(m)
+        at[got.stamp] = got.pose
         if got.stamp in truth:
             error = got.pose - truth[got.stamp]
             error[2] = wrap(error[2])
@@ -193,14 +198,15 @@ def judge(ear: Ear) -> tuple[int, Array, Array, dict[str, str]]:
     }
     features = []
     for m in ear.messages('features'):
-        existing = true.get(convert.stamp(m, ''))
-        if existing is None:
+        stamp = convert.stamp(m, '')
+        if stamp not in true or stamp not in at:
             continue
-        found = read_features(m)
-        for id, point, cov in zip(found.ids, found.points, found.cov, strict=True):
-            errors = point - existing.points
+        existing, found = true[stamp], read_features(m)
+        reached = np.hypot(*(found.points - at[stamp][:2]).T) < Carrier().max_range
+        for j in np.flatnonzero(reached | (found.ids >= 0)):
+            errors, id = found.points[j] - existing.points, found.ids[j]
             near = existing.ids == id if id >= 0 else [np.argmin(np.hypot(*errors.T))]
-            features += [chi2_of(e, cov) for e in errors[near]]
+            features += [chi2_of(e, found.cov[j]) for e in errors[near]]
     figures: dict[str, str] = {}
     for m in ear.messages('/diagnostics'):
         figures = {v.key: v.value for v in m.status[0].values}
