@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -17,16 +16,14 @@ from rclpy.node import Node
 from rlml_slam import warm_up
 from rlml_slam.errors import InputError
 from rlml_slam.params import SimulatorParameters
-from rlml_slam.ros import build, convert
+from rlml_slam.ros import convert
 from rlml_slam.ros.declare import declare
-from rlml_slam.ros.messages import make_rclpy
 from rlml_slam.ros.pace import Pace
 from rlml_slam.ros.run import run
 from rlml_slam.ros.simulated import SimulatedTopics
 from rlml_slam.simulation.robot import SECOND
 from rlml_slam.simulation.simulation import START, STEP, Simulation
 from rlml_slam.simulation.world_file import load_world
-from rlml_slam.types import Health
 
 LINGER = 0.5  # [s] between the last message and the end of the process
 BATCH = 20  # steps at most in one tick, so that a rate beyond reach does not shut out the rest
@@ -47,19 +44,10 @@ class SimulatorNode(Node):
         if n.drive == 'cmd_vel':
             self.create_subscription(Twist, 'cmd_vel', self.on_cmd_vel, 10)
         warm_up.compile_loaded()
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         # steady timers: with use_sim_time, a ROS timer would wait for this node's own clock
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(0.005, self.tick, clock=steady)
-        self.create_timer(1.0, self.tell, clock=steady)
-
-    def tell(self) -> None:
-        """How many messages were published, on /diagnostics."""
-        figures = {f'{topic} published': n for topic, n in self._topics.published.items()}
-        name = self.get_fully_qualified_name().lstrip('/')
-        self._diagnostics.publish(
-            build.diagnostics(make_rclpy, self.simulation.time, name, Health(), figures)
-        )
+        self.create_timer(1.0, lambda: self._topics.tell(self.simulation.time), clock=steady)
 
     def on_cmd_vel(self, msg: Any) -> None:
         """Drive as told."""
@@ -92,7 +80,7 @@ class SimulatorNode(Node):
     def _finish(self, now: float) -> None:
         if self._finished is None:
             self._topics.publish(self.simulation.rest())
-            self.tell()
+            self._topics.tell(self.simulation.time)
             self._finished = now
             seconds = (self.simulation.time - START) / SECOND
             self.get_logger().info(f'the drive is done after {seconds:.1f} s')

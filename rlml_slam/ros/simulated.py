@@ -17,7 +17,7 @@ from rlml_slam.ros.tf import TF_MESSAGE
 from rlml_slam.se2 import Array
 from rlml_slam.simulation.robot import SECOND
 from rlml_slam.simulation.simulation import START, Event, GroundTruth, Message, Simulation
-from rlml_slam.types import Detections, Imu, Odometry, Scan
+from rlml_slam.types import Detections, Health, Imu, Odometry, Scan
 
 # topic (relative) -> type, depth of its queue; the first four are sensor data, best effort
 TOPICS = {
@@ -123,6 +123,10 @@ class SimulatedTopics:
             if topic in SENSOR_TOPICS:
                 qos.reliability = ReliabilityPolicy.BEST_EFFORT
             self._publishers[topic] = node.create_publisher(rclpy_class(msgtype), topic, qos)
+        self._name = node.get_fully_qualified_name().lstrip('/')
+        self._diagnostics = node.create_publisher(
+            rclpy_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', 10
+        )
         self._clock = node.create_publisher(rclpy_class('rosgraph_msgs/msg/Clock'), '/clock', 10)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         truth = self._messages.true_reflectors(simulation)
@@ -151,3 +155,10 @@ class SimulatedTopics:
             topic, message = self._messages(event.message)
             self._publishers[topic].publish(message)
             self.published[topic] += 1
+
+    def tell(self, stamp: int) -> None:
+        """Say on /diagnostics how many messages were published."""
+        figures = {f'{topic} published': n for topic, n in self.published.items()}
+        self._diagnostics.publish(
+            build.diagnostics(make_rclpy, stamp, self._name, Health(), figures)
+        )

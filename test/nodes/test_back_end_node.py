@@ -144,7 +144,9 @@ def test_front_end_that_begins_anew_begins_a_new_map(live):
     front, back = start(live)
     drive(live, front, back, end=4.0)
     there = np.array([50.0, 0.0, 0.0])
-    front.start_at(build.pose_with_covariance(make, SECOND, 'map', there, 1e-4 * np.eye(3)))
+    front.control.start_at(
+        build.pose_with_covariance(make, SECOND, 'map', there, 1e-4 * np.eye(3))
+    )
     drive(live, front, back, start=4.0, end=5.0)
     _, poses = back.mapper.back_end.trajectory()
     assert 1 <= len(poses) <= 15
@@ -199,8 +201,8 @@ def test_saved_map_serves_for_localization(live, tmp_path):
     reflectors = slam.reflectors()
     reflector_file.save(reflectors, tmp_path / 'map.csv')
     front, back = start(live, map_directory=str(tmp_path), mode='localization')
-    live.spin_until(lambda: front._map is not None)
-    assert len(front._map) == len(reflectors)
+    live.spin_until(lambda: front.control.map is not None)
+    assert len(front.control.map) == len(reflectors)
     drive(live, front, back)
     assert back.mapper.back_end.keyframes == []
     stamps, poses = slam.trajectory()
@@ -231,7 +233,9 @@ def test_robot_that_was_carried_away_finds_itself_in_its_map(live, tmp_path):
     assert back.mapper.back_end.keyframes == []
 
     wrong = se2.compose(front.last.T_map_base, np.array([1.0, -0.8, 2.0]))
-    front.start_at(build.pose_with_covariance(make, SECOND, 'map', wrong, 1e-4 * np.eye(3)))
+    front.control.start_at(
+        build.pose_with_covariance(make, SECOND, 'map', wrong, 1e-4 * np.eye(3))
+    )
     drive(live, front, back, start=9.0, end=10.0)
     believed = front.last.T_map_base
     found = call(Trigger, 'back_end/relocalize', Trigger.Request())

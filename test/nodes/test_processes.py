@@ -52,6 +52,7 @@ def test_processes_map_a_recording_and_stop_cleanly(live, start):
     live.listen('pose', POSE, DEEP)
     live.listen('map', 'nav_msgs/msg/OccupancyGrid', LATCHED)
     live.listen('/ground_truth', 'nav_msgs/msg/Odometry', DEEP)
+    live.listen('/scan', 'sensor_msgs/msg/LaserScan')
     nodes = [
         start(name, '--ros-args', '-p', 'laser_pose:=[0.2, 0.0, 0.0]', '-p', 'use_sim_time:=true')
         for name in ('front_end', 'back_end')
@@ -62,7 +63,8 @@ def test_processes_map_a_recording_and_stop_cleanly(live, start):
     )
     player = start(
         'bag_player', '--ros-args', '-p', f'bag:={ROOM}', '-p', 'rate:=4.0',
-        '-p', 'wait_for_subscribers:=1',
+        # of the scans: the front end and this one, so that the beginning is not missed
+        '-p', 'wait_for_subscribers:=2', '-p', 'start_delay:=0.5',
     )  # fmt: skip
     live.spin_until(lambda: len(live.heard['pose']) > 250 and live.heard['map'], timeout=60.0)
     assert ended(player)[0] == 0

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a front end is told from outside: where it is, which map it is in, and corrections."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+from rlml_slam import se2
+from rlml_slam.params import Parameters
+from rlml_slam.rlml.front_end import FrontEnd
+from rlml_slam.ros import convert
+from rlml_slam.ros.answers import FramePublisher
+from rlml_slam.ros.associated import read_reflector_map
+from rlml_slam.ros.beliefs import read_belief
+from rlml_slam.ros.messages import rclpy_class
+from rlml_slam.ros.sensors import LATCHED, RELIABLE, checked
+from rlml_slam.se2 import Array
+from rlml_slam.types import Frame, Observation, Reflectors
+
+RECENT = 1000  # frames that an initialpose may be of: the search for it takes its time
+POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+CLOUD = 'sensor_msgs/msg/PointCloud2'
+
+
+class FrontEndControl:
+    """Owns a FrontEnd, which begins anew where it is told to; ``map`` is what it localizes in.
+
+    ``last`` is the newest frame. Every beginning is a new session of ``answers``.
+    """
+
+    def __init__(self, node: Any, params: Parameters, answers: FramePublisher) -> None:
+        self._logger = node.get_logger()
+        self._p = params
+        self._answers = answers
+        self.front_end = FrontEnd(params)
+        self.map: Reflectors | None = None
+        self.last: Frame | None = None
+        self._recent: deque[tuple[int, Array]] = deque(maxlen=RECENT)
+        for kind, topic, callback, qos in (
+            (POSE, 'initialpose', self.start_at, RELIABLE),
+            (POSE, 'correction', self.correct, LATCHED),
+            (CLOUD, 'belief', self.believe, RELIABLE),
+            (CLOUD, 'localization_map', self.use_map, LATCHED),
+        ):
+            node.create_subscription(rclpy_class(kind), topic, checked(node, callback), qos)
+
+    def process(self, observation: Observation) -> Frame:
+        """One observation."""
+        frame = self.last = self.front_end.process(observation)
+        self._recent.append((frame.stamp, frame.T_local_base))
+        return frame
+
+    def restart(self) -> None:
+        """Forget everything: the clock jumped back."""
+        self._begin(np.array(self._p.node.map_start_pose), np.zeros((3, 3)))
+
+    def start_at(self, msg: Any) -> None:
+        """Begin anew at a pose of the map; one with the stamp of a frame is of that moment."""
+        start = convert.pose_estimate(msg, 'initialpose')
+        pose = start.pose
+        for stamp, T_local_base in self._recent:
+            if stamp == start.stamp:
+                moved = se2.between(T_local_base, self.front_end.state.pose)
+                pose = se2.compose(pose, moved)
+        self._begin(pose, start.cov)
+        self._logger.info(f'begins at {np.round(pose, 3).tolist()}')
+
+    def use_map(self, msg: Any) -> None:
+        """Localise in the map of the back end from where the robot is; without fields, map."""
+        self.map = read_reflector_map(msg, 'localization_map') if msg.fields else None
+        mode = 'mapping' if self.map is None else 'localization'
+        node = dataclasses.replace(self._p.node, mode=mode)
+        self.front_end = FrontEnd(dataclasses.replace(self._p, node=node))
+        if self.last is None:
+            self.restart()
+        else:
+            self._begin(self.last.T_map_base, self.last.cov_map)
+        known = '' if self.map is None else f' in a map of {len(self.map)} reflectors'
+        self._logger.info(f'mode is {mode}{known}')
+
+    def _begin(self, pose: Array, cov: Array) -> None:
+        self.front_end.reset(pose, cov)
+        if self.map is not None:
+            self.front_end.use_map(self.map)
+        self._recent.clear()
+        self._answers.begin_session()
+
+    def believe(self, msg: Any) -> None:
+        """Go on from the back end's graph where it contradicts this end's pose of now."""
+        said = read_belief(msg)
+        if said.session == self._answers.session:
+            self.front_end.correct(said.T_map_local)
+            fresh = said.stamp == self.front_end.newest
+            if fresh and self.front_end.contradicts(said.belief):
+                self.front_end.adopt(said.belief)
+
+    def correct(self, msg: Any) -> None:
+        """Take over T_map_local from the back end."""
+        self.front_end.correct(convert.pose_estimate(msg, 'correction').pose)
