@@ -35,7 +35,10 @@ Waiting: TypeAlias = tuple[int, str, Scan | Detections]
 
 @dataclass
 class Inputs:
-    """What became of the inputs, by stream: used, late, duplicate, future, invalid, waited_out."""
+    """What became of the inputs, by stream: used, late, duplicate, future, invalid, waited_out.
+
+    Of those used, ``no_returns`` are scans in which no beam came back.
+    """
 
     counts: dict[str, Counter[str]] = field(default_factory=dict)
     last_error: str = ''
@@ -273,6 +276,8 @@ class Sequencer:
             delta = self.buffer.motion(scan.stamp, scan.stamp + duration).delta
             points = project(scan, T, delta, self._p.submap.max_laser_range)
             origin = T[:2].copy()
+            if not len(points):
+                self.inputs.count('scan', 'no_returns')
         if len(group) == 2:
             self._paired = stamp
         motion = STILL

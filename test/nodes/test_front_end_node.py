@@ -351,3 +351,78 @@ def make_transforms(*transforms):
     from types import SimpleNamespace
 
     return SimpleNamespace(transforms=list(transforms))
+
+
+def test_bad_input_over_dds_is_counted_in_the_diagnostics(live, node):
+    """Eight scans, one second apart in the bag, each with a fault of its own; the rest is used."""
+
+    def all_nan(msg):
+        msg.ranges = [float('nan')] * len(msg.ranges)
+
+    def empty(msg):
+        msg.ranges, msg.intensities = [], []
+
+    def short_intensities(msg):
+        msg.intensities = [1.0]
+
+    def another_frame(msg):
+        msg.header.frame_id = 'camera'
+
+    def no_geometry(msg):
+        msg.angle_increment = float('nan')
+
+    def no_stamp(msg):
+        msg.header.stamp.sec, msg.header.stamp.nanosec = 0, 0
+
+    def backward(msg):
+        msg.header.stamp.sec -= 1
+
+    def future(msg):
+        msg.header.stamp.sec += 500
+
+    faults = [
+        all_nan, empty, short_intensities, another_frame, no_geometry, no_stamp, backward, future
+    ]  # fmt: skip
+    messages, scans = [], 0
+    for stream, msg in room(seconds=9.0):
+        if stream == 'scan':
+            scans += 1
+            if scans % 10 == 0:
+                faults[scans // 10 - 1](msg)
+        messages.append((stream, msg))
+        if scans == 85:
+            break
+    publishers = {s: live.ear.create_publisher(type(m), s, 1000) for s, m in messages}
+    live.spin_until(lambda: all(p.get_subscription_count() == 1 for p in publishers.values()))
+    for stream, msg in messages:
+        publishers[stream].publish(msg)
+        if stream == 'scan':
+            live.executor.spin_once(timeout_sec=0.0)
+    figures = {}
+
+    def told():
+        for m in live.heard['/diagnostics']:
+            figures.update({v.key: v.value for v in m.status[0].values})
+        return int(figures.get('scan used', 0)) >= scans - 8
+
+    live.spin_until(told)
+    assert int(figures['scan invalid']) == 5
+    assert int(figures['scan late']) == int(figures['scan future']) == 1
+    assert int(figures['scan no_returns']) == 1
+    assert 'in the future' in figures['last refused input']
+    # whatever the scans were, the detections of their instants gave poses
+    live.drain()
+    assert len(live.heard['pose']) >= scans - 1
+    poses = np.array([convert.planar_pose(m.pose.pose, '') for m in live.heard['pose']])
+    assert np.isfinite(poses).all()
+    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() < 0.2
+
+
+def test_unknown_parameter_is_told_and_harmless(live, monkeypatch):
+    """One file may serve all nodes, so an unknown name is no error; a near one is suggested."""
+    from rclpy.impl.rcutils_logger import RcutilsLogger
+
+    said = []
+    monkeypatch.setattr(RcutilsLogger, 'warning', lambda self, text, **_: said.append(text))
+    live.start(FrontEndNode, scan_topik='x')
+    assert any("unknown parameter 'scan_topik'" in s and "'scan_topic'" in s for s in said)
