@@ -454,6 +454,12 @@ class Ekf(Group):
     local_margin: float = param(
         5.0, 'travel after which the local region is chosen anew', 'm', 0.1, 1e4
     )
+    error: str = param(
+        'invariant',
+        "the note's error of each coordinate, or one that turns with the heading and stays "
+        'consistent',
+        choices=('additive', 'invariant'),
+    )
     line_origin: tuple[float, ...] = param(
         (0.0, 0.0), 'fixed point of the map; a line is its point nearest to this', 'm, m'
     )

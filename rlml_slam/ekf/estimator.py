@@ -47,7 +47,9 @@ class Estimator:
 
     def reset(self, pose: Array, cov: Array) -> None:
         """Forget everything and start at a pose (3,) of the map with covariance (3, 3)."""
-        self.filter = Filter(pose, cov, self._p.motion.imu_bias, self.model)
+        # a line is no point that turns with the rest
+        invariant = self._p.ekf.error == 'invariant' and self.model is POINT
+        self.filter = Filter(pose, cov, self._p.motion.imu_bias, self.model, invariant)
         self.candidates = Candidates(self.model)
         self.health = HealthMonitor(self._p.health)
         self.ids = np.zeros(0, dtype=np.int64)

@@ -5,13 +5,18 @@ State (x, y, theta, b, x_1, y_1, ...): the note's, with the bias b of the gyro, 
 it is without an IMU. Only the robot and the landmarks of a local region are worked on. What an
 update means for the landmarks beyond it is collected in three small matrices and applied when the
 region changes (compressed filter: Guivant, Nebot 2001), which gives the same state exactly.
+
+The note's filter believes that it knows its heading in the map from landmarks alone, which it
+cannot: turning everything about the origin changes no measurement, but once the estimate has moved
+between two linearisations, the Jacobians no longer say so, and the covariance becomes too small.
+An ``invariant`` filter (right-invariant EKF: Barrau, Bonnabel 2015) moves position and landmarks
+along with the heading by which the error is turned, and is consistent there.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpstrf
 
 from rlml_slam import se2
 from rlml_slam.ekf.models import Model
@@ -28,8 +33,11 @@ class Filter:
     of the last :meth:`settle`. In a filter whose region is never chosen all landmarks are local.
     """
 
-    def __init__(self, pose: Array, cov: Array, bias_sigma: float, model: Model) -> None:
+    def __init__(
+        self, pose: Array, cov: Array, bias_sigma: float, model: Model, invariant: bool = False
+    ) -> None:
         self.model = model
+        self.invariant = invariant
         self.x = np.zeros(ROBOT)
         self.x[:3] = pose
         self.P = np.zeros((ROBOT, ROBOT))
@@ -99,15 +107,50 @@ class Filter:
         S = 0.5 * (S + S.T)
         S_inv = np.linalg.inv(S)
         K = W.T @ S_inv
-        if self._phi is not None:
-            HPhi = H @ self._phi[columns]
-            self._psi += HPhi.T @ S_inv @ HPhi
-            self._theta += HPhi.T @ (S_inv @ nu)
-            self._phi -= K @ HPhi
-        self.x += K @ nu
-        self.x[2] = se2.wrap(self.x[2])
+        dx = K @ nu
         M = K @ (0.5 * S @ K.T - W)
         self.P += M + M.T
+        g = np.zeros(0)
+        if self._phi is not None:
+            HPhi = H @ self._phi[columns]
+            self._psi -= HPhi.T @ S_inv @ HPhi
+            self._phi -= K @ HPhi
+            g = HPhi.T @ (S_inv @ nu)
+        if self.invariant:
+            self._correct_along(dx, g)
+        else:
+            self.x += dx
+            self._theta += g
+        self.x[2] = se2.wrap(self.x[2])
+
+    def _correct_along(self, dx: Array, g: Array) -> None:
+        """X <- exp(xi) X, and P with the error turned as before, not as linearised anew.
+
+        The error is xi_theta = dtheta, xi_p = dp - J p dtheta, and the same for landmarks, with
+        J = R(90 deg). exp moves a point m by V (dm), V = sin t/t + (1 - cos t)/t J, t = dtheta;
+        xi keeping its covariance, dm gains J (m_after - m_before) dtheta: P <- M P M^T with
+        M = I + u e_theta^T.
+        """
+        turn = float(dx[2])
+        along = float(np.sinc(turn / np.pi))
+        across = float(np.sinc(0.5 * turn / np.pi) * np.sin(0.5 * turn))
+        step, u = dx.copy(), np.zeros(len(dx))
+        for k in (slice(0, 2), slice(ROBOT, len(dx))):
+            step[k] = along * dx[k] + across * _quarter_turn(dx[k])
+            u[k] = _quarter_turn(step[k])
+        self.x += step
+        c = self.P[2].copy()
+        if self._phi is not None:
+            # the landmarks beyond: [P_ba0, J P_ba0] takes the part of P_ba0, J swaps its halves
+            moved = along * g + across * _swap(g)
+            h, heading = _swap(moved), self._phi[2].copy()
+            self._theta += moved
+            gain = np.outer(h, heading + 0.5 * c[2] * h)
+            self._psi += gain + gain.T
+            self._phi += np.outer(c, h)
+            self._phi += np.outer(u, self._phi[2])
+        E = np.outer(u, c + 0.5 * c[2] * u)
+        self.P += E + E.T
 
     # --- step 3 ----------------------------------------------------------------------------
 
@@ -153,19 +196,20 @@ class Filter:
             return
         assert self._phi is not None
         a, b = self._rows(self.local), self._columns(self._others)
-        a0 = a[: self._phi.shape[1]]
+        a0 = self._rows(self.local[self.local < len(self._x[ROBOT:]) // 2])
         n, before = ROBOT + 2 * self.num_landmarks, len(self._x)
-        P_ba0 = self._P[np.ix_(b, a0)]
+        B = self._P[np.ix_(b, a0)]
+        if self.invariant:
+            B = np.concatenate([B, _quarter_turn(B)], axis=1)
         x, P = np.empty(n), self._P
         if n > before:
             P = np.zeros((n, n))
             P[:before, :before] = self._P
-        x[a], x[b] = self.x, self._x[b] + P_ba0 @ self._theta
-        # P_bb <- P_bb - P_ba0 Psi P_a0b as G G^T over the whole matrix: half the work, contiguous
-        G = np.zeros((n, len(self._psi)))
-        G[b] = P_ba0 @ _factor(self._psi)
-        P -= G @ G.T
-        P[np.ix_(b, a)] = P_ba = P_ba0 @ self._phi.T
+        x[a], x[b] = self.x, self._x[b] + B @ self._theta
+        # P_bb <- P_bb + B Psi B^T, symmetric to the last bit
+        D = 0.5 * (B @ self._psi @ B.T)
+        P[np.ix_(b, b)] += D + D.T
+        P[np.ix_(b, a)] = P_ba = B @ self._phi.T
         P[np.ix_(a, b)] = P_ba.T
         P[np.ix_(a, a)] = self.P
         self.x, self.P, self._phi = x, P, None
@@ -181,9 +225,10 @@ class Filter:
         self._x, self._P = self.x, self.P
         a = self._rows(self.local)
         self.x, self.P = self._x[a], self._P[np.ix_(a, a)]
-        self._phi = np.eye(len(a))
-        self._psi = np.zeros((len(a), len(a)))
-        self._theta = np.zeros(len(a))
+        width = 2 * len(a) if self.invariant else len(a)
+        self._phi = np.eye(len(a), width)
+        self._psi = np.zeros((width, width))
+        self._theta = np.zeros(width)
 
     @staticmethod
     def _columns(landmarks: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -244,10 +289,14 @@ class Filter:
         return out
 
 
-def _factor(M: Array) -> Array:
-    """F with F F^T = M for a positive semidefinite M: pivoted Cholesky."""
-    L, pivots, rank, _ = dpstrf(0.5 * (M + M.T), lower=1)
-    F = np.empty_like(M)
-    F[pivots - 1] = np.tril(L)
-    F[:, rank:] = 0.0
-    return F
+def _quarter_turn(rows: Array) -> Array:
+    """J (rows in pairs of x and y): each point (x, y) becomes (-y, x)."""
+    out = np.empty_like(rows)
+    out[0::2], out[1::2] = -rows[1::2], rows[0::2]
+    return out
+
+
+def _swap(coefficients: Array) -> Array:
+    """What J does to B = [P, J P]: J B c = B [-c_2, c_1]."""
+    first, second = np.split(coefficients, 2)
+    return np.concatenate([-second, first])

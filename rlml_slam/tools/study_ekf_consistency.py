@@ -9,7 +9,7 @@ freedom over N if the covariance is right.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,7 @@ from rlml_slam.tools.record import FrameLog
 from rlml_slam.tools.study_jobs import each
 from rlml_slam.tools.tum import Trajectory
 
-SYSTEMS = ('ekf', 'rlml')
+SYSTEMS = ('additive', 'invariant', 'rlml')  # the two errors of the EKF, and RLML
 CONFIDENCE = 0.95
 DURATION = 85.0  # [s] the first loop of the demo world and a little more
 HEADER = ['drive, system', 'mean NEES', '95 % bounds', 'inside', 'above', 'heading [°]',
@@ -176,7 +176,7 @@ def knows(p: SimulatorParameters) -> EkfParameters:
 
 
 def judge_case(name: str, seed: int) -> dict[str, Judged]:
-    """Both systems on the first loop of one drive."""
+    """All systems on the first loop of one drive."""
     p = simulator(CASES[name])
     messages, truth = simulate(p, seed)
     end = first_loop(truth.trajectory)
@@ -184,7 +184,9 @@ def judge_case(name: str, seed: int) -> dict[str, Judged]:
     out = {}
     for system in SYSTEMS:
         params = knows(p)
-        slam: Slam | EkfSlam = Slam(params) if system == 'rlml' else EkfSlam(params)
+        slam: Slam | EkfSlam = Slam(params)
+        if system != 'rlml':
+            slam = EkfSlam(replace(params, ekf=replace(params.ekf, error=system)))
         slam.set_sensor_pose(p.node.laser_frame, np.array(p.node.laser_pose))
         log = FrameLog()
         for frames in feed(slam, messages):

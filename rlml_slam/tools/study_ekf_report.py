@@ -14,12 +14,12 @@ from matplotlib.figure import Figure
 from rlml_slam.maps.occupancy import write_atomically
 from rlml_slam.tools import page
 from rlml_slam.tools.outputs import make_folder
-from rlml_slam.tools.pictures import LIVE, PATH, TRUTH, png
+from rlml_slam.tools.pictures import CLOSURE, LIVE, PATH, TRUTH, png
 from rlml_slam.tools.study_ekf import COLUMNS, drive_rows
 from rlml_slam.tools.study_ekf_consistency import CASES, HEADER, SYSTEMS, Series, rows
 
-COLORS = {'ekf': LIVE, 'rlml': PATH}
-NAMES = {'ekf': 'EKF', 'rlml': 'RLML'}
+COLORS = {'additive': LIVE, 'invariant': CLOSURE, 'rlml': PATH}
+NAMES = {'additive': "EKF, the note's error", 'invariant': 'EKF, invariant error', 'rlml': 'RLML'}
 
 
 def write_report(folder: Path, summary: Mapping[str, Any], series: Mapping[str, Series]) -> None:

@@ -80,15 +80,16 @@ def near_now(f, radius):
     return f.local[np.hypot(*(f.points - f.x[:2]).T) < radius]
 
 
-def test_postponed_update_equals_the_plain_filter():
-    plain = Filter(POSE, COV, 0.02, POINT)
+@pytest.mark.parametrize('invariant', [False, True])
+def test_postponed_update_equals_the_plain_filter(invariant):
+    plain = Filter(POSE, COV, 0.02, POINT, invariant)
     rng = np.random.default_rng(5)
     motions = [
         Motion(np.array([0.3, 0.0, 0.05]) + 0.01 * rng.standard_normal(3), Q) for _ in range(200)
     ]
     noise = 0.01 * rng.standard_normal((200, 50, 2))
     new = np.stack([rng.uniform(0.5, 2.5, 200), rng.uniform(-3.0, 3.0, 200)], -1)
-    postponed = Filter(POSE, COV, 0.02, POINT)
+    postponed = Filter(POSE, COV, 0.02, POINT, invariant)
     shares = []
     for k, motion in enumerate(motions):
         for f in (plain, postponed):
@@ -119,3 +120,41 @@ def test_a_line_does_not_tell_the_place_along_it():
     f.update(0, np.array([2.0, 0.5 * np.pi]), np.diag([1e-4, 1e-4]))
     assert f.P[0, 0] == pytest.approx(0.04, rel=1e-6)
     assert f.P[1, 1] < 2e-4
+
+
+def test_an_invariant_filter_learns_no_heading_from_landmarks_it_does_not_know():
+    """Turning the map about the origin changes no measurement, wherever the estimate went."""
+    rng = np.random.default_rng(2)
+    gained = {}
+    for invariant in (False, True):
+        f = Filter(np.zeros(3), np.diag([1e-6, 1e-6, 0.5**2]), 0.1, POINT, invariant)
+        for bearing in (-1.0, 0.2, 1.3):
+            f.augment(np.array([4.0, bearing]), 25.0 * R)
+        before = f.P[2, 2]
+        for k in range(60):
+            f.predict(Motion(np.array([0.1, 0.0, 0.3]), np.diag([1e-3, 1e-3, 0.02])))
+            slot = k % 3
+            z = POINT.observe(f.x[:3], f.points[slot][None])[0][0]
+            f.update(slot, z + 5.0 * np.sqrt(np.diag(R)) * rng.standard_normal(2), 25.0 * R)
+        # the heading of the whole: the direction in state space that no measurement sees
+        turn = np.zeros(len(f.x))
+        turn[2] = 1.0
+        for k in (0, *range(ROBOT, len(f.x), 2)):
+            turn[k], turn[k + 1] = -f.x[k + 1], f.x[k]
+        gained[invariant] = 1.0 / (turn @ np.linalg.solve(f.P, turn)) / before
+    # what the robot forgets on its way is less than a hundredth of it
+    assert gained[True] == pytest.approx(1.0, abs=1e-2)
+    assert gained[False] < 0.7
+
+
+def test_small_corrections_are_the_same_in_both_errors():
+    corrections = []
+    for invariant in (False, True):
+        f = Filter(POSE, 1e-8 * COV, 0.0, POINT, invariant)
+        f.augment(np.array([3.0, 0.4]), 1e-8 * R)
+        x = f.x.copy()
+        z = POINT.observe(x[:3], f.points)[0][0] + 1e-6
+        f.update(0, z, 1e-8 * R)
+        corrections.append(f.x - x)
+    assert np.abs(corrections[0] - corrections[1]).max() < 1e-10
+    assert np.abs(corrections[0]).max() > 1e-7

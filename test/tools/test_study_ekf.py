@@ -113,9 +113,9 @@ def test_true_covariance_lies_inside_the_bounds():
 def test_overconfident_covariance_is_called_so():
     summary = drives(2.0).summary()
     assert summary['share_above'] > 0.9
-    assert 'believes too much' in verdicts({'demo, ekf': summary})[0]
-    assert 'consistent' in verdicts({'demo, ekf': drives(1.0).summary()})[0]
-    assert 'too little' in verdicts({'demo, ekf': drives(0.3).summary()})[0]
+    assert 'believes too much' in verdicts({'demo, additive': summary})[0]
+    assert 'consistent' in verdicts({'demo, additive': drives(1.0).summary()})[0]
+    assert 'too little' in verdicts({'demo, additive': drives(0.3).summary()})[0]
 
 
 def test_only_instants_known_to_all_seeds_count():
