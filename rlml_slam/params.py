@@ -226,8 +226,8 @@ class Submap(Group):
     resolution: float = param(0.05, 'cell size', 'm', 0.01, 1.0)
     max_laser_range: float = param(30.0, 'beams longer than this are not used', 'm', 0.5, 300.0)
     max_points: int = param(500, 'most end points of one scan that are inserted', '', 20, 100000)
-    p_hit: float = param(0.65, 'occupancy probability that one hit adds', '', 0.5, 0.99)
-    p_miss: float = param(0.49, 'occupancy probability that one miss leaves', '', 0.01, 0.5)
+    p_hit: float = param(0.7, 'occupancy probability that one hit adds', '', 0.5, 0.99)
+    p_miss: float = param(0.46, 'occupancy probability that one miss leaves', '', 0.01, 0.5)
     bias2: tuple[float, ...] = param(
         (1e-4, 1e-4, 2.25e-6),
         "variance of a submap's own error, common to its scans",
@@ -247,14 +247,14 @@ class ScanMatch(Group):
     )
     max_points: int = param(400, 'most end points used by one match', '', 20, 10000)
     sigma: float = param(
-        0.3, 'sigma_s of one end point (eq. 2), calibrated by NEES', '', 1e-3, 100.0
+        0.2, 'sigma_s of one end point (eq. 2), calibrated by NEES', '', 1e-3, 100.0
     )
     sigma_point: float = param(
-        0.15, 'error of an end point across its surface, correlation included', 'm', 1e-3, 10.0
+        0.03, 'error of an end point across its surface, correlation included', 'm', 1e-3, 10.0
     )
     min_points: int = param(20, 'scans with fewer end points are not used', '', 3, 10000)
     floor2: tuple[float, ...] = param(
-        (2.5e-5, 2.5e-5, 4e-6), 'variance of a match that more beams do not lower', 'm², m², rad²'
+        (1e-6, 1e-6, 1e-7), 'variance of a match that more beams do not lower', 'm², m², rad²'
     )
     min_score: float = param(
         0.3, 'mean hit probability below which a match is not used', '', 0.0, 1.0
@@ -311,6 +311,11 @@ class BackEnd(Group):
     edge_floor2: tuple[float, ...] = param(
         (1e-6, 1e-6, 1e-7), 'variance added to every odometry edge', 'm², m², rad²'
     )
+    scan_floor2: tuple[float, ...] = param(
+        (1e-4, 1e-4, 4e-6),
+        'variance added to a scan edge: of what the keyframes of one submap have in common',
+        'm², m², rad²',
+    )
     submap_size: int = param(40, 'keyframes that complete a submap', '', 2, 1000)
     match_sigma: tuple[float, ...] = param(
         (0.05, 0.05, 0.02),
@@ -339,7 +344,7 @@ class LoopClosure(Group):
     min_score: float = param(0.55, 'mean hit probability that a closure must reach', '', 0.1, 1.0)
     every: int = param(3, 'try every n-th keyframe', '', 1, 1000)
     floor2: tuple[float, ...] = param(
-        (4e-4, 4e-4, 2.5e-5), 'variance of a closure that more beams do not lower', 'm², m², rad²'
+        (1e-4, 1e-4, 1e-5), 'variance of a closure that more beams do not lower', 'm², m², rad²'
     )
     candidates: int = param(3, 'submaps tried per keyframe, nearest first', '', 1, 100)
     max_second: float = param(0.95, 'score of the second place relative to the best', '', 0.1, 1.0)

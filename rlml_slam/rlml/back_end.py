@@ -115,7 +115,7 @@ class BackEnd:
             index = self.graph.add_pose(frame.T_local_base, fixed=True)
             since, scanned = o.motion, False
         else:
-            self.reflector_graph.add(len(self.keyframes) - 1, interval.sightings)
+            self.reflector_graph.add(len(self.keyframes) - 1, interval)
             since, scanned = interval.motion, interval.scanned
             last = self.keyframes[-1]
             # with scans the front end's motion is the better mean; without, it holds the
@@ -165,7 +165,7 @@ class BackEnd:
     def finish(self) -> None:
         """Use what is still collected, look for the last closures and optimise."""
         if self._interval is not None and self.keyframes:
-            self.reflector_graph.add(len(self.keyframes) - 1, self._interval.sightings)
+            self.reflector_graph.add(len(self.keyframes) - 1, self._interval)
             self._interval = Interval(self.keyframes[-1].T_local)
             self.scans.finish()
             self.optimize()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from rlml_slam import se2
 from rlml_slam.motion import STILL, compose_motion
 from rlml_slam.se2 import Array
-from rlml_slam.types import Frame, Motion
+from rlml_slam.types import ANONYMOUS, Frame, Motion
 
 AGREE = 9.2  # 99 % of a chi-square with 2 degrees of freedom
 
@@ -65,6 +66,8 @@ class Interval:
         self.motion = STILL
         self.scanned = False
         self.sightings: dict[int, list[Sighting]] = {}
+        self.ids: dict[int, int] = {}
+        self.diameters: dict[int, float] = {}
 
     def add_motion(self, frame: Frame) -> None:
         """Compose the odometry motion of one more frame."""
@@ -85,6 +88,7 @@ class Interval:
         z = se2.transform(T, d.points)
         R = se2.rotation(T[2])
         for k in np.flatnonzero(frame.landmarks >= 0):
+            self._tell(int(frame.landmarks[k]), int(d.ids[k]), float(d.diameters[k]))
             J = np.array([[1.0, 0.0, -(z[k, 1] - T[1])], [0.0, 1.0, z[k, 0] - T[0]]])
             cov = R @ d.cov[k] @ R.T + J @ self.motion.cov @ J.T
             groups = self.sightings.setdefault(int(frame.landmarks[k]), [])
@@ -93,3 +97,10 @@ class Interval:
                 group = Sighting()
                 groups.append(group)
             group.add(z[k], cov)
+
+    def _tell(self, key: int, id_: int, diameter: float) -> None:
+        """What a detection says of its reflector besides the place."""
+        if id_ != ANONYMOUS:
+            self.ids[key] = id_
+        if math.isfinite(diameter):
+            self.diameters[key] = diameter

@@ -111,8 +111,8 @@ class ScanGraph:
         cov = np.linalg.inv(information + np.diag([1e-4, 1e-4, 1e-4]))
         cov = TURN_ROTATION @ cov @ TURN_ROTATION.T
         delta = se2.compose(TURN, delta)
-        if closure:
-            cov[[0, 1, 2], [0, 1, 2]] += self._p.loop_closure.floor2
+        floor2 = self._p.loop_closure.floor2 if closure else self._p.back_end.scan_floor2
+        cov[[0, 1, 2], [0, 1, 2]] += floor2
         self.changed |= closure
         return self._graph.add_edge(kind, i, j, delta, relative_information(delta, cov))
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,7 +12,7 @@ from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.marginals import Marginals
 from rlml_slam.matching.association import gate
 from rlml_slam.params import Reflector
-from rlml_slam.rlml.keyframes import Sighting
+from rlml_slam.rlml.keyframes import Interval
 from rlml_slam.se2 import Array, transform
 from rlml_slam.types import ANONYMOUS, Belief, Reflectors
 
@@ -25,6 +26,7 @@ class _Landmark:
     key: int
     index: int = -1
     id: int = ANONYMOUS
+    diameter: float = float('nan')
     count: int = 0
     sightings: list[tuple[int, Array, Array, int]] = field(default_factory=list)
 
@@ -38,7 +40,6 @@ class ReflectorGraph:
         self._landmarks: dict[int, _Landmark] = {}
         self._alias: dict[int, int] = {}
         self.changed = False
-        self.ids: dict[int, int] = {}
 
     def resolve(self, key: int) -> int:
         """The key under which a merged reflector goes on."""
@@ -46,10 +47,12 @@ class ReflectorGraph:
             key = self._alias[key]
         return key
 
-    def add(self, pose: int, sightings: dict[int, list[Sighting]]) -> None:
+    def add(self, pose: int, interval: Interval) -> None:
         """The reflectors seen near keyframe ``pose``."""
-        for key, s in ((k, s) for k, groups in sightings.items() for s in groups):
+        for key, s in ((k, s) for k, groups in interval.sightings.items() for s in groups):
             landmark = self._landmarks.setdefault(self.resolve(key), _Landmark(self.resolve(key)))
+            landmark.id = interval.ids.get(key, landmark.id)
+            landmark.diameter = interval.diameters.get(key, landmark.diameter)
             landmark.count += s.count
             landmark.sightings.append((pose, s.z, s.information, -1))
             if landmark.index >= 0:
@@ -113,6 +116,7 @@ class ReflectorGraph:
             self._link(keep, len(keep.sightings) - 1)
         keep.count += gone.count
         keep.id = gone.id if keep.id == ANONYMOUS else keep.id
+        keep.diameter = gone.diameter if math.isnan(keep.diameter) else keep.diameter
         self._alias[gone.key] = keep.key
         del self._landmarks[gone.key]
 
@@ -139,7 +143,7 @@ class ReflectorGraph:
             cov,
             np.array([m.id for m in alive], dtype=np.int64),
             np.array([m.count for m in alive], dtype=np.int64),
-            np.full(len(alive), np.nan),
+            np.array([m.diameter for m in alive], dtype=np.float64),
         )
 
 

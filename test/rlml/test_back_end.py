@@ -25,7 +25,7 @@ from rlml_slam.params import LoopClosure, Node, Parameters
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.front_end import FrontEnd
 from rlml_slam.rlml.keyframes import Interval, Sighting
-from rlml_slam.types import Frame, Motion, Observation, Status
+from rlml_slam.types import ANONYMOUS, Frame, Motion, Observation, Status
 
 CURVE = drive((0.6, 0.0, 3.0), (0.6, 0.6, 4.0), (0.5, -0.7, 2.0))
 # one lap around a block: from any corner one sees two of the four sides
@@ -281,6 +281,20 @@ def test_neighbours_seen_together_are_never_merged():
     twins = replace(ROOM, reflectors=np.array([[2.0, 2.5], [2.15, 2.5], [-1.5, 0.0]]))
     back_end, _ = run(frames_along(CURVE, twins, scan=False, rng=np.random.default_rng(6)))
     assert len(back_end.reflectors()) == 3
+
+
+def test_reflectors_keep_the_id_and_the_diameter_that_some_detection_told():
+    frames = frames_along(CURVE, scan=False, ids=True)
+    told = []
+    for k, f in enumerate(frames):
+        d = f.observation.detections
+        ids = d.ids if k % 4 == 1 else np.full(len(d), ANONYMOUS)
+        diameters = np.where(k % 4 == 2, 0.01 * d.ids, np.nan)
+        o = replace(f.observation, detections=replace(d, ids=ids, diameters=diameters))
+        told.append(replace(f, observation=o, landmarks=d.ids - 100))
+    found = run(told)[0].reflectors()
+    np.testing.assert_array_equal(found.ids, found.keys + 100)
+    np.testing.assert_allclose(found.diameters, 0.01 * found.ids)
 
 
 def test_one_outlier_of_a_known_reflector_does_not_bend_the_map():
