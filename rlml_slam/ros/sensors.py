@@ -23,10 +23,13 @@ from rlml_slam.types import Detections, Observation
 
 TF_PATIENCE = 1_000_000_000  # [ns] of stamps that a sensor's place on /tf_static is waited for
 RELIABLE = QoSProfile(depth=10)
-# two seconds of a 100 Hz IMU: a pause of the interpreter must not cost a message
+# a pause of the interpreter must not cost a message; and where the machine is too slow, scans are
+# lost before the odometry that all later ones need: 2000 are 20 s of a 100 Hz IMU
 DEPTH = 200
-SILENCE = 1.0  # [s] of the wall clock without any message, after which nothing more is waited for
+MOTION_DEPTH = 2000
 SENSOR = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+MOTION = QoSProfile(depth=MOTION_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+SILENCE = 1.0  # [s] of the wall clock without any message, after which nothing more is waited for
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -66,9 +69,9 @@ class Sensors:
 
     def _subscribe(self, node: Any, stream: str, topic: str) -> None:
         index = len(self._queues)
-        subscription = node.create_subscription(
-            rclpy_class(STREAMS[stream][1]), topic, lambda msg: self.receive(index, msg), SENSOR
-        )
+        qos = MOTION if stream in ('odom', 'imu') else SENSOR
+        kind, callback = rclpy_class(STREAMS[stream][1]), lambda msg: self.receive(index, msg)
+        subscription = node.create_subscription(kind, topic, callback, qos)
         self._queues.append((stream, subscription))
 
     def _begin(self, extrinsics: Extrinsics) -> None:
@@ -115,7 +118,7 @@ class Sensors:
         stream, subscription = self._queues[index]
         out: list[tuple[str, Any]] = []
         with subscription.handle:
-            while len(out) < DEPTH:
+            while len(out) < MOTION_DEPTH:
                 taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
                 if taken is None:
                     break

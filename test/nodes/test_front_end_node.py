@@ -255,26 +255,34 @@ def test_clock_that_jumps_back_begins_anew(live, node):
 # --- the place of the laser -----------------------------------------------------------------
 
 
-@pytest.mark.skipif(
-    rclpy_class('tf2_msgs/msg/TFMessage') is None, reason='tf2_msgs is not installed: make tf'
-)
 def test_scans_wait_for_the_place_of_the_laser(live):
     node = live.start(FrontEndNode, use_reflectors=False)
+    node.sensors._waits = True  # as where there is tf2_msgs
     scans = [(s, m) for s, m in room(['/scan', '/odom'], seconds=2.0)]
     for stream, msg in scans[:10]:
         node.sensors.add(stream, msg)
     assert used(node, 'scan') == 0
+    place = build.transform(make, SECOND, ('base_link', 'laser'), np.array([0.3, 0.1, 0.0]))
+    node.sensors.extrinsics.add(convert.transforms(place))
+    for stream, msg in scans[10:]:
+        node.sensors.add(stream, msg)
+    n = len([1 for s, _ in scans if s == 'scan'])
+    assert used(node, 'scan') >= n - 1
+    np.testing.assert_allclose(node.last.observation.origin, [0.3, 0.1], atol=1e-6)
+
+
+@pytest.mark.skipif(
+    rclpy_class('tf2_msgs/msg/TFMessage') is None, reason='tf2_msgs is not installed: make tf'
+)
+def test_tf_static_tells_the_place_of_the_laser(live):
+    node = live.start(FrontEndNode)
     place = build.transform(make, SECOND, ('base_link', 'laser'), np.array([0.3, 0.1, 0.0]))
     publisher = live.ear.create_publisher(
         rclpy_class('tf2_msgs/msg/TFMessage'), '/tf_static', LATCHED
     )
     publisher.publish(build.tf_message(make, [place]))
     live.spin_until(lambda: node.sensors.extrinsics.pose('base_link', 'laser') is not None)
-    for stream, msg in scans[10:]:
-        node.sensors.add(stream, msg)
-    n = len([1 for s, _ in scans if s == 'scan'])
-    assert used(node, 'scan') >= n - 1
-    np.testing.assert_allclose(node.last.observation.origin, [0.3, 0.1], atol=1e-6)
+    np.testing.assert_allclose(node.sensors.extrinsics.pose('base_link', 'laser'), [0.3, 0.1, 0.0])
 
 
 def test_parameter_serves_where_nobody_tells_the_place_of_the_laser(live):
