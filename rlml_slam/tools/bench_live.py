@@ -19,6 +19,7 @@ from rlml_slam.simulation.world_file import load_world
 from rlml_slam.tools.live import LISTENERS, Source, drive
 from rlml_slam.tools.metrics import metrics
 
+ALSO_USED = ('waited_out', 'no_returns')  # counted beside `used`
 START = 10.0  # [s] at least: shorter tells nothing
 
 
@@ -54,10 +55,11 @@ def run(args: argparse.Namespace) -> int:
         result = drive(source(args, duration), Path(folder), args.json)
     figures = metrics(result)
     scans = figures['inputs'].get('scan', {})
+    arrived = sum(n for what, n in scans.items() if what not in ALSO_USED)
     out = {
         'scans_sent': figures['scans_published'],
         'poses': figures['scans'],
-        'dropped': figures['scans_published'] - sum(scans.values()) + scans.get('waited_out', 0),
+        'dropped': figures['scans_published'] - arrived,
         'late': scans.get('late', 0),
         'latency_ms': figures.get('latency_ms'),
         'front_end_ms': figures['front_end_ms'],

@@ -225,7 +225,7 @@ class Recorder(Node):
         return now - self._heard if self._began is not None else 0.0
 
     def has_caught_up(self, since: float) -> bool:
-        """Whether the newest scan has its pose, which is in the map and in the diagnostics.
+        """Whether all scans came and the newest has its pose, in map and diagnostics as well.
 
         ``since`` is when the source ended; after PATIENCE the answer is yes in any case.
         """
@@ -236,7 +236,7 @@ class Recorder(Node):
         mapped = stamp_of(path) if path is not None else 0
         answered = self.frames.stamps[-1] if self.frames.stamps else 0
         told = max(self._healths, default=0)
-        return min(mapped, told) >= answered >= newest
+        return self.sensed >= self.sent() and min(mapped, told) >= answered >= newest
 
     def note(self) -> str:
         """One line for the progress."""
