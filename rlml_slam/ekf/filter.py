@@ -24,6 +24,7 @@ from rlml_slam.se2 import Array
 from rlml_slam.types import Motion
 
 BIAS, ROBOT = 3, 4
+PENDING = 128  # updates whose share in Psi is summed up at once
 
 
 class Filter:
@@ -51,6 +52,7 @@ class Filter:
         self._phi: Array | None = None
         self._psi = np.zeros((0, 0))
         self._theta = np.zeros(0)
+        self._pending: list[tuple[Array, Array]] = []
 
     # --- step 1 ----------------------------------------------------------------------------
 
@@ -108,49 +110,55 @@ class Filter:
         S_inv = np.linalg.inv(S)
         K = W.T @ S_inv
         dx = K @ nu
-        M = K @ (0.5 * S @ K.T - W)
-        self.P += M + M.T
-        g = np.zeros(0)
+        left, right = K, 0.5 * S @ K.T - W  # P <- P + left right + (left right)^T
+        turn = _Turn(dx[2]) if self.invariant else None
+        u = c = np.zeros(0)
+        if turn is not None:
+            # The error is xi_theta = dtheta, xi_p = dp - J p dtheta, and the same for landmarks,
+            # J = R(90 deg). exp moves a point m by V dm; xi keeping its covariance, dm gains
+            # J (m_after - m_before) dtheta: P <- M P M^T with M = I + u e_theta^T
+            c = self.P[2] + K[2] @ right + K @ right[:, 2]
+            dx, u = turn.step(dx)
+            left = np.concatenate([K, u[:, None]], axis=1)
+            right = np.concatenate([right, (c + 0.5 * c[2] * u)[None]])
         if self._phi is not None:
             HPhi = H @ self._phi[columns]
-            self._psi -= HPhi.T @ S_inv @ HPhi
-            self._phi -= K @ HPhi
-            g = HPhi.T @ (S_inv @ nu)
-        if self.invariant:
-            self._correct_along(dx, g)
-        else:
-            self.x += dx
-            self._theta += g
+            self._pass_on(HPhi, S_inv, nu, K)
+            if turn is not None:
+                self._pass_on_turn(turn, HPhi.T @ (S_inv @ nu), c, u)
+            else:
+                self._theta += HPhi.T @ (S_inv @ nu)
+        self.x += dx
         self.x[2] = se2.wrap(self.x[2])
+        M = left @ right
+        self.P += M + M.T
 
-    def _correct_along(self, dx: Array, g: Array) -> None:
-        """X <- exp(xi) X, and P with the error turned as before, not as linearised anew.
+    def _pass_on(self, HPhi: Array, S_inv: Array, nu: Array, K: Array) -> None:
+        """What an update is to the landmarks beyond: P_bb, P_ba, in terms of P_ba0."""
+        assert self._phi is not None
+        self._phi -= K @ HPhi
+        self._collect(HPhi, -S_inv)
 
-        The error is xi_theta = dtheta, xi_p = dp - J p dtheta, and the same for landmarks, with
-        J = R(90 deg). exp moves a point m by V (dm), V = sin t/t + (1 - cos t)/t J, t = dtheta;
-        xi keeping its covariance, dm gains J (m_after - m_before) dtheta: P <- M P M^T with
-        M = I + u e_theta^T.
-        """
-        turn = float(dx[2])
-        along = float(np.sinc(turn / np.pi))
-        across = float(np.sinc(0.5 * turn / np.pi) * np.sin(0.5 * turn))
-        step, u = dx.copy(), np.zeros(len(dx))
-        for k in (slice(0, 2), slice(ROBOT, len(dx))):
-            step[k] = along * dx[k] + across * _quarter_turn(dx[k])
-            u[k] = _quarter_turn(step[k])
-        self.x += step
-        c = self.P[2].copy()
-        if self._phi is not None:
-            # the landmarks beyond: [P_ba0, J P_ba0] takes the part of P_ba0, J swaps its halves
-            moved = along * g + across * _swap(g)
-            h, heading = _swap(moved), self._phi[2].copy()
-            self._theta += moved
-            gain = np.outer(h, heading + 0.5 * c[2] * h)
-            self._psi += gain + gain.T
-            self._phi += np.outer(c, h)
-            self._phi += np.outer(u, self._phi[2])
-        E = np.outer(u, c + 0.5 * c[2] * u)
-        self.P += E + E.T
+    def _pass_on_turn(self, turn: _Turn, g: Array, c: Array, u: Array) -> None:
+        """The turn of the error for the landmarks beyond, where B = [P_ba0, J P_ba0]."""
+        assert self._phi is not None
+        moved = turn.moved(g)
+        h, heading = _swap(moved), self._phi[2].copy()
+        self._theta += moved
+        self._collect(np.stack([h, heading]), np.array([[c[2], 1.0], [1.0, 0.0]]))
+        self._phi += np.stack([c, u], -1) @ np.stack([h, heading + c[2] * h])
+
+    def _collect(self, rows: Array, weight: Array) -> None:
+        """Psi <- Psi + rows^T weight rows, some hundred rows at a time."""
+        self._pending.append((rows, weight @ rows))
+        if len(self._pending) >= PENDING:
+            self._sum_up()
+
+    def _sum_up(self) -> None:
+        if self._pending:
+            rows, weighted = (np.concatenate(part) for part in zip(*self._pending, strict=True))
+            self._psi += rows.T @ weighted
+            self._pending.clear()
 
     # --- step 3 ----------------------------------------------------------------------------
 
@@ -207,6 +215,7 @@ class Filter:
             P[:before, :before] = self._P
         x[a], x[b] = self.x, self._x[b] + B @ self._theta
         # P_bb <- P_bb + B Psi B^T, symmetric to the last bit
+        self._sum_up()
         D = 0.5 * (B @ self._psi @ B.T)
         P[np.ix_(b, b)] += D + D.T
         P[np.ix_(b, a)] = P_ba = B @ self._phi.T
@@ -286,6 +295,27 @@ class Filter:
             + cross.transpose(0, 2, 1)
             + H_m @ self.point_covs() @ H_m.transpose(0, 2, 1)
         )
+        return out
+
+
+class _Turn:
+    """V = sin t/t + (1 - cos t)/t J of the exponential map, for a correction of the heading t."""
+
+    def __init__(self, t: float) -> None:
+        self._along = float(np.sinc(t / np.pi))
+        self._across = float(np.sinc(0.5 * t / np.pi) * np.sin(0.5 * t))
+
+    def step(self, dx: Array) -> tuple[Array, Array]:
+        """``dx`` with V applied to position and landmarks, and J of that (0 elsewhere)."""
+        step, u = dx.copy(), np.zeros(len(dx))
+        for k in (slice(0, 2), slice(ROBOT, len(dx))):
+            step[k] = self._along * dx[k] + self._across * _quarter_turn(dx[k])
+            u[k] = _quarter_turn(step[k])
+        return step, u
+
+    def moved(self, coefficients: Array) -> Array:
+        """V applied to B times the coefficients."""
+        out: Array = self._along * coefficients + self._across * _swap(coefficients)
         return out
 
 

@@ -64,6 +64,9 @@ COMMANDS: Table = {
                 'study_lego',
                 'spikes and EKF on the LEGO robot among cylinders: figures and a picture',
             ),
+            'victoria-park': Command(
+                'study_victoria_park', 'dead reckoning, EKF and RLML among trees, against GPS'
+            ),
         },
     ),
     'bench': Group(

@@ -114,6 +114,16 @@ def test_postponed_update_equals_the_plain_filter(invariant):
     assert is_covariance(plain.P)
 
 
+def test_a_region_that_holds_all_again_is_plain():
+    f, _ = small()
+    f.choose(np.array([True, False, True, True]))
+    f.update(0, f.model.observe(f.x[:3], f.points)[0][0] + 0.01, R)
+    f.choose(np.ones(4, dtype=np.bool_))
+    f.update(1, f.model.observe(f.x[:3], f.points)[0][1] + 0.01, R)
+    assert len(f.local) == 4
+    assert is_covariance(f.P)
+
+
 def test_a_line_does_not_tell_the_place_along_it():
     f = Filter(np.zeros(3), np.diag([0.04, 0.04, 1e-6]), 0.0, line_model(np.zeros(2)))
     f.fix(np.array([0.0, 2.0]), 1e-12 * np.eye(2))
