@@ -56,6 +56,7 @@ class Estimator:
         self.sightings = np.zeros(0, dtype=np.int64)
         self.diameters = np.zeros(0)
         self.fates: Counter[str] = Counter()
+        self._mapping = self._p.node.mode == 'mapping'
         self._region: Array | None = None
         self._radius = self._reach = 0.0
         self._last_stamp: int | None = None
@@ -64,8 +65,9 @@ class Estimator:
         self._drawn: list[tuple[Array, Array, Array]] = []
 
     def use_map(self, reflectors: Reflectors) -> None:
-        """Localise against given landmarks (map frame)."""
+        """Localise against given landmarks (map frame); no others are added from now on."""
         self.filter.settle()
+        self._mapping = False
         for k in range(len(reflectors)):
             self.filter.fix(reflectors.points[k], reflectors.cov[k])
             self._note(
@@ -195,7 +197,7 @@ class Estimator:
         """Count what is new as candidates; those seen N times enter the state."""
         e = self._p.ekf
         new = np.flatnonzero(statuses == Status.NEW)
-        if len(new) and self._p.node.mode == 'mapping':
+        if len(new) and self._mapping:
             ids = detections.ids[new]
             times = self.candidates.see(stamp, z[new], R[new], ids, self._gate)
             for k, n in zip(new, times, strict=True):

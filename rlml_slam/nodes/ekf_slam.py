@@ -9,19 +9,18 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
-from std_srvs.srv import Trigger
 
 from rlml_slam import warm_up
 from rlml_slam.ekf.estimator import Estimator
-from rlml_slam.errors import RlmlError
 from rlml_slam.params import EkfParameters
 from rlml_slam.ros import convert
 from rlml_slam.ros.answers import FramePublisher
 from rlml_slam.ros.declare import declare
-from rlml_slam.ros.ekf_products import EkfProducts, map_to_odom, save
+from rlml_slam.ros.ekf_products import EkfProducts, map_to_odom
+from rlml_slam.ros.ekf_services import EkfServices
 from rlml_slam.ros.feed import STREAMS
 from rlml_slam.ros.health import HealthPublisher
-from rlml_slam.ros.map_folder import MapFolder
+from rlml_slam.ros.map_folder import SavedMap
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensors import RELIABLE, Sensors, checked
 from rlml_slam.ros.tf import TransformPublisher
@@ -36,9 +35,8 @@ class EkfSlamNode(Node):
         super().__init__('ekf_slam', **options)
         self.params: EkfParameters = declare(self, EkfParameters)
         n = self.params.node
-        self.folder = MapFolder(n.map_directory)
-        self.saved = self.folder.load(n.map_file_name) if n.mode == 'localization' else None
         self.estimator = Estimator(self.params)
+        self.map_services = EkfServices(self, n, self.estimator, self.restart_in)
         warm_up.compile_loaded()
         self.answers = FramePublisher(self, n)
         self.products = EkfProducts(self, n)
@@ -47,8 +45,6 @@ class EkfSlamNode(Node):
         self.health = HealthPublisher(self, self.sensors)
         start = checked(self, self.start_at)
         self.create_subscription(PoseWithCovarianceStamped, 'initialpose', start, RELIABLE)
-        self.create_service(Trigger, '~/save_map', self.save_map)
-        self.create_service(Trigger, '~/reset', self.reset)
         self.restart()
 
     def process(self, observation: Observation) -> None:
@@ -62,33 +58,22 @@ class EkfSlamNode(Node):
     def start_at(self, msg: PoseWithCovarianceStamped) -> None:
         """Begin anew at a pose of the map."""
         start = convert.pose_estimate(msg, 'initialpose')
-        self._begin(start.pose, start.cov)
+        self._begin(start.pose, start.cov, self.map_services.saved)
 
     def restart(self) -> None:
         """Forget everything but a saved map."""
-        self._begin(np.array(self.params.node.map_start_pose), np.zeros((3, 3)))
+        self.restart_in(self.map_services.saved)
 
-    def _begin(self, pose: Array, cov: Array) -> None:
+    def restart_in(self, saved: SavedMap | None) -> None:
+        """Begin at map_start_pose, in a saved map or without one."""
+        self._begin(np.array(self.params.node.map_start_pose), np.zeros((3, 3)), saved)
+
+    def _begin(self, pose: Array, cov: Array, saved: SavedMap | None) -> None:
         self.estimator.reset(pose, cov)
-        if self.saved is not None:
-            self.estimator.use_map(self.saved.reflectors)
+        if saved is not None:
+            self.estimator.use_map(saved.reflectors)
         self.answers.begin_session()
         self.products.restart()
-
-    def save_map(self, _request: Any, response: Any) -> Any:
-        """Write landmarks and grid under map_file_name."""
-        try:
-            name = self.params.node.map_file_name
-            response.success, response.message = True, save(self.estimator, self.folder, name)
-        except RlmlError as e:
-            response.success, response.message = False, str(e)
-        return response
-
-    def reset(self, _request: Any, response: Any) -> Any:
-        """Forget the map and begin at map_start_pose."""
-        self.restart()
-        response.success, response.message = True, 'the map begins anew'
-        return response
 
 
 def main() -> int:

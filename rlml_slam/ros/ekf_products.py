@@ -10,11 +10,9 @@ import numpy as np
 
 from rlml_slam import se2
 from rlml_slam.ekf.estimator import Estimator
-from rlml_slam.errors import MapError
 from rlml_slam.params import Node
 from rlml_slam.ros import build
 from rlml_slam.ros.associated import build_reflector_map
-from rlml_slam.ros.map_folder import MapFolder, SavedMap
 from rlml_slam.ros.markers import reflector_markers
 from rlml_slam.ros.messages import make_rclpy, rclpy_class
 from rlml_slam.ros.sensors import LATCHED
@@ -78,11 +76,3 @@ def map_to_odom(frame: Frame) -> Array:
     if T_odom_base is None:
         return np.zeros(3)
     return se2.compose(frame.T_map_base, se2.inverse(T_odom_base))
-
-
-def save(estimator: Estimator, folder: MapFolder, name: str) -> str:
-    """Write landmarks and grid as ``name``; what was written, in words. MapError without a map."""
-    saved = SavedMap(estimator.reflectors(), estimator.occupancy_grid())
-    if not len(saved.reflectors) and saved.grid is None:
-        raise MapError('there is no map yet')
-    return f'{folder.save(name, saved)}: {len(saved.reflectors)} landmarks'

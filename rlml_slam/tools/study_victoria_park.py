@@ -32,7 +32,7 @@ from rlml_slam.tools.victoria_park import (
     VictoriaPark,
     read_victoria_park,
 )
-from rlml_slam.types import Odometry, Reflectors
+from rlml_slam.types import Detections, Odometry, Reflectors
 
 SYSTEMS = ('dead_reckoning', 'ekf', 'rlml')
 
@@ -94,7 +94,10 @@ def drive(
     slam: Slam | EkfSlam = Slam(params) if system == 'rlml' else EkfSlam(params)
     slam.set_sensor_pose(LASER_FRAME, T_BASE_LASER)
     warm_up.compile_loaded()
-    inputs = [*odometry, *(d for d in data.detections if d.stamp <= end)]
+    inputs: list[Odometry | Detections] = [
+        *odometry,
+        *(d for d in data.detections if d.stamp <= end),
+    ]
     log, began = FrameLog(), time.perf_counter()
     with Progress(system, (end - start) * 1e-9, quiet) as progress:
         for k, item in enumerate(sorted(inputs, key=lambda i: i.stamp)):

@@ -6,6 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from live import LATCHED, room
+from nav_msgs.srv import LoadMap
+from numpy.testing import assert_allclose
 from std_srvs.srv import Trigger
 
 from rlml_slam.nodes.ekf_slam import EkfSlamNode
@@ -13,10 +15,10 @@ from rlml_slam.ros.associated import read_reflector_map
 
 
 @pytest.fixture
-def node(live):
+def node(live, tmp_path):
     live.listen('pose', 'geometry_msgs/msg/PoseWithCovarianceStamped')
     live.listen('reflector_map_points', 'sensor_msgs/msg/PointCloud2', LATCHED)
-    node = live.start(EkfSlamNode, map_update_interval=0.5)
+    node = live.start(EkfSlamNode, map_update_interval=0.5, map_directory=str(tmp_path))
     node.sensors.stop_waiting()
     live.spin_until(lambda: node.count_subscribers('pose') == 1)
     return node
@@ -32,10 +34,33 @@ def test_every_scan_is_answered_and_the_landmarks_are_published(live, node, tmp_
     landmarks = read_reflector_map(live.heard['reflector_map_points'][-1])
     assert len(landmarks) >= 3
     assert np.isfinite(landmarks.cov).all()
-    node.folder = type(node.folder)(str(tmp_path))
-    answer = node.save_map(None, Trigger.Response())
+    services = node.map_services
+    answer = services.save_map(None, Trigger.Response())
     assert answer.success, answer.message
     assert (tmp_path / 'map.csv').exists()
-    node.reset(None, Trigger.Response())
+    services.reset(None, Trigger.Response())
     assert node.estimator.filter.num_landmarks == 0
-    assert not node.save_map(None, Trigger.Response()).success
+    assert not services.save_map(None, Trigger.Response()).success
+
+
+def test_a_loaded_map_is_localised_in_and_not_extended(live, node, tmp_path):
+    for stream, msg in room(seconds=3.0):
+        node.sensors.add(stream, msg)
+    live.spin_until(lambda: len(live.heard['reflector_map_points']) >= 1)
+    services = node.map_services
+    assert services.save_map(None, Trigger.Response()).success
+    saved = node.estimator.reflectors()
+    services.load_map(LoadMap.Request(map_url='nowhere'), answer := LoadMap.Response())
+    assert answer.result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
+    assert node.estimator.filter.num_landmarks == len(saved) > 0
+    services.load_map(LoadMap.Request(map_url='map'), answer := LoadMap.Response())
+    assert answer.result == LoadMap.Response.RESULT_SUCCESS
+    assert_allclose(node.estimator.reflectors().points, saved.points, atol=1e-6)
+    heard = len(live.heard['pose'])
+    for stream, msg in room(seconds=3.0):
+        node.sensors.add(stream, msg)
+    live.spin_until(lambda: len(live.heard['pose']) >= heard + 20)
+    assert len(node.estimator.reflectors()) == len(saved)
+    # a reset forgets where the robot is, not the map
+    services.reset(None, Trigger.Response())
+    assert node.estimator.filter.num_landmarks == len(saved)
