@@ -107,7 +107,7 @@ class Filter:
         W = H @ self.P[columns]
         S = W[:, columns] @ H.T + R
         S = 0.5 * (S + S.T)
-        S_inv: Array = np.linalg.inv(S)
+        S_inv = np.asarray(np.linalg.inv(S), dtype=np.float64)
         K = W.T @ S_inv
         dx = K @ nu
         left, right = K, 0.5 * S @ K.T - W  # P <- P + left right + (left right)^T

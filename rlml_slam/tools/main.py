@@ -64,6 +64,9 @@ COMMANDS: Table = {
                 'study_lego',
                 'spikes and EKF on the LEGO robot among cylinders: figures and a picture',
             ),
+            'repeatability': Command(
+                'study_repeatability', 'how often spikes and lines of a real log are seen again'
+            ),
             'victoria-park': Command(
                 'study_victoria_park', 'dead reckoning, EKF and RLML among trees, against GPS'
             ),
