@@ -27,6 +27,7 @@ from rlml_slam.types import EdgeKind
 TURN = np.array([0.0, 0.0, GRID_TURN])
 TURN_ROTATION = np.eye(3)
 TURN_ROTATION[:2, :2] = se2.rotation(GRID_TURN)
+OPEN = 1e-2  # [1/m², 1/rad²] an edge knows its directions to 10 m and 10 rad at the worst
 PYRAMIDS = 16  # search pyramids kept: each is several times as large as its submap
 
 
@@ -107,8 +108,8 @@ class ScanGraph:
 
     def _edge(self, kind: EdgeKind, i: int, j: int, delta: Array, information: Array) -> int:
         closure = kind is EdgeKind.CLOSURE
-        # a direction that the scan leaves open still needs a regular covariance
-        cov = np.linalg.inv(information + np.diag([1e-4, 1e-4, 1e-4]))
+        # a direction that the scan leaves open still needs a covariance, and a regular one
+        cov = np.linalg.inv(information + OPEN * np.eye(3))
         cov = TURN_ROTATION @ cov @ TURN_ROTATION.T
         delta = se2.compose(TURN, delta)
         floor2 = self._p.loop_closure.floor2 if closure else self._p.back_end.scan_floor2
