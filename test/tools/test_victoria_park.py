@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import scipy.io
 from numpy.testing import assert_allclose, assert_array_equal
 
 from rlml_slam.errors import FileFormatError
+from rlml_slam.tools.main import main
 from rlml_slam.tools.victoria_park import HALF_TRACK, WHEEL_BASE, read_victoria_park
 
 SHARED = Path(__file__).resolve().parents[3] / 'shared' / 'data' / 'victoria-park'
@@ -98,3 +100,16 @@ def test_the_whole_drive():
     steps = np.diff([o.pose for o in data.odometry[::40]], axis=0)
     # about 4 km
     assert np.hypot(steps[:, 0], steps[:, 1]).sum() == pytest.approx(4000.0, rel=0.15)
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason='the data set is not here')
+def test_filter_follows_gps_where_dead_reckoning_does_not(tmp_path, capsys):
+    out = tmp_path / 'park.png'
+    arguments = ['study', 'victoria-park', str(SHARED), '--system', 'dead_reckoning', 'ekf',
+                 '--duration', '200', '--out', str(out), '--json']  # fmt: skip
+    assert main(arguments) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures['ekf']['rmse_m'] < min(5.0, figures['dead_reckoning']['rmse_m'])
+    assert figures['ekf']['compared'] > 300
+    assert 20 < figures['ekf']['trees'] < 200
+    assert out.read_bytes().startswith(b'\x89PNG')
