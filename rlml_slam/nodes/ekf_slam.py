@@ -10,22 +10,22 @@ import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 
-from rlml_slam import warm_up
+from rlml_slam import se2, warm_up
 from rlml_slam.ekf.estimator import Estimator
 from rlml_slam.params import EkfParameters
 from rlml_slam.ros import convert
 from rlml_slam.ros.answers import FramePublisher
 from rlml_slam.ros.declare import declare
-from rlml_slam.ros.ekf_products import EkfProducts, map_to_odom
 from rlml_slam.ros.ekf_services import EkfServices
 from rlml_slam.ros.feed import STREAMS
 from rlml_slam.ros.health import HealthPublisher
 from rlml_slam.ros.map_folder import SavedMap
+from rlml_slam.ros.products import TOPICS, MapProducts
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensors import RELIABLE, Sensors, checked
 from rlml_slam.ros.tf import TransformPublisher
 from rlml_slam.se2 import Array
-from rlml_slam.types import Observation
+from rlml_slam.types import Frame, Observation
 
 
 class EkfSlamNode(Node):
@@ -39,7 +39,7 @@ class EkfSlamNode(Node):
         self.map_services = EkfServices(self, n, self.estimator, self.restart_in)
         warm_up.compile_loaded()
         self.answers = FramePublisher(self, n)
-        self.products = EkfProducts(self, n)
+        self.products = MapProducts(self, n, TOPICS)
         self.tf = TransformPublisher(self)
         self.sensors = Sensors(self, self.params, STREAMS, self.process, self.restart)
         self.health = HealthPublisher(self, self.sensors)
@@ -53,7 +53,8 @@ class EkfSlamNode(Node):
         self.answers.publish(frame)
         self.health.update(frame)
         self.tf.publish(frame.stamp, (n.map_frame, n.odom_frame), map_to_odom(frame))
-        self.products.update(self.estimator, frame.stamp)
+        if self.products.is_due(frame.stamp):
+            self.products.publish(self.estimator, None, frame.stamp)
 
     def start_at(self, msg: PoseWithCovarianceStamped) -> None:
         """Begin anew at a pose of the map."""
@@ -74,6 +75,14 @@ class EkfSlamNode(Node):
             self.estimator.use_map(saved.reflectors)
         self.answers.begin_session()
         self.products.restart()
+
+
+def map_to_odom(frame: Frame) -> Array:
+    """T_map_odom (3,) at a frame; without odometry, odom is the map."""
+    T_odom_base = frame.observation.odom_pose
+    if T_odom_base is None:
+        return np.zeros(3)
+    return se2.compose(frame.T_map_base, se2.inverse(T_odom_base))
 
 
 def main() -> int:

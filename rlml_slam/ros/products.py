@@ -1,19 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the back end publishes of its map: grid, trajectory, reflectors and graph."""
+"""What a system publishes of its map: grid, trajectory, reflectors and, with one, its graph."""
 
 from __future__ import annotations
 
 import time
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Node
-from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.ros import build
 from rlml_slam.ros.associated import build_reflector_map
 from rlml_slam.ros.map_folder import SavedMap
 from rlml_slam.ros.markers import graph_markers, reflector_markers
 from rlml_slam.ros.messages import make_rclpy, rclpy_class
 from rlml_slam.ros.sensors import LATCHED
+from rlml_slam.se2 import Array
+from rlml_slam.types import Reflectors
 
 MAX_SHARE = 0.2  # of the time may be spent on pictures of the map, however large it grows
 TOPICS = {
@@ -22,8 +28,21 @@ TOPICS = {
     'trajectory': 'nav_msgs/msg/Path',
     'reflector_map': 'visualization_msgs/msg/MarkerArray',
     'reflector_map_points': 'sensor_msgs/msg/PointCloud2',
-    'graph': 'visualization_msgs/msg/MarkerArray',
 }
+GRAPH = {'graph': 'visualization_msgs/msg/MarkerArray'}
+
+
+class Mapped(Protocol):
+    """A system with a map; one that has a ``graph`` shows it."""
+
+    def occupancy_grid(self) -> OccupancyGrid | None:
+        """The map of the scans, None without any."""
+
+    def reflectors(self) -> Reflectors:
+        """The reflector map."""
+
+    def trajectory(self) -> tuple[NDArray[np.int64], Array]:
+        """Stamps (n,) and poses (n, 3)."""
 
 
 class MapProducts:
@@ -32,11 +51,13 @@ class MapProducts:
     ``stamp`` is that of the newest map that was sent, 0 before the first.
     """
 
-    def __init__(self, node: Any, params: Node) -> None:
+    def __init__(
+        self, node: Any, params: Node, topics: Mapping[str, str] = {**TOPICS, **GRAPH}
+    ) -> None:
         self._p = params
         self._publishers = {
             topic: node.create_publisher(rclpy_class(kind), topic, LATCHED)
-            for topic, kind in TOPICS.items()
+            for topic, kind in topics.items()
         }
         self.restart()
 
@@ -50,21 +71,23 @@ class MapProducts:
         """Whether the interval has passed, and the pause that the last map's cost asks for."""
         return stamp >= self._next and time.monotonic() >= self._rested
 
-    def publish(self, back_end: BackEnd, saved: SavedMap | None, stamp: int) -> None:
-        """Send everything that there is: of the graph, or of a saved map."""
+    def publish(self, source: Mapped, saved: SavedMap | None, stamp: int) -> None:
+        """Send everything that there is: of the system, or of a saved map."""
         began = time.monotonic()
         make, frame = make_rclpy, self._p.map_frame
-        grid = back_end.occupancy_grid() if saved is None else saved.grid
-        reflectors = back_end.reflectors() if saved is None else saved.reflectors
+        grid = source.occupancy_grid() if saved is None else saved.grid
+        reflectors = source.reflectors() if saved is None else saved.reflectors
         if grid is not None:
             self._send('map', build.occupancy_grid(make, stamp, frame, grid))
             self._send('map_metadata', build.map_metadata(make, stamp, grid))
         self._send('reflector_map', reflector_markers(make, stamp, frame, reflectors))
         self._send('reflector_map_points', build_reflector_map(make, stamp, frame, reflectors))
         if saved is None:
-            stamps, poses = back_end.trajectory()
+            stamps, poses = source.trajectory()
             self._send('trajectory', build.path(make, stamp, frame, stamps.tolist(), poses))
-            self._send('graph', graph_markers(make, stamp, frame, back_end.graph))
+            graph = getattr(source, 'graph', None)
+            if graph is not None:
+                self._send('graph', graph_markers(make, stamp, frame, graph))
         self.stamp, self._next = stamp, stamp + int(self._p.map_update_interval * 1e9)
         now = time.monotonic()
         self._rested = now + (now - began) * (1.0 / MAX_SHARE - 1.0)
