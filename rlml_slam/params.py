@@ -353,6 +353,28 @@ class LoopClosure(Group):
 
 
 @dataclass(frozen=True)
+class Relocalization(Group):
+    """Where in a map of reflectors anonymous detections were made, without any idea before."""
+
+    gate: float = param(
+        0.999, 'probability inside the gate of a detection and a reflector', '', 0.5, 0.999999
+    )
+    risk: float = param(1e-4, 'probability that a verdict of unique may be wrong', '', 1e-12, 0.5)
+    sigma_floor: float = param(
+        0.01, 'error of a detection besides the noise that it states', 'm', 1e-4, 1.0
+    )
+    missing: float = param(0.3, 'share of reflectors in range that are not seen', '', 0.01, 0.99)
+    ghosts: float = param(0.3, 'share of detections that are of no reflector', '', 0.01, 0.99)
+    max_range: float = param(
+        0.0, 'a reflector nearer than this should be seen; 0: unseen ones tell nothing', 'm',
+        0.0, 1000.0,
+    )  # fmt: skip
+    max_sigma: float = param(
+        0.2, 'a pose is not unique while its position is held worse', 'm', 1e-3, 100.0
+    )
+
+
+@dataclass(frozen=True)
 class Solver(Group):
     """Sparse least squares."""
 
@@ -524,6 +546,7 @@ class Parameters:
     health: HealthLimits = HealthLimits()
     back_end: BackEnd = BackEnd()
     loop_closure: LoopClosure = LoopClosure()
+    relocalization: Relocalization = Relocalization()
     solver: Solver = Solver()
 
 

@@ -178,6 +178,14 @@ class Belief:
     aliases: dict[int, int]
 
 
+class Verdict(Enum):
+    """What a search of the whole map says."""
+
+    UNIQUE = 'unique'
+    AMBIGUOUS = 'ambiguous'
+    IMPOSSIBLE = 'impossible'
+
+
 class EdgeKind(Enum):
     """Where a relative-pose edge of the graph comes from."""
 

@@ -8,7 +8,6 @@ well, no other place fits nearly as well, and the scan holds it in every directi
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from rlml_slam.matching.scan_match import match
 from rlml_slam.matching.submap import P_MAX, P_MIN, Submap, value_of
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
+from rlml_slam.types import Verdict
 
 SEARCHED = 150  # end points of the search; all of them count when its places are compared
 SPREAD = np.array([0.5, 0.5, 0.2])  # [m, m, rad] a refined place lies within this of the found one
@@ -26,14 +26,6 @@ SPREAD = np.array([0.5, 0.5, 0.2])  # [m, m, rad] a refined place lies within th
 # edges may contradict: in a truly symmetric hall, the scores of twins differ by up to 7 %.
 MAX_SECOND = 0.85
 OPEN_SIGMA = 0.5  # [m] a scan that leaves a direction wider than this does not tell the place
-
-
-class Verdict(Enum):
-    """What a search of the whole map says."""
-
-    UNIQUE = 'unique'
-    AMBIGUOUS = 'ambiguous'
-    IMPOSSIBLE = 'impossible'
 
 
 @dataclass(frozen=True)

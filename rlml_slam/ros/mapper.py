@@ -13,7 +13,7 @@ from rlml_slam import se2
 from rlml_slam.errors import MapError
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.back_end import BackEnd
-from rlml_slam.rlml.relocalize import Verdict, relocalize
+from rlml_slam.rlml.relocalize import relocalize
 from rlml_slam.ros import build
 from rlml_slam.ros.associated import build_reflector_map
 from rlml_slam.ros.beliefs import StampedBelief, build_belief
@@ -26,7 +26,7 @@ from rlml_slam.ros.tf import TransformPublisher
 from rlml_slam.ros.updates import build_update
 from rlml_slam.ros.worker import Worker
 from rlml_slam.se2 import Array
-from rlml_slam.types import Frame
+from rlml_slam.types import Frame, Verdict
 
 MAX_BACKLOG = 20  # frames behind which pictures of the map are left out
 IDLE = 0.3  # [s] of the wall clock without a frame, after which the map is brought up to date

@@ -60,6 +60,10 @@ COMMANDS: Table = {
                 'study_ekf',
                 'RLML, the EKF with each extractor and dead reckoning on the same drives',
             ),
+            'relocalization': Command(
+                'study_relocalization',
+                'whether reflectors alone tell the place, and whether the verdict is right',
+            ),
             'lego': Command(
                 'study_lego',
                 'spikes and EKF on the LEGO robot among cylinders: figures and a picture',

@@ -10,7 +10,8 @@ from made_worlds import CORRIDOR, OTHER_ROOM, ROOM, TinyWorld, drive, points_of,
 from rlml_slam import se2
 from rlml_slam.maps.occupancy import OccupancyGrid, load, render, save
 from rlml_slam.params import Parameters
-from rlml_slam.rlml.relocalize import Verdict, relocalize
+from rlml_slam.rlml.relocalize import relocalize
+from rlml_slam.types import Verdict
 
 P = Parameters()
 # turned by half a turn, it is the same
