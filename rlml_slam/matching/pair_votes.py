@@ -84,7 +84,8 @@ def _fill(
                     else:
                         starts[c] += 1
         if not filling:
-            starts = np.cumsum(starts)
+            for c in range(columns * rows):
+                starts[c + 1] += starts[c]
             members = np.zeros(starts[-1], np.int64)
     return starts, members
 
@@ -96,6 +97,19 @@ def _cell_of(x: float, y: float, b: Buckets) -> int:
     if u < 0 or v < 0 or u >= b.columns or v >= b.rows:
         return -1
     return int(v * b.columns + u)
+
+
+@part
+def _bisect(ascending: Array, value: float) -> int:
+    """How many are less than a value."""
+    low, high = 0, len(ascending)
+    while low < high:
+        middle = (low + high) // 2
+        if ascending[middle] < value:
+            low = middle + 1
+        else:
+            high = middle
+    return low
 
 
 @kernel
@@ -120,7 +134,9 @@ def vote(
     """
     k, m = len(z), len(p)
     g = math.sqrt(gate2)
-    widest_var = p_var.max()
+    widest_var = 0.0
+    for i in range(m):
+        widest_var = max(widest_var, p_var[i])
     counts = np.zeros(CAPACITY, np.int64)
     bases = np.zeros((CAPACITY, 4), np.int64)
     kept, proposals, best, need, stamp = 0, 0, 0, MIN_MATCHES, 0
@@ -133,13 +149,13 @@ def vote(
             tolerance = g * math.sqrt(z_var[a] + z_var[b] + 2.0 * widest_var)
             if length <= 2.0 * tolerance:
                 continue  # such a pair tells no heading
-            low = np.searchsorted(pairs.length, length - tolerance)
-            high = np.searchsorted(pairs.length, length + tolerance)
+            low = _bisect(pairs.length, length - tolerance)
+            high = _bisect(pairs.length, length + tolerance)
             if low == high:
                 continue
             inside = 0
             for c in range(k):
-                if c in (a, b):
+                if c == a or c == b:
                     continue
                 near_a = math.hypot(z[c, 0] - z[a, 0], z[c, 1] - z[a, 1]) <= length
                 if near_a and math.hypot(z[c, 0] - z[b, 0], z[c, 1] - z[b, 1]) <= length:
@@ -210,7 +226,9 @@ def vote(
                     old, kept = kept, 0
                     for n in range(old):
                         if counts[n] >= need:
-                            counts[kept], bases[kept] = counts[n], bases[n]
+                            counts[kept] = counts[n]
+                            for i in range(4):
+                                bases[kept, i] = bases[n, i]
                             kept += 1
                     if kept == CAPACITY:
                         need += 1
@@ -218,8 +236,14 @@ def vote(
                 bases[kept, 0], bases[kept, 1] = a, b
                 bases[kept, 2], bases[kept, 3] = i, j
                 kept += 1
-    chosen = counts[:kept] >= need
-    return counts[:kept][chosen], bases[:kept][chosen], proposals
+    chosen = 0
+    for n in range(kept):
+        if counts[n] >= need:
+            counts[chosen] = counts[n]
+            for i in range(4):
+                bases[chosen, i] = bases[n, i]
+            chosen += 1
+    return counts[:chosen], bases[:chosen], proposals
 
 
 @kernel
@@ -241,7 +265,7 @@ def refine(
     (k,) (reflector or -1) and the squared Mahalanobis distance of all matches and the prior.
     """
     k = len(z)
-    match = np.full(k, -1, np.int64)
+    match, before = np.full(k, -1, np.int64), np.zeros(k, np.int64)
     a, b, i, j = base[0], base[1], base[2], base[3]
     dx, dy = z[b, 0] - z[a, 0], z[b, 1] - z[a, 1]
     ex, ey = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1]
@@ -253,12 +277,17 @@ def refine(
     pose[1] = p[i, 1] - s * z[a, 0] - c * z[a, 1]
     cov, chi2 = _fit(pose, match, z, z_cov, p, p_cov, prior, information)
     for _ in range(ROUNDS):
-        before = match.copy()
+        matches, changed = 0, False
+        for n in range(k):
+            before[n] = match[n]
         _match_all(pose, cov, match, z, z_cov, p, p_cov, buckets, gate2, noise)
-        if (match >= 0).sum() < 2:
+        for n in range(k):
+            matches += match[n] >= 0
+            changed |= match[n] != before[n]
+        if matches < 2:
             break
         cov, chi2 = _fit(pose, match, z, z_cov, p, p_cov, prior, information)
-        if (match == before).all():
+        if not changed:
             break
     return pose, cov, match, chi2
 
@@ -294,7 +323,7 @@ def _match_all(
         xy = cov[0, 1] + rx * cov[0, 2] - ry * cov[1, 2] - rx * ry * cov[2, 2]
         if xx + yy > LOOSE * noise:
             continue
-        axx, axy, ayy = _turned(z_cov[n], c, s)
+        axx, axy, ayy = _turned(z_cov, n, c, s)
         for q in range(buckets.starts[cell], buckets.starts[cell + 1]):
             r = buckets.members[q]
             sxx, sxy = xx + axx + p_cov[r, 0, 0], xy + axy + p_cov[r, 0, 1]
@@ -315,9 +344,9 @@ def _match_all(
 
 
 @part
-def _turned(C: Array, c: float, s: float) -> tuple[float, float, float]:
-    """Entries xx, xy, yy of R C R^T."""
-    xx, xy, yy = C[0, 0], C[0, 1], C[1, 1]
+def _turned(C: Array, n: int, c: float, s: float) -> tuple[float, float, float]:
+    """Entries xx, xy, yy of R C[n] R^T."""
+    xx, xy, yy = C[n, 0, 0], C[n, 0, 1], C[n, 1, 1]
     return (
         c * c * xx - 2.0 * c * s * xy + s * s * yy,
         c * s * (xx - yy) + (c * c - s * s) * xy,
@@ -341,17 +370,18 @@ def _fit(
     Minimises sum r^T S^-1 r with r = p_j - (t + R z_i), S = R C_i R^T + P_j. Returns the inverse
     of the information and the minimum.
     """
-    H, g, chi2 = np.zeros((3, 3)), np.zeros(3), 0.0
+    H, g, d, chi2 = np.zeros((3, 3)), np.zeros(3), np.zeros(3), 0.0
     cov = np.zeros((3, 3))
     for iteration in range(6):
         c, s = math.cos(pose[2]), math.sin(pose[2])
-        d = pose - prior
+        for i in range(3):
+            d[i] = pose[i] - prior[i]
         d[2] -= 2.0 * math.pi * round(d[2] / (2.0 * math.pi))
-        H[:] = information
         chi2 = 0.0
         for i in range(3):
             g[i] = 0.0
             for j in range(3):
+                H[i, j] = information[i, j]
                 g[i] -= information[i, j] * d[j]
                 chi2 += d[i] * information[i, j] * d[j]
         for n in range(len(z)):
@@ -360,7 +390,7 @@ def _fit(
                 continue
             rx, ry = c * z[n, 0] - s * z[n, 1], s * z[n, 0] + c * z[n, 1]
             u, v = p[r, 0] - pose[0] - rx, p[r, 1] - pose[1] - ry
-            axx, axy, ayy = _turned(z_cov[n], c, s)
+            axx, axy, ayy = _turned(z_cov, n, c, s)
             axx, axy, ayy = axx + p_cov[r, 0, 0], axy + p_cov[r, 0, 1], ayy + p_cov[r, 1, 1]
             det = axx * ayy - axy * axy
             wxx, wxy, wyy = ayy / det, -axy / det, axx / det
