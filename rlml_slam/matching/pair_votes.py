@@ -155,7 +155,7 @@ def vote(
                 continue
             inside = 0
             for c in range(k):
-                if c == a or c == b:
+                if c in (a, b):
                     continue
                 near_a = math.hypot(z[c, 0] - z[a, 0], z[c, 1] - z[a, 1]) <= length
                 if near_a and math.hypot(z[c, 0] - z[b, 0], z[c, 1] - z[b, 1]) <= length:
