@@ -143,8 +143,8 @@ def _summarize_row(row: Row, r: RowResult) -> dict[str, Any]:
         'share_nls_below_ekf': float((r.ss3('nls') < r.ss3('ekf')).mean()),
         'nees_nls': {'mean': float(r.nees_nls.mean()), 'degrees': degrees, 'bounds': bounds},
         'nees_ekf': {
-            'mean': float(steps.mean()), 'lowest_step': float(steps.min()),
-            'highest_step': float(steps.max()), 'last_step': float(steps[-1]),
+            'mean': float(steps.mean()), 'lowest_step': float(np.min(steps)),
+            'highest_step': float(np.max(steps)), 'last_step': float(steps[-1]),
             'degrees': 3 + 2 * FEATURES, 'bounds': step_bounds,
             'steps_outside': int(((steps < step_bounds[0]) | (steps > step_bounds[1])).sum()),
             'steps': len(steps),
@@ -153,7 +153,7 @@ def _summarize_row(row: Row, r: RowResult) -> dict[str, Any]:
         'path_m': mean_ci(r.path),
         'mean_step_m': float(r.path.mean() / (STEPS - 1)),
         'converged': float(r.converged.mean()),
-        'iterations': {'mean': float(r.iterations.mean()), 'max': int(r.iterations.max())},
+        'iterations': {'mean': float(r.iterations.mean()), 'max': int(np.max(r.iterations))},
     }  # fmt: skip
 
 

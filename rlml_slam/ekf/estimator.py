@@ -116,7 +116,7 @@ class Estimator:
         if e.update == 'plain' or self.model is not POINT:
             return
         if seen is not None and len(seen.z):
-            self._reach = max(self._reach, float(seen.z[:, 0].max()))
+            self._reach = max(self._reach, float(np.max(seen.z[:, 0])))
         here = f.x[:2]
         sigma = 3.0 * float(np.sqrt(np.trace(f.P[:2, :2])))
         needed = self._reach + sigma

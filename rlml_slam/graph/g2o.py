@@ -274,7 +274,7 @@ def write_graph(
     n = len(graph.poses)
     pose_ids = np.arange(n) if pose_ids is None else np.asarray(pose_ids)
     if landmark_ids is None:
-        landmark_ids = int(pose_ids.max(initial=-1)) + 1 + np.arange(len(graph.landmarks))
+        landmark_ids = int(np.max(pose_ids, initial=-1)) + 1 + np.arange(len(graph.landmarks))
     toro = {'.graph', '.toro'} & set(path.suffixes)
     write = _toro_lines if toro else _g2o_lines
     text = '\n'.join(write(path, graph, pose_ids, np.asarray(landmark_ids))) + '\n'

@@ -283,12 +283,13 @@ def branch_and_bound(
             best = max(threshold, int(second_share * found[0, 0]))
         else:
             break
-        for m in order:
-            if sums[m] <= best:
+        for number in order:
+            root = int(number)
+            if sums[root] <= best:
                 break
-            a, rest = divmod(m, tiles * tiles)
+            a, rest = divmod(root, tiles * tiles)
             i, j = divmod(rest, tiles)
-            stack[0, 0], stack[0, 1], stack[0, 2] = sums[m], a, j * size - n
+            stack[0, 0], stack[0, 1], stack[0, 2] = sums[root], a, j * size - n
             stack[0, 3], stack[0, 4] = i * size - n, depth
             top = 1
             while top > 0:

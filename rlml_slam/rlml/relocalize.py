@@ -55,7 +55,7 @@ def relocalize(grid: OccupancyGrid | None, points: Array | None, p: Parameters) 
     few = thinning.thin(points, p.scan_match.voxel, SEARCHED)
     middle = 0.5 * (submap.bounds[:2] + submap.bounds[2:])
     # a robot stands inside of what it has seen
-    reach = 0.5 * float((submap.bounds[2:] - submap.bounds[:2]).max())
+    reach = 0.5 * float(np.max(submap.bounds[2:] - submap.bounds[:2]))
     found = search.wide(
         search.Pyramid(submap), few, np.array([*middle, 0.0]), reach, np.pi,
         separation_angle=2.0 * SPREAD[2],

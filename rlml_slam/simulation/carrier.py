@@ -108,7 +108,7 @@ def _feed(
     ids, points = ids.copy(), points.copy()
     for j in np.flatnonzero(points[:, 0] - pose[0] > settings.max_range + 1.0):
         points[j] = (pose[0] - settings.max_range - 0.5, points[j, 1])
-        ids[j] = ids.max() + 1
+        ids[j] = np.max(ids) + 1
     return ids, points
 
 

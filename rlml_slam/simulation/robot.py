@@ -178,7 +178,7 @@ class Track:
 
     def _columns(self, stamps: NDArray[np.int64]) -> Array:
         """All columns (n, 7) at the stamps; the newest twist holds beyond the newest knot."""
-        if len(stamps) and stamps.min() < self._first:
+        if len(stamps) and np.min(stamps) < self._first:
             raise InputError('the simulated track does not reach back that far')
         return _along(self._knots, self._count, self._first, self._step, stamps)
 

@@ -48,7 +48,7 @@ class TrajectoryErrors:
             'mean_m': float(d.mean()),
             'median_m': float(np.median(d)),
             'std_m': float(d.std()),
-            'max_m': float(d.max()),
+            'max_m': float(np.max(d)),
             'last_m': float(d[-1]),
         }
         if len(heading):

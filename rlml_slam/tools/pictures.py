@@ -119,7 +119,8 @@ def _extent(run: Run) -> tuple[Array, Array]:
     if run.grid is not None:
         rows, columns = np.nonzero(run.grid.cells >= 0)
         if len(rows):
-            corners = np.array([[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]])
+            first, last = (np.min(columns), np.min(rows)), (np.max(columns), np.max(rows))
+            corners = np.array([first, last]) + [[0], [1]]
             points.append(np.array(run.grid.origin) + corners * run.grid.resolution)
     every = np.concatenate([*points, np.zeros((1, 2))])
     low, high = every.min(axis=0), every.max(axis=0)
@@ -211,7 +212,7 @@ def health_picture(run: Run) -> bytes:
     covs = np.array(frames.covs)
     sigma = 100.0 * np.sqrt(np.maximum(np.linalg.eigvalsh(covs[:, :2, :2])[:, 1], 0.0))
     panels[1].plot(t, sigma, color=LIVE, linewidth=0.9)
-    panels[1].set_ylim(0.0, max(1.05 * float(sigma.max()), 0.1))
+    panels[1].set_ylim(0.0, max(1.05 * float(np.max(sigma)), 0.1))
     if has_reflectors:
         _dress(panels[2], '', 'reflectors')
         panels[2].plot(t, frames.seen, color=SOFT, linewidth=0.8, label='seen')

@@ -46,7 +46,7 @@ class RelationErrors:
         for name, unit, e in (('trans', 'm', self.trans), ('rot', 'deg', rot)):
             out[f'{name}_mean_{unit}'] = float(e.mean())
             out[f'{name}_std_{unit}'] = float(e.std())
-            out[f'{name}_max_{unit}'] = float(e.max())
+            out[f'{name}_max_{unit}'] = float(np.max(e))
             out[f'{name}_squared_mean_{unit}2'] = float((e**2).mean())
             out[f'{name}_squared_std_{unit}2'] = float((e**2).std())
         return out
