@@ -23,13 +23,10 @@ from rlml_slam.matching.pair_votes import (
     pairs_of,
     refine,
     vote,
-    warm_up,
 )
 from rlml_slam.params import Relocalization
 from rlml_slam.se2 import Array
 from rlml_slam.types import Verdict
-
-__all__ = ['Candidate', 'Constellation', 'Prior', 'locate', 'warm_up']
 
 MAX_CANDIDATES = 50  # different poses that are fitted; those with fewest matches are left out
 TYPICAL = 5  # the pose of this rank behind the best tells what chance gives in this map
@@ -143,7 +140,7 @@ class _Search:
 
     def candidates(self, prior: Prior | None) -> tuple[list[Candidate], int]:
         """All different poses, best first, and the number of proposals that they came from."""
-        pose = np.zeros(3) if prior is None else np.asarray(prior.pose, dtype=np.float64)
+        pose = np.zeros(3) if prior is None else np.array(prior.pose, dtype=np.float64)
         information = np.zeros((3, 3))
         if prior is not None:
             information[:] = np.linalg.inv(prior.cov)

@@ -46,7 +46,7 @@ class Relocation:
 
 def relocalize(grid: OccupancyGrid | None, points: Array | None, p: Parameters) -> Relocation:
     """Search ``points`` (n, 2), end points in the base frame, in a grid of the map frame."""
-    if grid is None or not (grid.cells > 0).any():
+    if grid is None or not is_mapped(grid):
         return Relocation(Verdict.IMPOSSIBLE, 'there is no map of scans yet')
     if points is None or len(points) < p.scan_match.min_points:
         return Relocation(Verdict.IMPOSSIBLE, 'the newest frame has no usable scan')
@@ -60,7 +60,9 @@ def relocalize(grid: OccupancyGrid | None, points: Array | None, p: Parameters) 
         search.Pyramid(submap), few, np.array([*middle, 0.0]), reach, np.pi,
         separation_angle=2.0 * SPREAD[2],
     )  # fmt: skip
-    places = [_refined(submap, points, c, p) for c in (found.best, found.second) if c is not None]
+    places = [
+        _refined(submap, points, c.pose, p) for c in (found.best, found.second) if c is not None
+    ]
     places.sort(key=lambda place: -place[1])
     least = p.loop_closure.min_score
     if not places or places[0][1] < least:
@@ -79,6 +81,18 @@ def relocalize(grid: OccupancyGrid | None, points: Array | None, p: Parameters) 
     return Relocation(verdict, why, pose, cov, score, second)
 
 
+def is_mapped(grid: OccupancyGrid) -> bool:
+    """Whether there is anything in the grid that a scan could fit."""
+    return bool((grid.cells > 0).any())
+
+
+def scan_fits(grid: OccupancyGrid, points: Array, poses: Array, p: Parameters) -> list[float]:
+    """Scores of ``points`` (n, 2), end points in the base frame, at or near each pose (q, 3)."""
+    submap = submap_of(grid, p.submap)
+    points = thinning.thin(points, p.scan_match.voxel, p.scan_match.max_points)
+    return [_refined(submap, points, pose, p)[1] for pose in poses]
+
+
 def submap_of(grid: OccupancyGrid, parameters: params.Submap) -> Submap:
     """A grid of the map as a submap in the map frame; unknown cells stay unknown."""
     submap = Submap(parameters)
@@ -92,12 +106,10 @@ def submap_of(grid: OccupancyGrid, parameters: params.Submap) -> Submap:
     return submap
 
 
-def _refined(
-    submap: Submap, points: Array, found: search.Candidate, p: Parameters
-) -> tuple[Array, float]:
+def _refined(submap: Submap, points: Array, near: Array, p: Parameters) -> tuple[Array, float]:
     """Pose and score of a place by scan matching, which the search's lattice only comes near."""
     weak = np.diag(1.0 / SPREAD**2)
-    result = match(submap, points, found.pose, weak, p.scan_match, searched=False)
+    result = match(submap, points, near, weak, p.scan_match, searched=False)
     return result.pose, result.score
 
 

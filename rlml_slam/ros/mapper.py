@@ -13,7 +13,7 @@ from rlml_slam import se2
 from rlml_slam.errors import MapError
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.back_end import BackEnd
-from rlml_slam.rlml.relocalize import relocalize
+from rlml_slam.rlml.find_place import find_place
 from rlml_slam.ros import build
 from rlml_slam.ros.associated import build_reflector_map
 from rlml_slam.ros.beliefs import StampedBelief, build_belief
@@ -211,10 +211,10 @@ class Mapper:
         return 'maps: a new map begins where the robot is, in the axes of the old one'
 
     def relocalize(self) -> tuple[bool, str]:
-        """In the worker: find the newest scan anywhere in the map; whether, and what to do now."""
-        frame = self._newest
-        points = None if frame is None else frame.observation.points
-        found = relocalize(self.current().grid, points, self._p)
+        """In the worker: find the newest frame anywhere in the map; whether, and what to do."""
+        frame, in_map = self._newest, self.current()
+        observation = None if frame is None else frame.observation
+        found = find_place(in_map.grid, in_map.reflectors, observation, self._p)
         if frame is None or found.verdict is Verdict.IMPOSSIBLE or found.pose is None:
             return False, f'not found: {found.why}; {ADVICE}'
         if found.verdict is Verdict.AMBIGUOUS:

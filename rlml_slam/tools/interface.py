@@ -148,8 +148,8 @@ SERVICES = (
             'forget the map and begin at `map_start_pose`'),
     Service('back_end', '~/dynamic_map', 'nav_msgs/GetMap', 'the grid as it is now'),
     Service('back_end', '~/relocalize', 'std_srvs/Trigger',
-            'find the newest scan anywhere in the map, and while localizing go on from there; '
-            'says so where it fits nowhere or in several places'),
+            'find the newest reflectors and scan anywhere in the map, and while localizing go on '
+            'from there; says so where they fit nowhere or in several places'),
     Service('back_end', 'reinitialize_global_localization', 'std_srvs/Empty',
             'the same; the answer goes to the log'),
     Service('back_end', '~/set_localization_mode', 'std_srvs/SetBool',

@@ -19,7 +19,8 @@ import numpy as np
 
 from rlml_slam import se2
 from rlml_slam.errors import ParameterError
-from rlml_slam.matching.constellation import Constellation, locate, warm_up
+from rlml_slam.matching.constellation import Constellation, locate
+from rlml_slam.matching.pair_votes import warm_up
 from rlml_slam.params import Relocalization
 from rlml_slam.se2 import Array
 from rlml_slam.tools.progress import Progress

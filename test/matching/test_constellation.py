@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from rlml_slam import se2
+from rlml_slam.matching import pair_votes
 from rlml_slam.matching.constellation import Prior, locate
 from rlml_slam.params import Relocalization
 from rlml_slam.types import Verdict
@@ -365,3 +366,13 @@ def test_crowded_regular_map_is_searched_to_the_end():
     found = search(seen_from(TRUTH, reflectors, rng), reflectors)
     assert found.verdict is Verdict.AMBIGUOUS
     assert min(error_of(c.pose)[0] for c in found.candidates) < 0.05
+
+
+def test_kernels_are_compiled_by_the_warm_up():
+    pair_votes.warm_up()
+    rng = np.random.default_rng(19)
+    reflectors, z = with_ghosts(rng)
+    prior = Prior(TRUTH, np.eye(3))
+    assert search(z, np.asfortranarray(reflectors), prior=prior).verdict is Verdict.UNIQUE
+    for kernel in (pair_votes._fill, pair_votes.vote, pair_votes.refine):
+        assert len(kernel.signatures) == 1
