@@ -98,7 +98,8 @@ def locate(
     """Find detections ``points`` (k, 2) with ``cov`` (k, 2, 2), base frame, among ``reflectors``.
 
     The reflectors (m, 2) and their covariances (m, 2, 2) are of the map frame. What is not finite
-    does not take part.
+    does not take part. Where the matches lie farther apart than their covariances allow, these
+    are widened until they do, once.
     """
     used = np.flatnonzero(np.isfinite(points).all(axis=1) & np.isfinite(cov).all(axis=(1, 2)))
     k, m = len(used), len(reflectors)
@@ -106,23 +107,23 @@ def locate(
         return Constellation(Verdict.IMPOSSIBLE, f'the map has {m} reflectors, three are needed')
     if k < MIN_MATCHES:
         return Constellation(Verdict.IMPOSSIBLE, f'{k} reflectors are seen, three are needed')
-    search = _Search(
-        np.ascontiguousarray(points[used], dtype=np.float64),
-        cov[used] + params.sigma_floor**2 * np.eye(2),
-        np.ascontiguousarray(reflectors, dtype=np.float64),
-        np.ascontiguousarray(reflectors_cov, dtype=np.float64),
-        params,
-    )
-    found, proposals = search.candidates(prior)
-    for n, c in enumerate(found):
-        match = np.full(len(points), -1, dtype=np.int64)
-        match[used] = c.match
-        found[n] = replace(c, match=match)
-    if not found:
-        return Constellation(
-            Verdict.IMPOSSIBLE, f'no pose matches three of the {k} detections with the map'
-        )
-    return search.judged(found, proposals)
+    z = np.ascontiguousarray(points[used], dtype=np.float64)
+    z_cov = cov[used] + params.sigma_floor**2 * np.eye(2)
+    p = np.ascontiguousarray(reflectors, dtype=np.float64)
+    p_cov = np.ascontiguousarray(reflectors_cov, dtype=np.float64)
+    result = _Search(z, z_cov, p, p_cov, params).run(prior)
+    if result.verdict is Verdict.UNIQUE:
+        best = result.candidates[0]
+        dof = 2 * best.num_matches - (3 if prior is None else 0)
+        # the noise is larger than stated, and gates by what was stated may have cut off a rival
+        if best.chi2 > gate(1.0 - params.risk, dof):
+            scale = best.chi2 / dof
+            result = _Search(z, scale * z_cov, p, scale * p_cov, params).run(prior)
+    match = np.full((len(result.candidates), len(points)), -1, dtype=np.int64)
+    for row, c in zip(match, result.candidates, strict=True):
+        row[used] = c.match
+    candidates = (replace(c, match=row) for c, row in zip(result.candidates, match, strict=True))
+    return replace(result, candidates=tuple(candidates))
 
 
 class _Search:
@@ -138,7 +139,15 @@ class _Search:
         # expected ghosts per m^2
         self._ghosts = max(1.0, params.ghosts * len(z)) / _area(z, self._floor2)
 
-    def candidates(self, prior: Prior | None) -> tuple[list[Candidate], int]:
+    def run(self, prior: Prior | None) -> Constellation:
+        """Verdict and candidates."""
+        found, proposals = self._candidates(prior)
+        if found:
+            return self._judged(found, proposals)
+        why = f'no pose matches three of the {len(self._z)} detections with the map'
+        return Constellation(Verdict.IMPOSSIBLE, why)
+
+    def _candidates(self, prior: Prior | None) -> tuple[list[Candidate], int]:
         """All different poses, best first, and the number of proposals that they came from."""
         pose = np.zeros(3) if prior is None else np.array(prior.pose, dtype=np.float64)
         information = np.zeros((3, 3))
@@ -191,7 +200,7 @@ class _Search:
         score += num_unseen * float(np.log(p.missing))
         return Candidate(T, cov, match, score, chi2, num_near, num_unseen)
 
-    def judged(self, found: list[Candidate], proposals: int) -> Constellation:
+    def _judged(self, found: list[Candidate], proposals: int) -> Constellation:
         """The verdict on candidates, best first."""
         p, k, best = self._params, len(self._z), found[0]
         n = best.num_matches

@@ -358,6 +358,22 @@ def test_covariance_of_the_pose_is_honest():
     assert low < np.mean(nees) < high
 
 
+def test_covariances_that_are_too_small_are_widened():
+    """Noise twice as large as stated: the pose's own covariance says what it truly is."""
+    params = replace(P, sigma_floor=1e-4)
+    ratio = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        reflectors = scattered(30, rng)
+        z = seen_from(TRUTH, reflectors, rng, sigma=0.04)
+        found = search(z, reflectors, params, z_cov=covs(30, 0.02), p_cov=covs(30, 1e-4))
+        assert found.verdict is Verdict.UNIQUE
+        assert error_of(found.candidates[0].pose)[0] < 0.05
+        ratio.append(np.trace(found.candidates[0].cov[:2, :2]) / (2.0 * 0.04**2 / 30))
+    # between that of the stated noise and that of the true, for the gate cuts off the tails
+    assert 0.6 < np.median(ratio) < 1.2
+
+
 def test_crowded_regular_map_is_searched_to_the_end():
     """Every pair of a lattice is as far apart as many others; more proposals than are kept."""
     x, y = np.meshgrid(np.arange(8) * 4.0, np.arange(5) * 4.0)
