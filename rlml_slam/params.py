@@ -216,6 +216,10 @@ class Reflector(Group):
     robust_scale: float = param(
         3.0, 'Cauchy scale of the reflector residual, in sigmas', '', 0.5, 100.0
     )
+    alike: float = param(
+        0.05, "share of a detection's variance that those of one keyframe have in common", '', 0.0,
+        1.0,
+    )  # fmt: skip
     max_range: float = param(40.0, 'detections farther away are not used', 'm', 0.5, 1000.0)
 
 

@@ -54,7 +54,9 @@ class ReflectorGraph:
             landmark.id = interval.ids.get(key, landmark.id)
             landmark.diameter = interval.diameters.get(key, landmark.diameter)
             landmark.count += s.count
-            landmark.sightings.append((pose, s.z, s.information, -1))
+            # errors of a sensor are alike from one message to the next: many do not average out
+            worth = 1.0 / (1.0 + self._p.alike * (s.count - 1))
+            landmark.sightings.append((pose, s.z, worth * s.information, -1))
             if landmark.index >= 0:
                 self._link(landmark, len(landmark.sightings) - 1)
             elif landmark.count >= self._p.min_sightings:

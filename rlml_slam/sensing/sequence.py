@@ -29,6 +29,8 @@ from rlml_slam.types import Detections, Imu, Motion, Observation, Odometry, Scan
 
 PAIRING = 2_000_000  # [ns] stamps of one instant: drivers round to milliseconds
 CARRY = 5 * SECOND  # motion older than this is summed up; an observation later than it is late
+MAX_SWEEP = 1.0  # [s] of one scan
+SIGMA = (1e-4, 10.0)  # [m] a detection that claims to be better or worse is believed this much
 PERSISTENT = 10  # inputs in a row: fewer with a strange stamp are faults, more are a new clock
 Waiting: TypeAlias = tuple[int, str, Scan | Detections]
 
@@ -116,6 +118,12 @@ class Sequencer:
             self.inputs.count('scan', 'invalid', f'scan at {scan.stamp} ns is empty')
         elif not np.all(np.isfinite(geometry)) or scan.angle_increment == 0.0:
             self.inputs.count('scan', 'invalid', f'scan at {scan.stamp} ns has no valid geometry')
+        elif not 0.0 <= sweep_time(scan) <= MAX_SWEEP:
+            # waiting for the odometry at the end of such a sweep would hold up all that follows
+            error = f'scan at {scan.stamp} ns: time_increment {scan.time_increment:g} s times {n} '
+            self.inputs.count(
+                'scan', 'invalid', error + f'beams is no sweep of 0 to {MAX_SWEEP} s'
+            )
         elif self._known_frame('scan', scan.frame_id) and self._accept(
             'scan', scan.stamp, source=scan.frame_id
         ):
@@ -315,11 +323,26 @@ class Sequencer:
         near = np.hypot(d.points[:, 0], d.points[:, 1]) <= self._p.reflector.max_range
         if not near.all():
             self.inputs.count('reflectors', 'points_too_far')
+        cov, bounded = believable(d.cov[near])
+        if bounded:
+            self.inputs.count('reflectors', 'sigma_bounded')
         return Detections(
             d.stamp,
             self._node.base_frame,
             se2.transform(T, d.points[near]),
-            R @ d.cov[near] @ R.T,
+            R @ cov @ R.T,
             d.ids[near],
             d.diameters[near],
         )
+
+
+def believable(cov: Array) -> tuple[Array, bool]:
+    """Covariances (k, 2, 2) with every sigma inside SIGMA, and whether one had to be bounded.
+
+    A driver that fills in 0 or the largest float for "unknown" must not make the estimate singular.
+    """
+    values, axes = np.linalg.eigh(0.5 * (cov + np.swapaxes(cov, 1, 2)))
+    bounded = np.clip(values, SIGMA[0] ** 2, SIGMA[1] ** 2)
+    if np.array_equal(bounded, values):
+        return cov, False
+    return (axes * bounded[:, None, :]) @ np.swapaxes(axes, 1, 2), True

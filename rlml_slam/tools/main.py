@@ -69,7 +69,8 @@ COMMANDS: Table = {
                 'spikes and EKF on the LEGO robot among cylinders: figures and a picture',
             ),
             'repeatability': Command(
-                'study_repeatability', 'how often spikes and lines of a real log are seen again'
+                'study_repeatability',
+                'how often spikes and lines of a corrected log are seen again',
             ),
             'victoria-park': Command(
                 'study_victoria_park', 'dead reckoning, EKF and RLML among trees, against GPS'

@@ -120,7 +120,7 @@ def _extent(run: Run) -> tuple[Array, Array]:
         rows, columns = np.nonzero(run.grid.cells >= 0)
         if len(rows):
             first, last = (np.min(columns), np.min(rows)), (np.max(columns), np.max(rows))
-            corners = np.array([first, last]) + [[0], [1]]
+            corners = np.array([first, last]) + np.array([[0], [1]])
             points.append(np.array(run.grid.origin) + corners * run.grid.resolution)
     every = np.concatenate([*points, np.zeros((1, 2))])
     low, high = every.min(axis=0), every.max(axis=0)

@@ -9,7 +9,7 @@ from rlml_slam import se2
 from rlml_slam.errors import InputError
 from rlml_slam.motion import SECOND, MotionBuffer
 from rlml_slam.params import Node, Parameters
-from rlml_slam.sensing.sequence import PAIRING, PERSISTENT, Sequencer
+from rlml_slam.sensing.sequence import PAIRING, PERSISTENT, SIGMA, Sequencer
 from rlml_slam.types import Detections, Imu, Odometry, Scan
 
 MS = SECOND // 1000
@@ -406,3 +406,31 @@ def test_silent_lidar_is_not_waited_for():
     assert [o.scan.frame_id for o in out].count('rear') == 30
     # while it may still come, the other waits as long as for anything else
     assert sequencer.inputs.totals()['scan']['waited_out'] <= 10
+
+
+@pytest.mark.parametrize('increment', [1.0, -1e-4, 1e6])
+def test_sweep_of_impossible_length_is_refused_and_holds_nothing_up(increment):
+    sequencer = Sequencer(Parameters())
+    out = []
+    for k in range(1, 40):
+        stamp = k * 100_000_000
+        out += sequencer.add_odometry(Odometry(stamp, np.array([0.01 * k, 0.0, 0.0])))
+        sweep = scan(stamp, time_increment=0.0 if k % 2 else increment)
+        out += sequencer.add_scan(sweep)
+    counts = sequencer.inputs.totals()['scan']
+    assert counts['invalid'] == 19
+    assert 'time_increment' in sequencer.inputs.last_error
+    assert len(out) >= 18
+
+
+@pytest.mark.parametrize('sigma', [1e-8, 1e5, 1e19])
+def test_sigma_that_nobody_can_mean_is_bounded_and_counted(sigma):
+    sequencer = Sequencer(Parameters())
+    d = detections(200_000_000)
+    d = replace(d, cov=np.broadcast_to(sigma**2 * np.eye(2), d.cov.shape))
+    sequencer.add_odometry(Odometry(100_000_000, np.zeros(3)))
+    sequencer.add_detections(d)
+    (observation,) = sequencer.flush()
+    values = np.sqrt(np.linalg.eigvalsh(observation.detections.cov))
+    assert 0.99 * SIGMA[0] <= values.min() <= values.max() <= 1.01 * SIGMA[1]
+    assert sequencer.inputs.totals()['reflectors']['sigma_bounded'] == 1
