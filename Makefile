@@ -45,7 +45,8 @@ types: env  ## mypy, strict
 	@$(BIN)/mypy
 
 config: env  ## write config/*.yaml anew from the declared parameters
-	@for name in default simulator deformable_slam carrier_simulator ekf_slam; do \
+	@for name in default simulator deformable_slam carrier_simulator ekf_slam \
+	  reflector_detector; do \
 	  $(BIN)/python -m rlml_slam.tools.config $$name.yaml >config/.new && \
 	  mv config/.new config/$$name.yaml; done
 

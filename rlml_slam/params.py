@@ -539,6 +539,51 @@ class Ransac(Group):
 
 
 @dataclass(frozen=True)
+class Detector(Group):
+    """Reflectors in the intensities of a scan: what is bright enough, and of the right shape."""
+
+    threshold: str = param(
+        'automatic', 'how bright a reflector is: brighter than all else in the same scan, above '
+        'a exp(-k r) + floor, or marked by the vendor (intensity 65534 and more)',
+        choices=('automatic', 'curve', 'bit'),
+    )  # fmt: skip
+    contrast: float = param(
+        4.5, 'automatic: intensity of a reflector per that of bright other surfaces as far away',
+        '', 1.1, 1000.0,
+    )  # fmt: skip
+    a: float = param(1000.0, 'curve: fading part of the threshold, at range 0', '', 0.0, 1e9)
+    k: float = param(0.1, 'curve: loss of the fading part with range', '1/m', 0.0, 100.0)
+    floor: float = param(
+        0.0, 'curve and automatic: what is less bright is no reflector', '', 0.0, 1e9
+    )
+    diameter: float = param(0.08, 'diameter of cylinders; 0 is none', 'm', 0.0, 2.0)
+    flat_width: float = param(0.0, 'width of flat reflectors; 0 is none', 'm', 0.0, 2.0)
+    size_tolerance: float = param(
+        0.025, 'what is narrower or wider by more is something else', 'm', 0.0, 1.0
+    )
+    divergence: float = param(
+        0.003, 'angle of a beam between its halves of power', 'rad', 0.0, 0.1
+    )
+    edge: float = param(
+        0.4, 'share of its brightness by which a reflector ends at once on either side; the '
+        'glare of a glossy wall fades',
+        '', 0.0, 1.0,
+    )  # fmt: skip
+    separation: float = param(
+        0.2, 'bright spots nearer to each other are parts of something larger', 'm', 0.0, 10.0
+    )
+    min_beams: int = param(1, 'fewer beams are no reflector', '', 1, 1000)
+    min_range: float = param(0.2, 'nearer ones are not used', 'm', 0.0, 100.0)
+    max_range: float = param(40.0, 'farther ones are not used', 'm', 0.5, 1000.0)
+    sigma_range: float = param(0.01, 'range noise of one beam', 'm', 1e-4, 1.0)
+    sigma_bearing: float = param(0.0005, 'error of a bearing that more beams do not lower', 'rad',
+                                 1e-6, 0.1)  # fmt: skip
+    sigma_floor: float = param(
+        0.003, 'error of a range that more beams do not lower', 'm', 1e-5, 1.0
+    )
+
+
+@dataclass(frozen=True)
 class Parameters:
     """One of every group. Fields of ``node`` have plain ROS names, all others ``group.field``."""
 
@@ -571,6 +616,15 @@ class DeformableParameters:
     motion: MotionNoise = MotionNoise()
     reflector: Reflector = Reflector()
     deformable: Deformable = Deformable()
+
+
+@dataclass(frozen=True)
+class DetectorParameters:
+    """Parameters of reflector_detector: its own group, and those that it shares."""
+
+    node: Node = Node()
+    motion: MotionNoise = MotionNoise()
+    detector: Detector = Detector()
 
 
 @dataclass(frozen=True)

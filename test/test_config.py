@@ -15,6 +15,7 @@ from rlml_slam import __version__
 from rlml_slam.params import (
     CarrierParameters,
     DeformableParameters,
+    DetectorParameters,
     EkfParameters,
     Parameters,
     PlayerParameters,
@@ -31,6 +32,7 @@ ALL = (
     Parameters,
     EkfParameters,
     DeformableParameters,
+    DetectorParameters,
     SimulatorParameters,
     CarrierParameters,
     PlayerParameters,

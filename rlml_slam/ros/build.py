@@ -146,14 +146,20 @@ DETECTION = np.dtype(
         ('sigma_range', '<f4'), ('sigma_bearing', '<f4'), ('diameter', '<f4'),
     ]
 )  # fmt: skip
+BRIGHT_DETECTION = np.dtype([*DETECTION.descr, ('intensity', '<f4')])
 
 
-def detections(make: Make, seen: Detections) -> Any:
-    """PointCloud2 of reflectors; the sigmas are those of the covariance along and across."""
+def detections(make: Make, seen: Detections, intensities: Array | None = None) -> Any:
+    """PointCloud2 of reflectors; the sigmas are those of the covariance along and across.
+
+    ``intensities`` (n,), where there are, of their brightest beams.
+    """
     r = np.maximum(np.hypot(seen.points[:, 0], seen.points[:, 1]), 1e-9)
     u = seen.points / r[:, None]
     t = np.stack([-u[:, 1], u[:, 0]], -1)
-    cloud = np.zeros(len(seen), dtype=DETECTION)
+    cloud = np.zeros(len(seen), dtype=DETECTION if intensities is None else BRIGHT_DETECTION)
+    if intensities is not None:
+        cloud['intensity'] = intensities
     cloud['x'], cloud['y'] = seen.points[:, 0], seen.points[:, 1]
     cloud['id'] = seen.ids
     cloud['sigma_range'] = np.sqrt(np.einsum('ni,nij,nj->n', u, seen.cov, u))

@@ -11,6 +11,7 @@ from rlml_slam.params import (
     CarrierParameters,
     Declaration,
     DeformableParameters,
+    DetectorParameters,
     EkfParameters,
     Parameters,
     SimulatorParameters,
@@ -22,6 +23,7 @@ FILES: dict[str, tuple[type[Any], str]] = {
     'simulator.yaml': (SimulatorParameters, 'Every parameter of the simulator'),
     'deformable_slam.yaml': (DeformableParameters, 'Every parameter of deformable_slam'),
     'ekf_slam.yaml': (EkfParameters, 'Every parameter of ekf_slam and `rlml replay --system ekf`'),
+    'reflector_detector.yaml': (DetectorParameters, 'Every parameter of reflector_detector'),
     'carrier_simulator.yaml': (CarrierParameters, 'Every parameter of carrier_simulator'),
 }
 

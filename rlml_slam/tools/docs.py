@@ -16,6 +16,7 @@ from rlml_slam.params import (
     CarrierParameters,
     Declaration,
     DeformableParameters,
+    DetectorParameters,
     Parameters,
     SimulatorParameters,
     declarations,
@@ -117,5 +118,6 @@ TABLES: Mapping[str, Callable[[], str]] = {
     'parameters': lambda: parameter_table(Parameters),
     'simulator parameters': lambda: parameter_table(SimulatorParameters),
     'deformable parameters': lambda: parameter_table(DeformableParameters, 'deformable.'),
+    'detector parameters': lambda: parameter_table(DetectorParameters, 'detector.'),
     'carrier parameters': lambda: parameter_table(CarrierParameters),
 }

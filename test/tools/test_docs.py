@@ -14,7 +14,10 @@ from rlml_slam.tools.docs import TABLES, filled, parameter_table
 from rlml_slam.tools.interface import SERVICES, TOPICS
 from rlml_slam.tools.main import main
 
-NODES = ('front_end', 'back_end', 'simulator', 'deformable_slam', 'carrier_simulator')
+NODES = (
+    'front_end', 'back_end', 'simulator', 'deformable_slam', 'carrier_simulator',
+    'reflector_detector',
+)  # fmt: skip
 README = Path(__file__).resolve().parents[2] / 'README.md'
 # what every node of rclpy has
 OF_EVERY_NODE = {'/rosout', '/parameter_events'}
@@ -63,6 +66,7 @@ def nodes():
     from rlml_slam.nodes.carrier_simulator import CarrierSimulatorNode
     from rlml_slam.nodes.deformable_slam import DeformableSlamNode
     from rlml_slam.nodes.front_end import FrontEndNode
+    from rlml_slam.nodes.reflector_detector import ReflectorDetectorNode
     from rlml_slam.nodes.simulator import SimulatorNode
 
     before = os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE')
@@ -77,6 +81,7 @@ def nodes():
         SimulatorNode(context=context, parameter_overrides=drive),
         DeformableSlamNode(context=context, parameter_overrides=suggest),
         CarrierSimulatorNode(context=context),
+        ReflectorDetectorNode(context=context),
     ]
     yield {node.get_name(): node for node in made}
     for node in made:

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Executable ``reflector_detector``: reflectors from the intensities of laser scans."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from typing import Any
+
+from rclpy.node import Node
+
+from rlml_slam import warm_up
+from rlml_slam.params import DetectorParameters, Parameters
+from rlml_slam.ros import build
+from rlml_slam.ros.declare import declare
+from rlml_slam.ros.detector_health import DetectorHealth
+from rlml_slam.ros.messages import make_rclpy, rclpy_class
+from rlml_slam.ros.run import run
+from rlml_slam.ros.sensors import SENSOR, Sensors
+from rlml_slam.sensing.reflector_detector import detect
+from rlml_slam.types import Observation
+
+
+class ReflectorDetectorNode(Node):
+    """Answers every scan with its reflectors, in the scan's frame and at its stamp.
+
+    Odometry and IMU, where there are, take out the robot's motion during the sweep.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__('reflector_detector', **options)
+        self.params: DetectorParameters = declare(self, DetectorParameters)
+        n = replace(self.params.node, use_scan=True)
+        self._publisher = self.create_publisher(
+            rclpy_class('sensor_msgs/msg/PointCloud2'), n.reflectors_topic, SENSOR
+        )
+        warm_up.compile_loaded()
+        shared = Parameters(node=n, motion=self.params.motion)
+        streams = ('scan', 'odom', 'imu')
+        self.sensors = Sensors(self, shared, streams, self.process, self.restart)
+        self.health = DetectorHealth(self, self.sensors)
+
+    def process(self, observation: Observation) -> None:
+        """One scan: detect and publish; no reflectors are published as an empty cloud."""
+        scan = observation.scan
+        if scan is None or observation.T_base_laser is None or observation.sweep is None:
+            return
+        found = detect(scan, self.params.detector)
+        seen = found.at_stamp(scan, observation.T_base_laser, observation.sweep)
+        if len(scan.intensities):  # without any, nothing was looked at
+            self._publisher.publish(build.detections(make_rclpy, seen, found.intensities))
+        self.health.update(scan, found)
+
+    def restart(self) -> None:
+        """The clock jumped back: scans are independent of each other, nothing is forgotten."""
+
+
+def main() -> int:
+    """Run the node."""
+    return run(ReflectorDetectorNode)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
