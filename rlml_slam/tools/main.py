@@ -72,6 +72,9 @@ COMMANDS: Table = {
                 'study_repeatability',
                 'how often spikes and lines of a corrected log are seen again',
             ),
+            'detector': Command(
+                'study_detector', 'bias, false detections and reach of the reflector detector'
+            ),
             'victoria-park': Command(
                 'study_victoria_park', 'dead reckoning, EKF and RLML among trees, against GPS'
             ),
@@ -83,6 +86,9 @@ COMMANDS: Table = {
             'back-end': Command('bench_back_end', 'the graph solver against other libraries'),
             'live': Command('bench_live', 'whether the live nodes keep up with a fast laser'),
         },
+    ),
+    'doctor': Command(
+        'doctor', 'what the scans of a bag are like, and a threshold for its reflectors'
     ),
     'docs': Command('docs', "the README's tables from the declarations in the code"),
 }
