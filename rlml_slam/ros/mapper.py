@@ -56,6 +56,7 @@ class Mapper:
         self.worker = Worker()
         self.products = MapProducts(node, params.node)
         self.T_map_odom: Array | None = None
+        self._has_odometry = False  # in any session: odom is the robot's, not the front end's
         self._newest: Frame | None = None
         self._session: int | None = None
         self._sent = 0
@@ -98,14 +99,22 @@ class Mapper:
                 if update.optimized:
                     self._send_correction()
                     self._send_belief(record)
-        T_map_base = se2.compose(self.back_end.T_map_local, frame.T_local_base)
-        T_odom_base = frame.observation.odom_pose
-        if T_odom_base is None:  # without odometry, odom is the front end's local frame
-            T_odom_base = frame.T_local_base
-        self.T_map_odom = se2.compose(T_map_base, se2.inverse(T_odom_base))
+        self._place_odom(frame)
         due = self.saved is None and self.products.is_due(frame.stamp)
         if due and self.worker.backlog < MAX_BACKLOG:
             self.publish_map()
+
+    def _place_odom(self, frame: Frame) -> None:
+        """Map to odom by a frame; one that lacks the odometry there is leaves it as it was."""
+        T_odom_base = frame.observation.odom_pose
+        if T_odom_base is not None:
+            self._has_odometry = True
+        elif self._has_odometry:
+            return
+        else:  # without any odometry, odom is the front end's local frame
+            T_odom_base = frame.T_local_base
+        T_map_base = se2.compose(self.back_end.T_map_local, frame.T_local_base)
+        self.T_map_odom = se2.compose(T_map_base, se2.inverse(T_odom_base))
 
     def _send_correction(self) -> None:
         frame, T = self._p.node.map_frame, self.back_end.T_map_local
