@@ -292,6 +292,9 @@ class HealthLimits(Group):
     """When the estimate counts as DEGRADED or LOST."""
 
     patience: float = param(1.0, 'an input may fail for this long', 's', 0.0, 60.0)
+    confirm_time: float = param(
+        5.0, 'LOST when no two reflectors of the saved map match for this long', 's', 0.0, 600.0
+    )
     weak_sigma: float = param(
         0.15, 'a scan that holds a direction worse leaves it open', 'm', 1e-3, 10.0
     )

@@ -36,6 +36,7 @@ from rlml_slam.types import (
 REFLECTOR_ITERATIONS = 4
 POSE_AND_TARGET = np.array([0, 1, 2, *range(ANCHORS[0], ANCHORS[0] + 3)])
 CONVERGED = np.array([1e-5, 1e-5, 1e-6])
+START_SIGMA = np.array([0.5, 0.5, 0.26])  # [m, m, rad] what RViz says of a pose set by hand
 
 
 class FrontEnd:
@@ -61,11 +62,19 @@ class FrontEnd:
         self._velocity = np.zeros(3)
         self._velocity_known = False
         self._has_odometry = False
+        self._unconfirmed = False
         self._last_fit = 0
         self._last_stamp: int | None = None
 
     def use_map(self, reflectors: Reflectors) -> None:
-        """Localise against given reflectors (map frame); they are never dropped."""
+        """Localise against given reflectors (map frame); they are never dropped.
+
+        A start pose that is only assumed, with no covariance, is as good as a person's guess; and
+        it stays unconfirmed until two of the reflectors have matched.
+        """
+        if not self.state.pose_cov.any():
+            self.state.widen(np.diag(START_SIGMA**2))
+        self._unconfirmed = True
         for k in range(len(reflectors)):
             self.state.fix_landmark(reflectors.points[k], reflectors.cov[k])
             self.tracks.append(
@@ -330,7 +339,15 @@ class FrontEnd:
             detections=None if observation.detections is None else len(observation.detections),
             used=int((matched.status == Status.USED).sum()),
             cov=self.state.P[:3, :3],
+            unconfirmed=self._is_unconfirmed(),
         )
+
+    def _is_unconfirmed(self) -> bool:
+        """Whether the pose in a given map is still the one that was told or assumed."""
+        if self._unconfirmed:
+            matched = self.tracks.surveyed & (self.tracks.sightings > 0)
+            self._unconfirmed = int(matched.sum()) < 2
+        return self._unconfirmed
 
     def _frame(
         self,

@@ -50,13 +50,19 @@ class HealthMonitor:
         detections: int | None,
         used: int,
         cov: Array,
+        unconfirmed: bool = False,
     ) -> Health:
-        """Health at ``stamp`` [ns]; ``detections`` is None where none were looked for."""
+        """Health at ``stamp`` [ns]; ``detections`` is None where none were looked for.
+
+        ``unconfirmed``: the pose in a given map is one that nothing measured agrees with so far.
+        """
+        reasons: list[str] = []
+        if unconfirmed:
+            reasons.append('no two reflectors of the saved map have matched yet')
         if self._first is None:
             self._first = stamp
-            return Health()
-        reasons: list[str] = []
-        lost = False
+            return Health(Level.DEGRADED if reasons else Level.OK, tuple(reasons))
+        lost = unconfirmed and stamp - self._first > self._limits.confirm_time * 1e9
         patience = int(self._limits.patience * 1e9)
 
         def failing(since: int) -> bool:

@@ -339,7 +339,7 @@ class Sequencer:
 def believable(cov: Array) -> tuple[Array, bool]:
     """Covariances (k, 2, 2) with every sigma inside SIGMA, and whether one had to be bounded.
 
-    A driver that fills in 0 or the largest float for "unknown" must not make the estimate singular.
+    A driver that fills in 0 or the largest float for "unknown" must not make the state singular.
     """
     values, axes = np.linalg.eigh(0.5 * (cov + np.swapaxes(cov, 1, 2)))
     bounded = np.clip(values, SIGMA[0] ** 2, SIGMA[1] ** 2)

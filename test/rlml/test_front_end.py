@@ -246,6 +246,28 @@ def test_localization_keeps_to_the_given_map():
     assert errors(poses_of(frames), CURVE)[0].max() < 1e-6
 
 
+@pytest.mark.parametrize('reflectors', [3, 0])
+def test_start_pose_in_a_map_that_nothing_confirms_is_lost(reflectors):
+    front_end = FrontEnd(Parameters(node=Node(mode='localization')))
+    front_end.use_map(surveyed(ROOM.reflectors[:reflectors] + 40.0, sigma=0.01))
+    frames, _ = run(observations(ROOM, CURVE), front_end=front_end)
+    waits = [(f.stamp - frames[0].stamp) * 1e-9 > 5.0 for f in frames]
+    assert sum(waits) > 5
+    assert sum(not w for w in waits) > 5
+    for f, waited in zip(frames, waits, strict=True):
+        assert f.health.level == (Level.LOST if waited else Level.DEGRADED)
+        assert 'saved map' in f.health.reasons[0]
+
+
+def test_assumed_start_pose_in_a_map_is_corrected_and_confirmed():
+    front_end = FrontEnd(Parameters(node=Node(mode='localization')))
+    front_end.reset(np.array([0.4, -0.3, 0.1]), np.zeros((3, 3)))
+    front_end.use_map(surveyed(ROOM.reflectors[:3], sigma=0.01))
+    frames, _ = run(observations(ROOM, CURVE, scan=False), front_end=front_end)
+    assert frames[-1].health.level is Level.OK
+    assert errors(poses_of(frames[-5:]), CURVE[-5:])[0].max() < 0.05
+
+
 # --- scan --------------------------------------------------------------------------------------
 
 
