@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from rlml_slam.errors import InputError
 from rlml_slam.ros import build, convert
 from rlml_slam.ros.convert import Transform
 from rlml_slam.ros.messages import make_rclpy, rclpy_class
@@ -100,7 +101,13 @@ def subscribe_static(node: Any, extrinsics: Extrinsics) -> bool:
     if kind is None:
         return False
     latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    node.create_subscription(
-        kind, '/tf_static', lambda m: extrinsics.add(convert.transforms(m)), latched
-    )
+
+    def take(msg: Any) -> None:
+        for transform in msg.transforms:  # each by itself: a bad one costs none of the others
+            try:
+                extrinsics.add(convert.transforms(transform))
+            except InputError as e:
+                node.get_logger().warning(f'not used: {e}')
+
+    node.create_subscription(kind, '/tf_static', take, latched)
     return True

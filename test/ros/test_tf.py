@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from rlml_slam import se2
 from rlml_slam.errors import InputError
-from rlml_slam.ros import build, convert
+from rlml_slam.ros import build, convert, tf
 from rlml_slam.ros.convert import Transform
 from rlml_slam.ros.messages import make_bag
 from rlml_slam.ros.tf import Extrinsics
@@ -60,3 +62,27 @@ def test_later_transform_replaces_the_earlier():
     tree.add(planar('base_link', 'laser', [1, 0, 0]))
     tree.add(planar('base_link', 'laser', [2, 0, 0]))
     assert tree.pose('base_link', 'laser')[0] == 2.0
+
+
+def test_bad_static_transform_costs_only_itself(monkeypatch):
+    pytest.importorskip('rclpy')
+    monkeypatch.setattr(tf, 'rclpy_class', lambda name: object)
+    hear, said = {}, []
+    node = SimpleNamespace(
+        create_subscription=lambda kind, topic, callback, qos: hear.update({topic: callback}),
+        get_logger=lambda: SimpleNamespace(warning=said.append),
+    )
+    tree = Extrinsics()
+    assert tf.subscribe_static(node, tree)
+    bad = build.transform(make_bag, 1, ('base_link', 'camera'), np.zeros(3))
+    bad.transform.rotation.w = 0.0
+    good = [
+        build.transform(make_bag, 1, ('base_link', child), np.array([0.3, 0.1, 0.0]))
+        for child in ('laser', 'imu')
+    ]
+    hear['/tf_static'](SimpleNamespace(transforms=[good[0], bad, good[1]]))
+    assert tree.pose('base_link', 'camera') is None
+    for child in ('laser', 'imu'):
+        np.testing.assert_allclose(tree.pose('base_link', child), [0.3, 0.1, 0.0])
+    assert len(said) == 1
+    assert 'base_link to camera: quaternion has the length 0' in said[0]
