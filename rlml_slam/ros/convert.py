@@ -22,6 +22,8 @@ from rlml_slam.types import ANONYMOUS, Detections, Imu, Odometry, Scan
 
 MAX_TILT = 0.35  # [rad] a larger roll or pitch is not a planar pose
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # (x, y, yaw) of ROS's 6 x 6 covariances
+MAX_VARIANCE = 1e6  # [m^2], [rad^2] of a start: from 1e9 or so, updates lose all their digits
+_ROUNDING = 1e-9  # of the largest variance
 _NEAR = 1e-3  # [m] nearer than this a bearing has no meaning
 
 
@@ -164,16 +166,47 @@ def polar_covariance(points: Array, sigma_r: Array, sigma_b: Array, fallback: fl
 
 def pose_estimate(msg: Any, topic: str = 'pose') -> PoseEstimate:
     """PoseWithCovarianceStamped or Odometry: planar pose and covariance."""
-    full = np.asarray(msg.pose.covariance, dtype=np.float64)
-    cov = np.array(full.reshape(6, 6)[_PLANAR])
-    if not np.isfinite(cov).all() or (np.diag(cov) < 0.0).any():
-        raise InputError(f'{topic}: pose.covariance is not a covariance')
+    cov = _planar_covariance(msg, topic)
     return PoseEstimate(
         stamp(msg, topic),
         frame(msg.header.frame_id),
         planar_pose(msg.pose.pose, f'{topic}: pose'),
         0.5 * (cov + cov.T),
     )
+
+
+def start_pose(msg: Any, map_frame: str, topic: str = 'initialpose') -> PoseEstimate:
+    """The pose_estimate to begin at: stamp 0 means now, an empty frame_id ``map_frame``.
+
+    InputError also for any other frame, and for a covariance that is not symmetric positive
+    semidefinite or has a variance above MAX_VARIANCE.
+    """
+    in_frame, map_frame = frame(msg.header.frame_id), frame(map_frame)
+    if in_frame not in ('', map_frame):
+        raise InputError(f'{topic}: header.frame_id is {in_frame!r} instead of {map_frame!r}')
+    cov, where = _planar_covariance(msg, topic), f'{topic}: pose.covariance'
+    most = float(np.diag(cov).max())
+    if most > MAX_VARIANCE:
+        raise InputError(f'{where} has a variance of {most:.3g}, above {MAX_VARIANCE:.3g}')
+    if np.abs(cov - cov.T).max() > _ROUNDING * most:
+        raise InputError(f'{where} is not symmetric')
+    cov = 0.5 * (cov + cov.T)
+    least = float(np.linalg.eigvalsh(cov)[0])
+    if least < -_ROUNDING * most:
+        raise InputError(f'{where} has the eigenvalue {least:.3g}, below 0')
+    t = msg.header.stamp
+    time = 0 if int(t.sec) == int(t.nanosec) == 0 else stamp(msg, topic)
+    pose = planar_pose(msg.pose.pose, f'{topic}: pose')
+    return PoseEstimate(time, map_frame, pose, cov)
+
+
+def _planar_covariance(msg: Any, topic: str) -> Array:
+    """(3, 3) of x, y and yaw as it is told: finite, without a negative variance."""
+    full = np.asarray(msg.pose.covariance, dtype=np.float64)
+    cov = np.array(full.reshape(6, 6)[_PLANAR])
+    if not np.isfinite(cov).all() or (np.diag(cov) < 0.0).any():
+        raise InputError(f'{topic}: pose.covariance is not a covariance')
+    return cov
 
 
 def twist(msg: Any, topic: str = 'cmd_vel') -> tuple[float, float]:

@@ -60,7 +60,7 @@ class FrontEndControl:
 
     def start_at(self, msg: Any) -> None:
         """Begin anew at a pose of the map; one with the stamp of a frame is of that moment."""
-        start = convert.pose_estimate(msg, 'initialpose')
+        start = convert.start_pose(msg, self._p.node.map_frame)
         pose = start.pose
         for stamp, T_local_base in self._recent:
             if stamp == start.stamp:

@@ -10,7 +10,7 @@ import pytest
 from live import LATCHED, room
 
 from rlml_slam import se2
-from rlml_slam.errors import ParameterError
+from rlml_slam.errors import InputError, ParameterError
 from rlml_slam.nodes.front_end import FrontEndNode
 from rlml_slam.ros import build, convert
 from rlml_slam.ros.associated import read_associated
@@ -105,6 +105,16 @@ def test_initialpose_begins_anew_there(live, node):
     node.control.start_at(
         build.pose_with_covariance(make, 99 * SECOND, 'map', start, 0.01 * np.eye(3))
     )
+    np.testing.assert_allclose(node.front_end.state.pose, start)
+
+
+def test_initialpose_without_stamp_is_of_now_and_of_another_frame_is_none(live, node):
+    feed(node, 2.0)
+    start, cov = np.array([5.0, 6.0, 1.0]), 0.01 * np.eye(3)
+    with pytest.raises(InputError, match="frame_id is 'odom' instead"):
+        node.control.start_at(build.pose_with_covariance(make, SECOND, 'odom', start, cov))
+    assert node.front_end.state.pose[0] < 2.0
+    node.control.start_at(build.pose_with_covariance(make, 0, 'map', start, cov))
     np.testing.assert_allclose(node.front_end.state.pose, start)
 
 

@@ -121,6 +121,47 @@ def test_covariance_that_is_none_is_refused(make, wrong):
         convert.pose_estimate(msg, 'initialpose')
 
 
+def start(cov, frame_id='map', stamp=STAMP):
+    return build.pose_with_covariance(
+        make_bag, stamp, frame_id, np.array([1.0, 2.0, 0.5]), np.array(cov, dtype=float)
+    )
+
+
+@pytest.mark.parametrize(
+    ('cov', 'why'),
+    [
+        ([[0.25, 5, 0], [5, 0.25, 0], [0, 0, 0.07]], r'has the eigenvalue -4\.75, below 0'),
+        ([[0.25, 0.1, 0], [0, 0.25, 0], [0, 0, 0.07]], 'is not symmetric'),
+        (np.diag([0.25, 1e300, 0.07]), r'has a variance of 1e\+300, above 1e\+06'),
+        ([[0.25, np.inf, 0], [np.inf, 0.25, 0], [0, 0, 0.07]], 'is not a covariance'),
+    ],
+)
+def test_start_with_a_covariance_that_is_none_is_refused(cov, why):
+    with pytest.raises(InputError, match=rf'initialpose: pose\.covariance {why}'):
+        convert.start_pose(start(cov), 'map')
+
+
+def test_start_may_be_certain_and_very_uncertain():
+    for cov in (np.zeros((3, 3)), np.diag([0.25, 0.25, 0.0]), convert.MAX_VARIANCE * np.eye(3)):
+        np.testing.assert_array_equal(convert.start_pose(start(cov), 'map').cov, cov)
+
+
+def test_start_is_in_the_map():
+    with pytest.raises(InputError, match=r"header\.frame_id is 'odom' instead of 'map'"):
+        convert.start_pose(start(np.eye(3), 'odom'), 'map')
+    for frame_id in ('', 'map', '/map'):
+        got = convert.start_pose(start(np.eye(3), frame_id), 'map')
+        assert got.frame_id == 'map'
+        np.testing.assert_allclose(got.pose, [1.0, 2.0, 0.5], atol=1e-12)
+
+
+def test_start_without_a_stamp_is_of_now():
+    assert convert.start_pose(start(np.eye(3), stamp=0), 'map').stamp == 0
+    assert convert.start_pose(start(np.eye(3)), 'map').stamp == STAMP
+    with pytest.raises(InputError, match=r'header\.stamp is -'):
+        convert.start_pose(start(np.eye(3), stamp=-STAMP), 'map')
+
+
 @pytest.mark.parametrize('wrong', [np.nan, np.inf])
 def test_odometry_that_is_not_finite_is_refused(make, wrong):
     T = np.array([0.0, wrong, 0.0])
