@@ -69,7 +69,8 @@ class HealthPublisher:
             health, stamp = self._frame.health, self._frame.stamp
             figures['wall time of the last frame [ms]'] = f'{self._frame.wall_ms:.2f}'
             if self._frames == self._reported:
-                health = Health(Level.DEGRADED, (*health.reasons, 'no new scan or reflectors'))
+                level = max(health.level, Level.DEGRADED)  # who is lost stays lost in silence
+                health = Health(level, (*health.reasons, 'no new scan or reflectors'))
         self._reported = self._frames
         message = build.diagnostics(
             make_rclpy, stamp, self._name, health, {**figures, **self._figures()}

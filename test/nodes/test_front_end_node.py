@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from rlml_slam.ros import build, convert
 from rlml_slam.ros.associated import read_associated
 from rlml_slam.ros.messages import make_rclpy as make
 from rlml_slam.ros.messages import rclpy_class
-from rlml_slam.types import Status
+from rlml_slam.types import Health, Level, Status
 
 SECOND = 1_000_000_000
 
@@ -146,6 +147,23 @@ def test_silence_is_told(live, node):
     node.health.publish()
     live.spin_until(lambda: live.heard['/diagnostics'])
     assert 'no input yet' in live.heard['/diagnostics'][0].status[0].message
+
+
+@pytest.mark.parametrize(
+    ('before', 'told'), [(Level.OK, Level.DEGRADED), (Level.LOST, Level.LOST)]
+)
+def test_silence_makes_health_no_better(live, node, before, told):
+    feed(node, 2.0)
+    node.health.update(dataclasses.replace(node.last, health=Health(before, ('why',))))
+    node.health.publish()
+    live.drain()
+    live.heard['/diagnostics'].clear()
+    node.health.publish()
+    live.spin_until(lambda: live.heard['/diagnostics'])
+    status = live.heard['/diagnostics'][0].status[0]
+    assert status.level == bytes([told])
+    assert 'why' in status.message
+    assert 'no new scan' in status.message
 
 
 # --- bad input ------------------------------------------------------------------------------
