@@ -50,8 +50,9 @@ class Mapper:
         self._logger = node.get_logger()
         self.folder = MapFolder(params.node.map_directory)
         self.saved: SavedMap | None = None
+        self._loaded: SavedMap | None = None  # the last one that came from the folder
         if params.node.mode == 'localization':
-            self.saved = self.folder.load(params.node.map_file_name)
+            self.saved = self._loaded = self.folder.load(params.node.map_file_name)
         self.back_end = BackEnd(params)
         self.worker = Worker()
         self.products = MapProducts(node, params.node)
@@ -170,8 +171,8 @@ class Mapper:
 
     def save(self, name: str) -> str:
         """In the worker: write the map; what was written, in words. Raises MapError."""
-        if self._p.node.mode == 'localization':
-            raise MapError('in localization mode the map does not change: nothing to save')
+        if self.saved is not None and self.saved is self._loaded:
+            raise MapError('the map that was loaded does not change: nothing to save')
         current = self.current()
         if current.grid is None and len(current.reflectors) == 0:
             raise MapError('there is no map yet')
@@ -187,7 +188,7 @@ class Mapper:
         """In the worker: localise in another saved map. Raises MapError."""
         if self.saved is None:
             raise MapError('load_map needs mode:=localization')
-        self.saved = self.folder.load(name)
+        self.saved = self._loaded = self.folder.load(name)
         self._use_saved()
         return self.saved
 

@@ -3,16 +3,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import defaultdict
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from rlml_slam.errors import MapError
 from rlml_slam.params import Parameters
 from rlml_slam.ros.frames import Record
+from rlml_slam.ros.map_folder import MapFolder, SavedMap
 from rlml_slam.ros.mapper import Mapper
-from rlml_slam.types import Frame, Motion, Observation
+from rlml_slam.types import Frame, Motion, Observation, Reflectors
 
 SECOND = 1_000_000_000
 ODOMETRY = np.array([100.0, 50.0, 1.0])
@@ -46,13 +49,27 @@ def ear():
 
 
 @pytest.fixture
-def mapper(ear, monkeypatch):
-    mapper = Mapper(ear, Parameters())
+def make(ear):
+    """Makes mappers with parameters of the group Node, and ends them with the test."""
+    made = []
+
+    def mapper(**node):
+        p = Parameters()
+        made.append(Mapper(ear, dataclasses.replace(p, node=dataclasses.replace(p.node, **node))))
+        return made[-1]
+
+    yield mapper
+    for mapper in made:
+        mapper.worker.close()
+
+
+@pytest.fixture
+def mapper(make, ear, monkeypatch):
+    mapper = make()
     transforms = ear.sent['transforms']
     monkeypatch.setattr(mapper._tf, 'publish', lambda *sent: transforms.append(sent))
     mapper.transforms = transforms
-    yield mapper
-    mapper.worker.close()
+    return mapper
 
 
 def give(mapper, k, pose=(0.0, 0.0, 0.0), odometry=ODOMETRY, session=1, **more):
@@ -87,3 +104,38 @@ def test_new_session_waits_for_the_odometry_that_there_is(mapper):
 def test_without_any_odometry_odom_is_the_local_frame(mapper):
     give(mapper, 0, pose=(3.0, 2.0, 1.0), odometry=None)
     np.testing.assert_allclose(mapper.transforms[-1][2], np.zeros(3), atol=1e-12)
+
+
+# --- saving ---------------------------------------------------------------------------------
+
+
+def posts(n):
+    covs = np.tile(1e-4 * np.eye(2), (n, 1, 1))
+    ids, counts = np.full(n, -1), np.full(n, 9)
+    points = np.arange(2.0 * n).reshape(n, 2)
+    return Reflectors(np.arange(n), points, covs, ids, counts, np.full(n, np.nan))
+
+
+def test_loaded_map_is_not_saved_but_a_new_one_after_it_is(make, tmp_path):
+    folder = MapFolder(str(tmp_path))
+    folder.save('old', SavedMap(posts(3)))
+    mapper = make(mode='localization', map_directory=str(tmp_path), map_file_name='old')
+    with pytest.raises(MapError, match='nothing to save'):
+        mapper.save('new')
+    mapper.localize(False)
+    with pytest.raises(MapError, match='there is no map yet'):
+        mapper.save('new')
+    mapper.back_end.reflectors = lambda: posts(5)
+    mapper.save('new')
+    assert len(folder.load('new').reflectors) == 5
+
+
+def test_map_made_here_can_be_saved_while_it_is_localized_in(make, tmp_path):
+    mapper = make(map_directory=str(tmp_path))
+    mapper.back_end.reflectors = lambda: posts(5)
+    mapper.localize(True)
+    mapper.save('new')
+    assert len(MapFolder(str(tmp_path)).load('new').reflectors) == 5
+    mapper.load('new')
+    with pytest.raises(MapError, match='nothing to save'):
+        mapper.save('again')
