@@ -37,7 +37,10 @@ class MapFolder:
         return path
 
     def save(self, name: str, saved: SavedMap) -> Path:
-        """Write name.csv, and name.pgm with name.yaml where there is a grid."""
+        """Write name.csv, and name.pgm with name.yaml where there is a grid.
+
+        Without one, those of an older map of the name are removed: they would be read with this.
+        """
         path = self.path(name)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -46,6 +49,13 @@ class MapFolder:
         reflector_file.save(saved.reflectors, path.with_name(path.name + '.csv'))
         if saved.grid is not None:
             occupancy.save(saved.grid, path)
+            return path
+        for suffix in ('.yaml', '.pgm'):
+            old = path.with_name(path.name + suffix)
+            try:
+                old.unlink(missing_ok=True)
+            except OSError as e:
+                raise MapError(f'{old}: of an older map, cannot be removed: {e.strerror}') from e
         return path
 
     def load(self, name: str) -> SavedMap:

@@ -175,14 +175,15 @@ class Mapper:
             raise MapError('the map that was loaded does not change: nothing to save')
         current = self.current()
         if current.grid is None and len(current.reflectors) == 0:
-            raise MapError('there is no map yet')
-        return f'{self.folder.save(name, current)}: {_content(current)}'
+            raise MapError(self.products.undrawn or 'there is no map yet')
+        why = f', no grid: {self.products.undrawn}' if self.products.undrawn else ''
+        return f'{self.folder.save(name, current)}: {_content(current)}{why}'
 
     def current(self) -> SavedMap:
         """In the worker: the map as it is now."""
         if self.saved is not None:
             return self.saved
-        return SavedMap(self.back_end.reflectors(), self.back_end.occupancy_grid())
+        return SavedMap(self.back_end.reflectors(), self.products.grid(self.back_end))
 
     def load(self, name: str) -> SavedMap:
         """In the worker: localise in another saved map. Raises MapError."""

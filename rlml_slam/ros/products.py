@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from rlml_slam.errors import MapError
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Node
 from rlml_slam.ros import build
@@ -48,13 +49,15 @@ class Mapped(Protocol):
 class MapProducts:
     """Publishes the map every ``map_update_interval`` of stamps, latched.
 
-    ``stamp`` is that of the newest map that was sent, 0 before the first.
+    ``stamp`` is that of the newest map that was sent, 0 before the first. ``undrawn`` says why the
+    newest grid could not be drawn, empty where it could; then everything else is sent.
     """
 
     def __init__(
         self, node: Any, params: Node, topics: Mapping[str, str] = {**TOPICS, **GRAPH}
     ) -> None:
         self._p = params
+        self._logger = node.get_logger()
         self._publishers = {
             topic: node.create_publisher(rclpy_class(kind), topic, LATCHED)
             for topic, kind in topics.items()
@@ -64,6 +67,8 @@ class MapProducts:
     def restart(self) -> None:
         """The next frame is due."""
         self.stamp = 0
+        self.undrawn = ''
+        self._warned = False
         self._next = 0
         self._rested = 0.0
 
@@ -71,11 +76,22 @@ class MapProducts:
         """Whether the interval has passed, and the pause that the last map's cost asks for."""
         return stamp >= self._next and time.monotonic() >= self._rested
 
+    def grid(self, source: Mapped) -> OccupancyGrid | None:
+        """The system's grid; None, with one warning, where it is too large to be drawn."""
+        try:
+            grid, self.undrawn = source.occupancy_grid(), ''
+        except MapError as e:
+            grid, self.undrawn = None, str(e)
+            if not self._warned:
+                self._logger.warning(f'no grid: {e}')
+                self._warned = True
+        return grid
+
     def publish(self, source: Mapped, saved: SavedMap | None, stamp: int) -> None:
         """Send everything that there is: of the system, or of a saved map."""
         began = time.monotonic()
         make, frame = make_rclpy, self._p.map_frame
-        grid = source.occupancy_grid() if saved is None else saved.grid
+        grid = self.grid(source) if saved is None else saved.grid
         reflectors = source.reflectors() if saved is None else saved.reflectors
         if grid is not None:
             self._send('map', build.occupancy_grid(make, stamp, frame, grid))

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from rlml_slam.errors import MapError
+from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Parameters
+from rlml_slam.ros.associated import read_reflector_map
 from rlml_slam.ros.frames import Record
 from rlml_slam.ros.map_folder import MapFolder, SavedMap
 from rlml_slam.ros.mapper import Mapper
@@ -139,3 +141,33 @@ def test_map_made_here_can_be_saved_while_it_is_localized_in(make, tmp_path):
     mapper.load('new')
     with pytest.raises(MapError, match='nothing to save'):
         mapper.save('again')
+
+
+# --- a grid that is too large ---------------------------------------------------------------
+
+
+def test_map_without_the_grid_that_cannot_be_drawn(make, ear, tmp_path):
+    """A pose that is kilometres off spreads the grid; all else of the map goes on."""
+    small = OccupancyGrid(0.05, (0.0, 0.0), np.zeros((2, 2), dtype=np.int8))
+    MapFolder(str(tmp_path)).save('map', SavedMap(posts(3), small))
+    mapper = make(map_directory=str(tmp_path))
+    give(mapper, 0)
+    mapper.back_end.reflectors = lambda: posts(5)
+    mapper.back_end.occupancy_grid = too_large
+    for k in range(1, 40):
+        give(mapper, k)
+    mapper.publish_map()
+    assert ear.sent['map'] == []
+    assert len(read_reflector_map(ear.sent['reflector_map_points'][-1])) == 5
+    assert mapper.current().grid is None
+    found, why = mapper.relocalize()
+    assert not found
+    assert why.startswith('not found: ')
+    assert 'no grid: map of 9 x 9 cells' in mapper.save('map')
+    saved = MapFolder(str(tmp_path)).load('map')  # nothing of the older one
+    assert (len(saved.reflectors), saved.grid) == (5, None)
+    assert [w for w in ear.warnings if 'no grid' in w] == ['no grid: map of 9 x 9 cells']
+
+
+def too_large():
+    raise MapError('map of 9 x 9 cells')
