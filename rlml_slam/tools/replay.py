@@ -16,7 +16,7 @@ import numpy as np
 
 from rlml_slam import warm_up
 from rlml_slam.ekf.slam import EkfSlam
-from rlml_slam.errors import BagError, InputError
+from rlml_slam.errors import BagError, InputError, MapError
 from rlml_slam.params import EkfParameters, Parameters, from_mapping, read_yaml
 from rlml_slam.rlml.slam import Slam
 from rlml_slam.ros.bag import BagReader
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
         print(summary_text(result.name, figures))
         print(f'report: {args.out / "report.html"}')
     if result.problem:
-        print(f'rlml: {result.problem}; the results hold what came before', file=sys.stderr)
+        print(f'rlml: {result.problem}', file=sys.stderr)
         return 1
     return 0
 
@@ -105,7 +105,9 @@ def replay(
             raise BagError(f'{path}: nothing in it could be used: {why}')
         result = collect(slam, log, Path(path).resolve().name, truth or inputs.truth())
         result.inputs = fates(slam.counts, bag.skipped, inputs.topics)
-    result.wall_s, result.problem = wall, problem
+    result.wall_s = wall
+    ended = f'{problem}; the results hold what came before' if problem else ''
+    result.problem = '; '.join(filter(None, (ended, result.problem)))
     return result
 
 
@@ -131,11 +133,16 @@ def _drive(
 
 
 def collect(slam: Slam | EkfSlam, log: FrameLog, name: str, truth: Truth | None) -> Run:
-    """The products of a finished system."""
+    """The products of a finished system; a grid too large to be drawn is ``Run.problem``."""
     stamps, optimized = slam.trajectory()
     path = Trajectory(stamps, optimized)
+    grid, problem = None, ''
+    try:
+        grid = slam.occupancy_grid()
+    except MapError as e:
+        problem = f'{e}; the results hold everything else'
     if isinstance(slam, EkfSlam):
-        return Run(name, log, path, slam.reflectors(), slam.occupancy_grid(), truth=truth)
+        return Run(name, log, path, slam.reflectors(), grid, truth=truth, problem=problem)
     back_end = slam.back_end
     indices = [key.index for key in back_end.keyframes]
     poses = back_end.graph.poses
@@ -146,12 +153,13 @@ def collect(slam: Slam | EkfSlam, log: FrameLog, name: str, truth: Truth | None)
         log,
         path,
         slam.reflectors(),
-        slam.occupancy_grid(),
+        grid,
         np.array(poses[indices]).reshape(-1, 3),
         np.array(ends).reshape(-1, 2, 2),
         sum(not c.accepted for c in tried),
         np.array([u.wall_ms for u in slam.updates]),
         truth=truth,
+        problem=problem,
     )
 
 

@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from rlml_slam.maps import occupancy
 from rlml_slam.params import Parameters
 from rlml_slam.ros import build
 from rlml_slam.ros.bag import BagWriter
@@ -126,6 +128,21 @@ def test_damaged_bag_gives_what_came_before(tmp_path, monkeypatch, capsys):
     assert 'damaged after 600 messages: cut; the results hold what came before' in err
     assert len(read_tum(tmp_path / 'out' / 'trajectory.tum')) > 50
     assert 'damaged' in (tmp_path / 'out' / 'report.html').read_text()
+
+
+@pytest.mark.parametrize('system', ['rlml', 'ekf'])
+def test_grid_too_large_to_be_drawn_costs_only_itself(system, tmp_path, monkeypatch, capsys):
+    # the room has more cells than this, as one with an outlier kilometres away has in truth
+    monkeypatch.setattr(occupancy, 'MAX_CELLS', 1000)
+    arguments = ['--system', system, '--out', str(tmp_path / 'out')]
+    assert main(['replay', str(BAGS / 'room'), *arguments]) == 1
+    said = r'map of \d+ x \d+ cells is too large to be drawn; the results hold everything else'
+    assert re.search(said, capsys.readouterr().err)
+    f = json.loads((tmp_path / 'out' / 'metrics.json').read_text())
+    assert re.search(said, f['problem'])
+    assert f['reflectors_found'] == f['reflectors_true']
+    assert len(read_tum(tmp_path / 'out' / 'trajectory.tum')) == f['scans']
+    assert {p.name for p in (tmp_path / 'out').iterdir()} >= {'map.pgm', 'report.html'}
 
 
 def test_file_cut_short_fails_in_one_line(tmp_path, capsys):
