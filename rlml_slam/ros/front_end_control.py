@@ -21,7 +21,7 @@ from rlml_slam.ros.sensors import LATCHED, RELIABLE, checked
 from rlml_slam.se2 import Array
 from rlml_slam.types import Frame, Observation, Reflectors
 
-RECENT = 1000  # frames that an initialpose may be of: the search for it takes its time
+RECENT = 1000  # frames that an initialpose or a correction may be of: both take their time
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 CLOUD = 'sensor_msgs/msg/PointCloud2'
 
@@ -99,5 +99,11 @@ class FrontEndControl:
                 self.front_end.adopt(said.belief)
 
     def correct(self, msg: Any) -> None:
-        """Take over T_map_local from the back end."""
-        self.front_end.correct(convert.pose_estimate(msg, 'correction').pose)
+        """Take over T_map_local from the back end, if it is of a frame of this session.
+
+        The topic keeps the newest one for who comes later, and the back end may be behind: one of
+        another local frame means nothing in this.
+        """
+        correction = convert.pose_estimate(msg, 'correction')
+        if any(stamp == correction.stamp for stamp, _ in self._recent):
+            self.front_end.correct(correction.pose)

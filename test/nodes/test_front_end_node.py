@@ -93,11 +93,32 @@ def test_detections_are_told_what_became_of_them(live, node):
 def test_correction_moves_the_map_pose_only(live, node):
     feed(node, 2.0)
     correction = np.array([1.0, -2.0, 0.5])
-    node.control.correct(build.pose_with_covariance(make, SECOND, 'map', correction, np.eye(3)))
+    stamp = node.last.stamp
+    node.control.correct(build.pose_with_covariance(make, stamp, 'map', correction, np.eye(3)))
     frame = node.front_end.process(node.last.observation)
     np.testing.assert_allclose(
         frame.T_map_base, se2.compose(correction, frame.T_local_base), atol=1e-12
     )
+
+
+@pytest.mark.parametrize('again', [lambda c: c.restart(), lambda c: c.start_at(start_at_five())])
+def test_correction_of_an_old_session_means_nothing(live, node, again):
+    feed(node, 2.0)
+    stamp, observation = node.last.stamp, node.last.observation
+    again(node.control)
+    late = build.pose_with_covariance(make, stamp, 'map', np.array([1.0, -2.0, 0.5]), np.eye(3))
+    node.control.correct(late)
+    later = dataclasses.replace(observation, stamp=stamp + SECOND)
+    frame = node.control.process(later)
+    np.testing.assert_array_equal(frame.T_map_base, frame.T_local_base)
+    node.control.correct(late)
+    frame = node.control.process(dataclasses.replace(observation, stamp=stamp + 2 * SECOND))
+    np.testing.assert_array_equal(frame.T_map_base, frame.T_local_base)
+
+
+def start_at_five():
+    pose = np.array([5.0, 6.0, 1.0])
+    return build.pose_with_covariance(make, 0, 'map', pose, 0.01 * np.eye(3))
 
 
 def test_initialpose_begins_anew_there(live, node):
