@@ -50,13 +50,15 @@ _MOTION = ('delta', 'cov', 'known', 'bias_gain', 'bias', 'bias_var')
 class Record:
     """A frame without its points and detections, and which of the two it has.
 
-    ``session`` is another one when the front end began anew: so did its local frame.
+    ``session`` is another one when the front end began anew: so did its local frame. A frame that
+    is ``paused`` tells where the robot is, and nothing of the map.
     """
 
     session: int
     frame: Frame
     has_points: bool
     has_detections: bool
+    paused: bool = False
 
 
 def build_record(make: Make, frame: Frame, session: int, local_frame: str) -> Any:
@@ -136,7 +138,7 @@ def read_points(msg: Any, topic: str = 'deskewed_points') -> Array:
 class FrameJoin:
     """Records, points and detections of one stamp become frames again, in the records' order.
 
-    While ``paused``, frames are left out, and their motion is added to the next one's.
+    While ``paused``, so are the frames, and their motion is added to that of the next one.
     ``incomplete`` counts frames whose points or detections did not come.
     """
 
@@ -176,11 +178,9 @@ class FrameJoin:
             self._records.popleft()
             frame = self._whole(head.frame, self._points.get(time), self._associated.get(time))
             self._forget(time)
-            if self.paused:
-                self._pending = frame.observation.motion
-            else:
-                self._pending = None
-                out.append(replace(head, frame=frame))
+            paused = self.paused  # once: a service sets it in a thread of its own
+            self._pending = frame.observation.motion if paused else None
+            out.append(replace(head, frame=frame, paused=paused))
         return out
 
     def _whole(self, frame: Frame, points: Array | None, seen: Associated | None) -> Frame:

@@ -90,7 +90,7 @@ class Mapper:
 
     def _add(self, record: Record) -> None:
         frame = self._newest = record.frame
-        if self.saved is None:
+        if self.saved is None and not record.paused:
             update = self.back_end.add(frame)
             if update is not None:
                 place = self.back_end.graph.poses[update.keyframe, :2]

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from rlml_slam import se2
 from rlml_slam.errors import MapError
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Parameters
@@ -106,6 +107,25 @@ def test_new_session_waits_for_the_odometry_that_there_is(mapper):
 def test_without_any_odometry_odom_is_the_local_frame(mapper):
     give(mapper, 0, pose=(3.0, 2.0, 1.0), odometry=None)
     np.testing.assert_allclose(mapper.transforms[-1][2], np.zeros(3), atol=1e-12)
+
+
+def test_pause_stops_the_map_but_not_map_to_odom(mapper):
+    used = []
+    add = mapper.back_end.add
+    mapper.back_end.add = lambda frame: (used.append(frame.stamp), add(frame))[1]
+    first = give(mapper, 0)
+    moved = give(mapper, 1, pose=(1.0, 0.0, 0.0), paused=True)
+    assert used == [first]
+    stamp, _, T = mapper.transforms[-1]
+    assert stamp == moved
+    np.testing.assert_allclose(se2.compose(T, ODOMETRY), [1.0, 0.0, 0.0], atol=1e-12)
+
+
+def test_pause_before_the_first_frame_is_survived(mapper, ear):
+    give(mapper, 0, paused=True)
+    mapper.publish_map()
+    assert len(mapper.transforms) == 1
+    assert ear.sent['trajectory'][-1].poses == []
 
 
 # --- saving ---------------------------------------------------------------------------------

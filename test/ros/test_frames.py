@@ -150,13 +150,16 @@ def test_lost_part_costs_only_itself():
     assert len(out[0].frame.observation.detections) == 3
 
 
-def test_pause_leaves_frames_out_but_keeps_their_motion():
+def test_pause_marks_frames_and_keeps_their_motion():
     join = FrameJoin()
     join.paused = True
     first, second, third = (a_frame((k + 1) * SECOND, k) for k in range(3))
-    assert send(join, first) == send(join, second) == []
+    paused = send(join, first) + send(join, second)
+    assert [(r.paused, r.frame.stamp) for r in paused] == [(True, SECOND), (True, 2 * SECOND)]
+    np.testing.assert_array_equal(paused[1].frame.T_local_base, second.T_local_base)
     join.paused = False
     (record,) = send(join, third)
+    assert not record.paused
     a, b, c = (f.observation.motion for f in (first, second, third))
     want = compose_motion(compose_motion(a, b), c)
     np.testing.assert_allclose(record.frame.observation.motion.delta, want.delta, atol=1e-12)
