@@ -75,8 +75,8 @@ class Run:
 
     ``trajectory`` is the optimised one; ``keyframes`` (k, 3) are poses in the map and
     ``closures`` (c, 2, 2) the ends of the accepted loop closures there. ``back_end_ms`` (k,)
-    has the cost per keyframe. ``problem`` says in one line what ended the run early, empty if
-    nothing did. ``extra`` goes into metrics.json as it is.
+    has the cost per keyframe. ``problem`` says in one line what ended the run early or what of it
+    is missing, empty without either. ``extra`` goes into metrics.json as it is.
     """
 
     name: str

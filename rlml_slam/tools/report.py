@@ -50,7 +50,7 @@ def report_html(run: Run, figures: Mapping[str, Any], pictures: Mapping[str, byt
         f'<div class="cards">{"".join(_cards(figures))}</div>',
     ]
     if run.problem:
-        parts.append(_section('The run ended early', escape(run.problem), 'problem'))
+        parts.append(_section('The results are not whole', escape(run.problem), 'problem'))
     parts += [_picture(name, pictures[name]) for name in ('map', 'errors') if name in pictures]
     parts.append(_section('Figures', _table(summary_rows(figures))))
     parts += [_picture(name, pictures[name]) for name in ('health', 'timing') if name in pictures]
