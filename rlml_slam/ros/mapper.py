@@ -39,7 +39,7 @@ ADVICE = (
 
 
 class Mapper:
-    """Frames in; correction, map and map to odom out. ``T_map_odom`` (3,) is None at first.
+    """Frames in; correction, map and map to odom out.
 
     While it localizes (``saved`` is there), the graph is left alone: the map that was loaded, or
     made before, is published and never changes.
@@ -56,7 +56,8 @@ class Mapper:
         self.back_end = BackEnd(params)
         self.worker = Worker()
         self.products = MapProducts(node, params.node)
-        self.T_map_odom: Array | None = None
+        # stamp and T_map_odom (3,), None at first; two threads use it, so the two come as one
+        self._odom: tuple[int, Array] | None = None
         self._has_odometry = False  # in any session: odom is the robot's, not the front end's
         self._newest: Frame | None = None
         self._session: int | None = None
@@ -76,7 +77,8 @@ class Mapper:
     @property
     def stamp(self) -> int:
         """Stamp of the newest frame, 1 before the first."""
-        return self._newest.stamp if self._newest is not None else 1
+        newest = self._newest  # once: the worker forgets it when everything begins anew
+        return newest.stamp if newest is not None else 1
 
     def add(self, record: Record) -> None:
         """Give one frame to the worker; another session of the front end begins another map."""
@@ -111,11 +113,13 @@ class Mapper:
         if T_odom_base is not None:
             self._has_odometry = True
         elif self._has_odometry:
+            if self._odom is not None:
+                self._odom = (frame.stamp, self._odom[1])
             return
         else:  # without any odometry, odom is the front end's local frame
             T_odom_base = frame.T_local_base
         T_map_base = se2.compose(self.back_end.T_map_local, frame.T_local_base)
-        self.T_map_odom = se2.compose(T_map_base, se2.inverse(T_odom_base))
+        self._odom = (frame.stamp, se2.compose(T_map_base, se2.inverse(T_odom_base)))
 
     def _send_correction(self) -> None:
         frame, T = self._p.node.map_frame, self.back_end.T_map_local
@@ -147,16 +151,16 @@ class Mapper:
     def send_transform(self) -> None:
         """Publish map to odom at the newest stamp, if it is a new one."""
         self.worker.check()
-        T, stamp = self.T_map_odom, self.stamp
-        if T is not None and stamp != self._sent:
+        odom = self._odom  # once: the worker may put another one there
+        if odom is not None and odom[0] != self._sent:
             n = self._p.node
-            self._tf.publish(stamp, (n.map_frame, n.odom_frame), T)
-            self._sent = stamp
+            self._tf.publish(odom[0], (n.map_frame, n.odom_frame), odom[1])
+            self._sent = odom[0]
 
     def _forget(self) -> None:
         self.back_end.reset()
         self.products.restart()
-        self._newest, self.T_map_odom = None, None
+        self._newest, self._odom = None, None
         self._send_correction()
 
     def start_at(self, pose: Array) -> None:

@@ -109,6 +109,22 @@ def test_without_any_odometry_odom_is_the_local_frame(mapper):
     np.testing.assert_allclose(mapper.transforms[-1][2], np.zeros(3), atol=1e-12)
 
 
+def test_map_to_odom_has_the_stamp_of_its_frame(mapper, monkeypatch):
+    """The timer may come while the back end works on a frame: what it sends is the last one's."""
+    first = give(mapper, 0)
+
+    def optimize(frame):
+        mapper.send_transform()
+        mapper.back_end.T_map_local = np.array([1.0, 0.0, 0.0])
+
+    monkeypatch.setattr(mapper.back_end, 'add', optimize)
+    second = give(mapper, 1)
+    (told, _, before), (stamp, _, after) = mapper.transforms
+    assert (told, stamp) == (first, second)
+    np.testing.assert_allclose(se2.compose(before, ODOMETRY), np.zeros(3), atol=1e-12)
+    np.testing.assert_allclose(se2.compose(after, ODOMETRY), [1.0, 0.0, 0.0], atol=1e-12)
+
+
 def test_pause_stops_the_map_but_not_map_to_odom(mapper):
     used = []
     add = mapper.back_end.add
