@@ -25,7 +25,6 @@ from rlml_slam.simulation.robot import SECOND
 from rlml_slam.simulation.simulation import START, STEP, Simulation
 from rlml_slam.simulation.world_file import load_world
 
-SETTLE = 0.5  # [s] from the last subscriber to the begin of time
 LINGER = 0.5  # [s] between the last message and the end of the process
 BATCH = 20  # steps at most in one tick, so that a rate beyond reach does not shut out the rest
 
@@ -42,7 +41,6 @@ class SimulatorNode(Node):
         self._wall = wall
         self._pace: Pace | None = None
         self._finished: float | None = None
-        self._heard: float | None = None
         if n.drive == 'cmd_vel':
             self.create_subscription(Twist, 'cmd_vel', self.on_cmd_vel, 10)
         warm_up.compile_loaded()
@@ -63,13 +61,7 @@ class SimulatorNode(Node):
         n, now = self.parameters.node, self._wall()
         if self._pace is None:
             self._topics.publish_time(START)
-            if self._topics.listeners('scan') < n.wait_for_subscribers:
-                self._heard = None
-                return
-            # a publisher knows its subscribers before all of them know it: the first scan would go
-            if self._heard is None:
-                self._heard = now
-            if n.wait_for_subscribers and now - self._heard < SETTLE:
+            if not self._topics.is_heard('scan', n.wait_for_subscribers, now):
                 return
             self._pace = Pace(n.rate, now)
         for _ in range(BATCH):

@@ -30,6 +30,7 @@ TOPICS = {
 SENSOR_TOPICS = ('odom', 'imu', 'scan', 'reflectors')
 # latched: where the reflectors really are, in the map frame
 TRUE_REFLECTORS = 'ground_truth_reflectors'
+SETTLE = 0.5  # [s] from the last subscriber to the begin of time
 
 
 class SimulatedMessages:
@@ -115,6 +116,7 @@ class SimulatedTopics:
     def __init__(self, node: Any, simulation: Simulation) -> None:
         from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+        self._heard: float | None = None
         self._messages = SimulatedMessages(make_rclpy, simulation.parameters)
         self._publishers: dict[str, Any] = {}
         self.published = dict.fromkeys(TOPICS, 0)
@@ -141,9 +143,18 @@ class SimulatedTopics:
             static = build.tf_message(make_rclpy, [self._messages.laser_transform()])
             node.create_publisher(kind, '/tf_static', latched).publish(static)
 
-    def listeners(self, topic: str) -> int:
-        """Number of subscriptions that a topic has."""
-        return int(self._publishers[topic].get_subscription_count())
+    def is_heard(self, topic: str, by: int, now: float) -> bool:
+        """Whether a topic has had ``by`` subscriptions for SETTLE, at the wall's time [s].
+
+        A publisher knows its subscribers before all of them know it: the first scan would be lost.
+        """
+        if by == 0:
+            return True
+        if self._publishers[topic].get_subscription_count() < by:
+            self._heard = None
+            return False
+        self._heard = now if self._heard is None else self._heard
+        return now - self._heard >= SETTLE
 
     def publish_time(self, stamp: int) -> None:
         """Say on /clock what time it is."""
