@@ -15,6 +15,7 @@ from rlml_slam.params import Node
 from rlml_slam.ros import build
 from rlml_slam.ros.map_folder import MapFolder, SavedMap
 from rlml_slam.ros.messages import make_rclpy
+from rlml_slam.ros.services import refuse_map
 
 
 class EkfServices:
@@ -57,13 +58,7 @@ class EkfServices:
         try:
             self.saved = self._folder.load(request.map_url or self._p.map_file_name)
         except RlmlError as e:
-            self._node.get_logger().warning(f'load_map: {e}')
-            missing = 'cannot be read' in str(e)
-            response.result = (
-                LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
-                if missing
-                else LoadMap.Response.RESULT_UNDEFINED_FAILURE
-            )
+            refuse_map(self._node, response, e)
             return response
         self._begin(self.saved)
         response.result = LoadMap.Response.RESULT_SUCCESS

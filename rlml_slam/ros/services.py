@@ -94,13 +94,7 @@ class MapServices:
         try:
             saved = self._mapper.load(request.map_url or self._p.node.map_file_name)
         except RlmlError as e:
-            self._node.get_logger().warning(f'load_map: {e}')
-            missing = 'cannot be read' in str(e)
-            response.result = (
-                LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
-                if missing
-                else LoadMap.Response.RESULT_UNDEFINED_FAILURE
-            )
+            refuse_map(self._node, response, e)
             return
         response.result = LoadMap.Response.RESULT_SUCCESS
         if saved.grid is not None:
@@ -116,3 +110,14 @@ class MapServices:
             response.success = True
         except RlmlError as e:
             response.success, response.message = False, str(e)
+
+
+def refuse_map(node: Any, response: Any, why: RlmlError) -> None:
+    """Answer load_map where a map cannot be had; the answer has no text, so the log tells."""
+    node.get_logger().warning(f'load_map: {why}')
+    missing = 'cannot be read' in str(why)
+    response.result = (
+        LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
+        if missing
+        else LoadMap.Response.RESULT_UNDEFINED_FAILURE
+    )

@@ -15,6 +15,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from rlml_slam import se2
 from rlml_slam.maps.occupancy import OccupancyGrid
@@ -262,6 +263,9 @@ def timing_picture(run: Run) -> bytes:
         bins = np.geomspace(0.95 * low, 1.05 * high + 1e-3, 60)
         axes.hist(shown, bins=bins, color=colour, alpha=0.85)
         axes.set_xscale('log')
+        # plain numbers at 1, 2, 5: by default, powers are written over each other
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.xaxis.set_major_formatter('{x:g}')
         axes.set_title(title, fontsize=9, color=INK, loc='left')
         for share, style in ((50, '-'), (99, '--')):
