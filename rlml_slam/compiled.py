@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.extending import intrinsic
 
 F = TypeVar('F', bound=Callable[..., Any])
 
@@ -23,3 +24,20 @@ def part(function: F) -> F:
     """A kernel that kernels alone call: without an entry from Python it compiles much faster."""
     options: dict[str, Any] = {'no_cpython_wrapper': True, 'no_cfunc_wrapper': True}
     return cast(F, numba.njit(cache=True, error_model='numpy', nogil=True, **options)(function))
+
+
+def _load_word(_typing: Any, array: Any, _at: Any) -> Any:
+    """Typing and code of load8: one load that need not be aligned."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        word = context.get_value_type(signature.return_type)
+        place = builder.bitcast(builder.gep(data, [args[1]]), word.as_pointer())
+        return builder.load(place, align=1)
+
+    return numba.uint64(array, numba.int64), generate
+
+
+# load8(bytes, at): the eight bytes of a contiguous uint8 array from ``at`` on as one word, the
+# first one lowest (little-endian); for kernels only, and not checked
+load8: Any = intrinsic(_load_word)

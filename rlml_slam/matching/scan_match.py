@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rlml_slam import params
 from rlml_slam.compiled import kernel
-from rlml_slam.matching import search, surfaces, thinning
+from rlml_slam.matching import surfaces, thinning, window_search
 from rlml_slam.matching.submap import P_MIN, STEP, Submap
 from rlml_slam.se2 import Array, wrap
 
@@ -386,7 +386,7 @@ class _Solve:
     def found(self, half_width: float, half_angle: float, stride: int) -> Array:
         """The best pose of a window search around the prior."""
         p = self.p
-        return search.window(
+        return window_search.window(
             self.submap, self.points, self.prior, half_width, half_angle, self.whitening,
             p.prior_scale, p.search_share, stride,
         ).pose  # fmt: skip
@@ -407,8 +407,9 @@ class _Solve:
     def merit(self, result: ScanMatchResult) -> float:
         """Score less what the prior has against the pose, as in the search."""
         x, y, turn = result.pose - self.prior
-        loss = search.prior_loss(x, y, float(wrap(turn)), self.whitening, self.p.prior_scale)
-        return result.score - self.p.search_share * loss
+        p, turn = self.p, float(wrap(turn))
+        loss = window_search.prior_loss(x, y, turn, self.whitening, p.prior_scale)
+        return result.score - p.search_share * loss
 
 
 def warm_up() -> None:

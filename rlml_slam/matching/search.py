@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Correlative search: exhaustive in a small window, branch and bound in a large one."""
+"""Correlative search in a large window: branch and bound (Hess et al. 2016, section V-B).
+
+A block of 2^h x 2^h shifts is bounded by the largest cell that each end point can meet in it.
+Blocks are divided by 8 x 8, not by 2 x 2: eight neighbours lie side by side in memory and are
+summed up as one word, so 64 bounds cost little more than one.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.compiled import kernel
+from rlml_slam.compiled import kernel, load8, part
 from rlml_slam.errors import InputError
-from rlml_slam.matching.submap import LEVELS, P_MAX, P_MIN, Submap
+from rlml_slam.matching.submap import P_MAX, P_MIN, Submap
 from rlml_slam.se2 import Array, wrap
+
+BRANCH, BITS = 8, 3  # a block is divided into BRANCH x BRANCH = 2^BITS x 2^BITS
+BYTES = 0x00FF00FF00FF00FF  # every second byte of a word, so that sums have 16 bits each
+ROOT = BRANCH * BRANCH  # side of the largest blocks
+BATCH = 1024  # of them that are divided before the best parts are searched
+NUM_LEVELS = 3  # cells, blocks of side BRANCH, blocks of side ROOT
+CARRY_FREE = 256  # bytes that can be summed in 16 bits
 
 
 @dataclass(frozen=True)
@@ -21,118 +33,6 @@ class Candidate:
 
     pose: Array
     score: float
-
-
-def window(
-    submap: Submap,
-    points: Array,
-    pose: Array,
-    half_width: float,
-    half_angle: float,
-    whitening: Array | None = None,
-    prior_scale: float = 3.0,
-    share: float = 0.05,
-    stride: int = 1,
-) -> Candidate:
-    """The best pose on a lattice around ``pose`` (3,), ties to the nearest.
-
-    The objective is the mean of M less prior_loss(): where the scan does not tell (along a
-    corridor), the prior does. Without ``whitening`` (3, 3) it is the scan alone.
-
-    ``points`` (n, 2) in the base frame. Shifts are multiples of ``stride`` cells; the angular
-    step moves the mean end point by as much.
-    """
-    spacing = stride * submap.resolution
-    n = round(half_width / spacing)
-    reach = float(np.mean(np.hypot(points[:, 0], points[:, 1]))) if len(points) else 1.0
-    step = min(max(spacing / max(reach, spacing), 0.005 * stride), 0.05 * stride)
-    m = math.ceil(half_angle / step)
-    step = half_angle / m if m else 0.0
-    j, i = submap.corner
-    x, y, theta, total = search_window(
-        submap.values, float(j), float(i), 1.0 / submap.resolution, points, pose, n, stride, m,
-        step, np.zeros((3, 3)) if whitening is None else whitening, prior_scale,
-        share * len(points) * LEVELS / (P_MAX - P_MIN),
-    )  # fmt: skip
-    score = P_MIN + (P_MAX - P_MIN) * total / (LEVELS * max(len(points), 1))
-    return Candidate(np.array([x, y, float(wrap(theta))]), score)
-
-
-@kernel
-def prior_loss(x: float, y: float, turn: float, whitening: Array, prior_scale: float) -> float:
-    """Sum over u = whitening @ (x, y, turn) of v^2 / (1 + v^2), v = u_k / prior_scale."""
-    loss = 0.0
-    for h in range(3):
-        u = (whitening[h, 0] * x + whitening[h, 1] * y + whitening[h, 2] * turn) / prior_scale
-        loss += u * u / (1.0 + u * u)
-    return loss
-
-
-@kernel
-def search_window(
-    values: NDArray[np.uint16],
-    corner_j: float,
-    corner_i: float,
-    scale: float,
-    points: Array,
-    pose: Array,
-    n: int,
-    stride: int,
-    m: int,
-    step: float,
-    whitening: Array,
-    prior_scale: float,
-    unit: float,
-) -> tuple[float, float, float, int]:
-    """Exhaustive sum of cell values over (2 n + 1)^2 shifts and 2 m + 1 angles.
-
-    ``unit`` is the sum of cell values that a component far from the prior costs.
-    """
-    width = 2 * n + 1
-    sums = np.empty((width, width), dtype=np.int64)
-    best, best_distance = -np.inf, 0.0
-    best_a = best_j = best_i = best_sum = 0
-    for a in range(-m, m + 1):
-        c, s = np.cos(pose[2] + a * step), np.sin(pose[2] + a * step)
-        sums[:] = 0
-        for k in range(len(points)):
-            px, py = points[k, 0], points[k, 1]
-            u = (pose[0] + c * px - s * py) * scale - corner_j
-            v = (pose[1] + s * px + c * py) * scale - corner_i
-            add_block(values, int(np.floor(u)) - n * stride, int(np.floor(v)) - n * stride,
-                      stride, sums)  # fmt: skip
-        for r in range(width):
-            for q in range(width):
-                di, dj = (r - n) * stride, (q - n) * stride
-                distance = di * di + dj * dj + a * a
-                loss = prior_loss(dj / scale, di / scale, a * step, whitening, prior_scale)
-                value = sums[r, q] - unit * loss
-                if value > best or (value == best and distance < best_distance):
-                    best, best_distance, best_sum = value, distance, sums[r, q]
-                    best_a, best_j, best_i = a, dj, di
-    return pose[0] + best_j / scale, pose[1] + best_i / scale, pose[2] + best_a * step, best_sum
-
-
-@kernel
-def add_block(
-    values: NDArray[np.uint16], j: int, i: int, stride: int, sums: NDArray[np.int64]
-) -> None:
-    """Add the cells (i, j), (i, j + stride) ... of a square to ``sums``; 0 outside the grid."""
-    rows, columns = values.shape
-    width = len(sums)
-    reach = (width - 1) * stride
-    if j >= 0 and i >= 0 and j + reach < columns and i + reach < rows:
-        for r in range(width):
-            for q in range(width):
-                sums[r, q] += values[i + r * stride, j + q * stride]
-        return
-    for r in range(width):
-        y = i + r * stride
-        if 0 <= y < rows:
-            for q in range(width):
-                x = j + q * stride
-                if 0 <= x < columns:
-                    sums[r, q] += values[y, x]
 
 
 @dataclass(frozen=True)
@@ -145,26 +45,41 @@ class WideResult:
 
 
 class Pyramid:
-    """Max-pooled grids of one submap for branch and bound (Hess et al. 2016, section V-B).
+    """Max-pooled grids of one submap for branch and bound.
 
-    Level h at [i, j] is the largest value of the 2^h x 2^h cells from (i, j) on, quantised to a
-    byte (0 = unknown or P_MIN, 255 = P_MAX). All levels have the resolution of the submap and
-    are padded by 2^depth on the low sides, so that a block that begins outside is bounded too.
+    Level k bounds blocks of side 8^k: its value at [i, j] is the largest of the side x side cells
+    from (i, j) on, quantised to a byte (0 = unknown or P_MIN, 255 = P_MAX). ``levels`` (3, rows *
+    columns) are padded by a block of the top level on each side, so that a block which begins or
+    ends outside is bounded too; in a row, the columns of neighbouring blocks are side by side
+    (see :func:`offset`).
     """
 
-    def __init__(self, submap: Submap, depth: int = 6) -> None:
+    def __init__(self, submap: Submap) -> None:
         self.resolution = submap.resolution
         self.version = submap.version
-        self.depth = depth
-        pad = 2**depth
-        self.corner = (submap.corner[0] - pad, submap.corner[1] - pad)
-        base = np.zeros((submap.values.shape[0] + pad, submap.values.shape[1] + pad), np.uint8)
+        self.corner = (submap.corner[0] - ROOT, submap.corner[1] - ROOT)
+        height, width = submap.values.shape
+        self.rows, self.columns = height + 2 * ROOT, (-(-width // ROOT) + 2) * ROOT
+        grid = np.zeros((self.rows, self.columns), np.uint8)
         # values reach LEVELS = 2^15 - 1; 0 and 1 (unknown, P_MIN) become 0
-        base[pad:, pad:] = np.minimum(submap.values >> 7, 255)
-        levels = [base]
-        for h in range(depth):
-            levels.append(pool(levels[-1], 2**h))
-        self.levels = np.stack(levels)
+        grid[ROOT : ROOT + height, ROOT : ROOT + width] = np.minimum(submap.values >> 7, 255)
+        self.levels = np.empty((NUM_LEVELS, grid.size), np.uint8)
+        self.levels[0] = grid.ravel()
+        for k in range(1, NUM_LEVELS):
+            side = BRANCH**k
+            for h in range(BITS):
+                grid = pool(grid, (side // BRANCH) << h)
+            self.levels[k] = grid.reshape(self.rows, -1, side).swapaxes(1, 2).ravel()
+
+    def bound(self, k: int, i: int, j: int) -> int:
+        """The value of level k at row i and column j."""
+        return int(self.levels[k, offset(self.columns, k * BITS, i, j)])
+
+
+@kernel
+def offset(columns: int, h: int, i: int, j: int) -> int:
+    """Where row i, column j of the level with blocks of side 2^h is."""
+    return i * columns + (j & ((1 << h) - 1)) * (columns >> h) + (j >> h)
 
 
 def pool(grid: NDArray[np.uint8], shift: int) -> NDArray[np.uint8]:
@@ -193,7 +108,7 @@ def wide(
     Shifts are whole cells within ``half_width`` [m], angles steps that move the far end points
     by about a cell within ``half_angle`` (>= pi: all around). The second candidate differs by
     more than ``separation`` [m] in x or y or by more than ``separation_angle``, and is
-    looked for down to ``second_share`` of the best sum. Candidates below ``min_score`` are None.
+    looked for down to ``second_share`` of the best score. Candidates below ``min_score`` are None.
     Raises InputError for no points.
     """
     if not len(points):
@@ -201,13 +116,16 @@ def wide(
     points = np.ascontiguousarray(points, dtype=np.float64)
     thetas = angles(points, pyramid.resolution, half_angle)
     n = round(half_width / pyramid.resolution)
-    threshold = math.ceil((min_score - P_MIN) / (P_MAX - P_MIN) * 255.0 * len(points)) - 1
+    unit = 255.0 * len(points) / (P_MAX - P_MIN)  # sum of cells per score
+    threshold = math.ceil((min_score - P_MIN) * unit) - 1
+    least = np.array([(second_share - 1.0) * P_MIN * unit, second_share])
     found = np.empty((2, 4), dtype=np.int64)
     turns = separation_angle / (thetas[1] - thetas[0]) if len(thetas) > 1 else math.inf
     evaluated = branch_and_bound(
-        pyramid.levels, pyramid.corner[0], pyramid.corner[1], 1.0 / pyramid.resolution, points,
-        np.ascontiguousarray(pose, dtype=np.float64), thetas, n, max(threshold, -1),
-        separation / pyramid.resolution, turns, half_angle >= math.pi, second_share, found,
+        pyramid.levels, pyramid.rows, pyramid.columns, pyramid.corner[0], pyramid.corner[1],
+        1.0 / pyramid.resolution, points, np.ascontiguousarray(pose, dtype=np.float64), thetas, n,
+        max(threshold, -1), separation / pyramid.resolution, turns, half_angle >= math.pi, least,
+        found,
     )  # fmt: skip
 
     def candidate(row: NDArray[np.int64]) -> Candidate | None:
@@ -215,7 +133,7 @@ def wide(
             return None
         shift = row[2:4] * pyramid.resolution
         at = (pose[0] + shift[0], pose[1] + shift[1], float(wrap(pose[2] + thetas[row[1]])))
-        score = P_MIN + (P_MAX - P_MIN) * float(row[0]) / (255.0 * len(points))
+        score = P_MIN + float(row[0]) / unit
         return Candidate(np.array(at), score)
 
     return WideResult(candidate(found[0]), candidate(found[1]), evaluated)
@@ -235,6 +153,8 @@ def angles(points: Array, resolution: float, half_angle: float) -> Array:
 @kernel
 def branch_and_bound(
     levels: NDArray[np.uint8],
+    rows: int,
+    columns: int,
     corner_j: int,
     corner_i: int,
     scale: float,
@@ -246,14 +166,82 @@ def branch_and_bound(
     separation: float,
     separation_turns: float,
     circular: bool,
-    second_share: float,
+    least: Array,
     found: NDArray[np.int64],
 ) -> int:
     """Rows of ``found``: (sum, angle index, column shift, row shift) of best and second, -1 none.
 
-    Returns the number of poses and blocks evaluated.
+    ``least`` (2,) = (a, b): the second has to have more than a + b * (sum of the best). Returns
+    the number of poses and blocks evaluated.
     """
-    depth = len(levels) - 1
+    cells = cells_of(points, pose, thetas, scale, corner_j, corner_i)
+    tiles = (2 * n + ROOT) // ROOT
+    roots = np.empty(len(thetas) * tiles * tiles, dtype=np.int64)
+    for m in range(len(roots)):
+        tile, a = divmod(m, len(thetas))
+        i, j = divmod(tile, tiles)
+        roots[m] = block_sum(levels[2], rows, columns, cells[a], j * ROOT - n, i * ROOT - n)
+    order = np.argsort(-roots, kind='mergesort')
+    evaluated = len(roots)
+    blocks = np.empty((min(BATCH, len(roots)) * BRANCH * BRANCH, 4), dtype=np.int32)
+    sums = np.empty(BRANCH * BRANCH, dtype=np.int64)
+    offsets = np.empty(len(points), dtype=np.int64)
+    count = 0
+    for rank in range(2):
+        found[rank] = -1
+        best = threshold
+        if rank == 1:
+            if found[0, 0] < 0:
+                break
+            best = max(threshold, int(np.floor(least[0] + least[1] * found[0, 0])))
+        for start in range(0, len(roots), BATCH):
+            if rank == 0 or len(roots) > BATCH:  # else those of the first search are all there
+                count = 0
+                for m in order[start : start + BATCH]:
+                    if roots[m] <= best:
+                        break
+                    tile, a = divmod(int(m), len(thetas))
+                    i, j = tile // tiles * ROOT - n, tile % tiles * ROOT - n
+                    evaluated += divide(
+                        levels[1], rows, columns, BITS, cells[a], j, i, n, offsets, sums
+                    )
+                    for k in range(len(sums)):
+                        if sums[k] > best:
+                            blocks[count, 0], blocks[count, 1] = sums[k], a
+                            blocks[count, 2] = j + k % BRANCH * BRANCH
+                            blocks[count, 3] = i + k // BRANCH * BRANCH
+                            count += 1
+            for b in np.argsort(-blocks[:count, 0], kind='mergesort'):
+                if blocks[b, 0] <= best:
+                    break
+                a, j, i = int(blocks[b, 1]), int(blocks[b, 2]), int(blocks[b, 3])
+                if rank == 1 and excluded(
+                    found[0], a, j, i, BRANCH - 1, len(thetas), separation, separation_turns,
+                    circular,
+                ):  # fmt: skip
+                    continue
+                evaluated += divide(levels[0], rows, columns, 0, cells[a], j, i, n, offsets, sums)
+                for k in range(len(sums)):
+                    q, r = j + k % BRANCH, i + k // BRANCH
+                    if sums[k] <= best or (
+                        rank == 1
+                        and excluded(
+                            found[0], a, q, r, 0, len(thetas), separation, separation_turns,
+                            circular,
+                        )
+                    ):  # fmt: skip
+                        continue
+                    best = sums[k]
+                    found[rank, 0], found[rank, 1] = best, a
+                    found[rank, 2], found[rank, 3] = q, r
+    return evaluated
+
+
+@part
+def cells_of(
+    points: Array, pose: Array, thetas: Array, scale: float, corner_j: int, corner_i: int
+) -> NDArray[np.int32]:
+    """Cells (angles, n, 2) of the points at each angle, (column, row) of the padded grid."""
     cells = np.empty((len(thetas), len(points), 2), dtype=np.int32)
     for a in range(len(thetas)):
         c, s = np.cos(pose[2] + thetas[a]), np.sin(pose[2] + thetas[a])
@@ -261,90 +249,74 @@ def branch_and_bound(
             px, py = points[k, 0], points[k, 1]
             cells[a, k, 0] = int(np.floor((pose[0] + c * px - s * py) * scale)) - corner_j
             cells[a, k, 1] = int(np.floor((pose[1] + s * px + c * py) * scale)) - corner_i
-    size = 1 << depth
-    tiles = (2 * n + size) // size
-    num_roots = len(thetas) * tiles * tiles
-    sums = np.empty(num_roots, dtype=np.int64)
-    m = 0
-    for a in range(len(thetas)):
-        for i in range(tiles):
-            for j in range(tiles):
-                sums[m] = block_sum(levels[depth], cells[a], j * size - n, i * size - n)
-                m += 1
-    order = np.argsort(-sums, kind='mergesort')
-    evaluated = num_roots
-    stack = np.empty((4 * depth + 4, 5), dtype=np.int64)
-    child = np.empty((4, 3), dtype=np.int64)
-    for rank in range(2):
-        found[rank] = -1
-        if rank == 0:
-            best = threshold
-        elif found[0, 0] >= 0:
-            best = max(threshold, int(second_share * found[0, 0]))
-        else:
-            break
-        for number in order:
-            root = int(number)
-            if sums[root] <= best:
-                break
-            a, rest = divmod(root, tiles * tiles)
-            i, j = divmod(rest, tiles)
-            stack[0, 0], stack[0, 1], stack[0, 2] = sums[root], a, j * size - n
-            stack[0, 3], stack[0, 4] = i * size - n, depth
-            top = 1
-            while top > 0:
-                top -= 1
-                total, j, i, h = stack[top, 0], stack[top, 2], stack[top, 3], stack[top, 4]
-                if total <= best:
-                    continue
-                if rank == 1 and excluded(
-                    found[0], a, j, i, (1 << h) - 1, len(thetas), separation, separation_turns,
-                    circular,
-                ):  # fmt: skip
-                    continue
-                if h == 0:
-                    best = total
-                    found[rank, 0], found[rank, 1] = total, a
-                    found[rank, 2], found[rank, 3] = j, i
-                    continue
-                half = 1 << (h - 1)
-                count = 0
-                for q in range(4):
-                    cj, ci = j + (q & 1) * half, i + (q >> 1) * half
-                    if cj > n or ci > n:
-                        continue
-                    value = block_sum(levels[h - 1], cells[a], cj, ci)
-                    evaluated += 1
-                    if value <= best:
-                        continue
-                    # ascending, so that the largest is on top; equal ones keep lattice order
-                    at = count
-                    while at > 0 and child[at - 1, 0] >= value:
-                        child[at] = child[at - 1]
-                        at -= 1
-                    child[at, 0], child[at, 1], child[at, 2] = value, cj, ci
-                    count += 1
-                for q in range(count):
-                    stack[top, 0], stack[top, 1] = child[q, 0], a
-                    stack[top, 2], stack[top, 3] = child[q, 1], child[q, 2]
-                    stack[top, 4] = h - 1
-                    top += 1
-    return evaluated
+    return cells
 
 
-@kernel
-def block_sum(level: NDArray[np.uint8], cells: NDArray[np.int32], j: int, i: int) -> int:
-    """Sum over the points of the level's value at their cells shifted by (j, i)."""
-    rows, columns = level.shape
+@part
+def block_sum(
+    level: NDArray[np.uint8],
+    rows: int,
+    columns: int,
+    cells: NDArray[np.int32],
+    j: int,
+    i: int,
+) -> int:
+    """Sum over the points of the top level's value at their cells shifted by (j, i)."""
     total = 0
     for k in range(len(cells)):
         q, r = cells[k, 0] + j, cells[k, 1] + i
         if 0 <= q < columns and 0 <= r < rows:
-            total += level[r, q]
+            total += level[offset(columns, 2 * BITS, r, q)]
     return total
 
 
-@kernel
+@part
+def divide(
+    level: NDArray[np.uint8],
+    rows: int,
+    columns: int,
+    h: int,
+    cells: NDArray[np.int32],
+    j: int,
+    i: int,
+    n: int,
+    offsets: NDArray[np.int64],
+    sums: NDArray[np.int64],
+) -> int:
+    """Block sums (64,) of the 8 x 8 blocks of side 2^h from shift (j, i) on; how many there are.
+
+    Those that begin beyond the window, at a shift of more than ``n``, get -1.
+    """
+    inside = 0
+    reach = (BRANCH - 1) << h
+    for k in range(len(cells)):
+        q, r = cells[k, 0] + j, cells[k, 1] + i
+        if 0 <= q < columns - reach and 0 <= r < rows - reach:
+            offsets[inside] = offset(columns, h, r, q)
+            inside += 1
+    sums[:] = 0
+    width = min(((n - j) >> h) + 1, BRANCH)
+    height = min(((n - i) >> h) + 1, BRANCH)
+    for r in range(height):
+        down = (r << h) * columns
+        for first in range(0, inside, CARRY_FREE):
+            even = odd = np.uint64(0)
+            for k in range(first, min(first + CARRY_FREE, inside)):
+                word = load8(level, offsets[k] + down)
+                even += word & np.uint64(BYTES)
+                odd += (word >> np.uint64(8)) & np.uint64(BYTES)
+            for q in range(0, BRANCH, 2):
+                shift = np.uint64(8 * q)
+                sums[BRANCH * r + q] += np.int64((even >> shift) & np.uint64(0xFFFF))
+                sums[BRANCH * r + q + 1] += np.int64((odd >> shift) & np.uint64(0xFFFF))
+    for r in range(BRANCH):
+        for q in range(BRANCH):
+            if r >= height or q >= width:
+                sums[BRANCH * r + q] = -1
+    return width * height
+
+
+@part
 def excluded(
     best: NDArray[np.int64],
     a: int,
@@ -372,5 +344,4 @@ def warm_up() -> None:
     submap = Submap()
     points = np.array([[1.0, 0.5], [-0.5, 1.0], [0.3, -0.8]])
     submap.insert(points, np.zeros(2))
-    window(submap, points, np.zeros(3), 0.1, 0.1)
-    wide(Pyramid(submap, 3), points, np.zeros(3), 0.2, 0.1)
+    wide(Pyramid(submap), points, np.zeros(3), 0.2, 0.1)

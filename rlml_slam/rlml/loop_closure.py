@@ -167,8 +167,9 @@ class ScanGraph:
             return Closure(i, j, guess, score, -1, why)
 
         result = search.wide(
-            self._pyramid(k), points, guess, p.search_window, p.search_angle, p.min_score
-        )
+            self._pyramid(k), points, guess, p.search_window, p.search_angle, p.min_score,
+            second_share=p.max_second,
+        )  # fmt: skip
         if result.best is None:
             return rejected('no place in the window fits')
         if result.second is not None and result.second.score > p.max_second * result.best.score:
