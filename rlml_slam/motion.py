@@ -241,7 +241,7 @@ class MotionBuffer:
                 weight += 1.0 / (c.bias_sigma**2 * scale)
                 weighted += c.bias / (c.bias_sigma**2 * scale)
         out = integrate(*rows)
-        out[0, 2] = se2.wrap(out[0, 2])
+        out[0, 2] = se2.wrapped(out[0, 2])
         bias = weighted / weight if weight > 0.0 else 0.0
         variance = 1.0 / weight if weight > 0.0 else np.inf
         return Motion(out[0], out[1:4], known, out[4], bias, variance)

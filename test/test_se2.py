@@ -48,6 +48,30 @@ def test_angle_is_wrapped_to_half_open_interval():
     assert np.isnan(se2.wrap([np.nan, np.inf])).all()
 
 
+@pytest.mark.parametrize('turn', [*ANGLES, np.nan])
+@pytest.mark.parametrize('f', [se2.inverse, se2.exp, se2.log])
+def test_one_pose_is_like_one_of_many(f, turn):
+    a = np.array([0.3, -1.2, turn])
+    np.testing.assert_allclose(f(a), f(a[None])[0], atol=1e-14)
+
+
+@pytest.mark.parametrize('turn', [*ANGLES, np.nan])
+@pytest.mark.parametrize(
+    'f', [se2.compose, se2.between, se2.compose_jacobians, se2.between_jacobians]
+)
+def test_one_pair_is_like_one_of_many(f, turn):
+    a, b = np.array([0.3, -1.2, turn]), poses(())
+    one, many = f(a, b), f(a[None], b[None])
+    np.testing.assert_allclose(one, np.asarray(many).reshape(np.shape(one)), atol=1e-14)
+
+
+@pytest.mark.parametrize('turn', [*ANGLES, np.nan])
+def test_points_of_one_frame_are_like_those_of_many(turn):
+    a, points = np.array([0.3, -1.2, turn]), poses((7,))[:, :2]
+    np.testing.assert_allclose(se2.transform(a, points), se2.transform(a[None], points)[0])
+    np.testing.assert_allclose(se2.rotation(turn), se2.rotation([turn])[0], atol=1e-16)
+
+
 @pytest.mark.parametrize('shape', SHAPES)
 def test_group_laws_hold_over_any_leading_shape(shape):
     a, b, c = (poses(shape, seed) for seed in (1, 2, 3))

@@ -18,7 +18,7 @@ from rlml_slam import params
 from rlml_slam.compiled import kernel
 from rlml_slam.matching import surfaces, thinning, window_search
 from rlml_slam.matching.submap import P_MIN, STEP, Submap
-from rlml_slam.se2 import Array, wrap
+from rlml_slam.se2 import Array, wrapped
 
 WIDE_STRIDE = 2  # cells between the shifts of the wide search; a wall is about as thick
 UNKNOWN = 0.1  # M of an unknown cell; like free space, so that a wall is a ridge from both sides
@@ -400,14 +400,14 @@ class _Solve:
             p.max_iterations, out,
         )  # fmt: skip
         return ScanMatchResult(
-            np.array([x, y, float(wrap(theta))]), symmetric(out[4:10]) / p.sigma**2,
+            np.array([x, y, wrapped(theta)]), symmetric(out[4:10]) / p.sigma**2,
             float(out[10]) / len(self.points), iterations, converged, weight,
         )  # fmt: skip
 
     def merit(self, result: ScanMatchResult) -> float:
         """Score less what the prior has against the pose, as in the search."""
         x, y, turn = result.pose - self.prior
-        p, turn = self.p, float(wrap(turn))
+        p, turn = self.p, wrapped(turn)
         loss = window_search.prior_loss(x, y, turn, self.whitening, p.prior_scale)
         return result.score - p.search_share * loss
 

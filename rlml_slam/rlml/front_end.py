@@ -294,7 +294,7 @@ class FrontEnd:
         at_match = se2.between_jacobians(anchor, se2.compose(anchor, found.pose))
         H = root @ np.hstack([at_match[1], at_match[0]])
         offset = found.pose - prior
-        offset[2] = se2.wrap(offset[2])
+        offset[2] = se2.wrapped(offset[2])
         v = root @ offset
         surprise = float(v @ np.linalg.solve(root @ cov @ root.T + np.eye(len(v)), v))
         if surprise > p.prior_scale**2 * max(len(v), 1):

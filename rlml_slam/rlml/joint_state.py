@@ -88,7 +88,7 @@ class JointState:
         if error * error < 16.0 * S:
             gain = self.P[:, BIAS] / S
             self.x += gain * error
-            self.x[2] = se2.wrap(self.x[2])
+            self.x[2] = se2.wrapped(self.x[2])
             self.P -= np.outer(gain, gain) * S
 
     def widen(self, cov: Array) -> None:
@@ -185,7 +185,7 @@ class JointState:
         S = H @ PH[columns] + R
         K = np.linalg.solve(S, PH.T).T
         self.x += K @ v
-        self.x[2] = se2.wrap(self.x[2])
+        self.x[2] = se2.wrapped(self.x[2])
         # Joseph form costs n^3; P - K S K^T, made symmetric, keeps it positive here because R > 0
         self.P -= K @ PH.T
         self.P = 0.5 * (self.P + self.P.T)
