@@ -21,7 +21,7 @@ from rlml_slam.matching.submap import P_MIN, STEP, Submap
 from rlml_slam.se2 import Array, wrapped
 
 WIDE_STRIDE = 2  # cells between the shifts of the wide search; a wall is about as thick
-UNKNOWN = 0.1  # M of an unknown cell; like free space, so that a wall is a ridge from both sides
+UNKNOWN = P_MIN  # M of an unknown cell; like free space, so a wall is a ridge from both sides
 INLIER = 0.5  # M from which an end point counts as explained
 ROBUST = 0.6  # e at which the Geman-McClure weight has fallen to a quarter
 
@@ -108,12 +108,12 @@ def sample_curved(
     b = spline(tv)
     c = spline_slope(tv)
     g = spline_curve(tv)
+    flat, columns = values.reshape(-1), values.shape[1]
     m = m_u = m_v = m_uu = m_uv = m_vv = 0.0
     for r in range(4):
-        p0 = cell(values[i - 1 + r, j - 1])
-        p1 = cell(values[i - 1 + r, j])
-        p2 = cell(values[i - 1 + r, j + 1])
-        p3 = cell(values[i - 1 + r, j + 2])
+        at = np.uint64((i - 1 + r) * columns + j - 1)
+        p0, p1 = known(flat[at]), known(flat[at + np.uint64(1)])
+        p2, p3 = known(flat[at + np.uint64(2)]), known(flat[at + np.uint64(3)])
         along = a0 * p0 + a1 * p1 + a2 * p2 + a3 * p3
         slope = d0 * p0 + d1 * p1 + d2 * p2 + d3 * p3
         m += b[r] * along
@@ -122,13 +122,16 @@ def sample_curved(
         m_uu += b[r] * (f0 * p0 + f1 * p1 + f2 * p2 + f3 * p3)
         m_uv += c[r] * slope
         m_vv += g[r] * along
-    return m, m_u, m_v, m_uu, m_uv, m_vv
+    # a cell's probability is linear in its value, and the weights of a spline sum up to one
+    return (
+        P_MIN + STEP * (m - 1.0), STEP * m_u, STEP * m_v, STEP * m_uu, STEP * m_uv, STEP * m_vv,
+    )  # fmt: skip
 
 
 @kernel
-def cell(value: int) -> float:
-    """Probability of one cell."""
-    return P_MIN + STEP * (value - 1) if value > 0 else UNKNOWN
+def known(value: int) -> float:
+    """Value of a cell, an unknown one counting as P_MIN."""
+    return float(max(int(value), 1))
 
 
 @kernel

@@ -27,6 +27,7 @@ STEP = (P_MAX - P_MIN) / (LEVELS - 1)
 MARGIN = 64  # cells of slack when a grid grows, and of free border that kernels may read
 BORDER = 4
 TOUCHED = np.uint16(0x8000)
+WHOLE_RAY = 2.0**40  # a ray's length as an integer
 EMPTY = np.zeros(0, dtype=np.int64)
 
 
@@ -185,32 +186,36 @@ def carve(
             flat[cell] = hit[v] | TOUCHED
             touched[n] = cell
             n += 1
+    hits = n
     for k in range(len(points)):
         x1, y1 = points[k, 0] * scale - corner_j, points[k, 1] * scale - corner_i
         f = points[k, 2]
         sx, sy = x0 + f * (x1 - x0), y0 + f * (y1 - y0)
-        n = carve_ray(flat, columns, sx, sy, x1, y1, miss, touched, n)
-    for m in range(n):
+        n = touch_ray(flat, columns, sx, sy, x1, y1, touched, n)
+    for m in range(hits):
         flat[touched[m]] ^= TOUCHED
+    for m in range(hits, n):
+        flat[touched[m]] = miss[flat[touched[m]] ^ TOUCHED]
     return n
 
 
 @kernel
-def carve_ray(
+def touch_ray(
     flat: NDArray[np.uint16],
     columns: int,
     x0: float,
     y0: float,
     x1: float,
     y1: float,
-    miss: NDArray[np.uint16],
     touched: NDArray[np.int64],
     n: int,
 ) -> int:
-    """Miss the cells from (x0, y0) to (x1, y1) [cells], the last two excluded (Amanatides).
+    """Mark and list the cells from (x0, y0) to (x1, y1) [cells], but the last two (Amanatides).
 
     The cell before the end point's is not known to be free: the wall's noise reaches into it, and
-    beams that graze the wall would wear off its near side.
+    beams that graze the wall would wear off its near side. The loop has no branches, which no
+    processor could predict: the place along the ray is an integer, and a cell that is marked
+    already is overwritten by the next one in the list.
     """
     j, i = int(np.floor(x0)), int(np.floor(y0))
     dx, dy = x1 - x0, y1 - y0
@@ -219,21 +224,21 @@ def carve_ray(
     step_i = columns if dy > 0 else -columns
     per_j = 1.0 / abs(dx) if dx != 0 else np.inf
     per_i = 1.0 / abs(dy) if dy != 0 else np.inf
-    next_j = ((j + 1 - x0) if dx > 0 else (x0 - j)) * per_j if dx != 0 else np.inf
-    next_i = ((i + 1 - y0) if dy > 0 else (y0 - i)) * per_i if dy != 0 else np.inf
+    first_j = ((j + 1 - x0) if dx > 0 else (x0 - j)) * per_j if dx != 0 else np.inf
+    first_i = ((i + 1 - y0) if dy > 0 else (y0 - i)) * per_i if dy != 0 else np.inf
+    # where along the ray the next column (row) begins; how far beyond its end does not matter
+    next_j, next_i = int(min(first_j, 2.0) * WHOLE_RAY), int(min(first_i, 2.0) * WHOLE_RAY)
+    width, height = int(min(per_j, 2.0) * WHOLE_RAY), int(min(per_i, 2.0) * WHOLE_RAY)
     cell = i * columns + j
     for _ in range(left - 1):
+        touched[n] = cell
         v = flat[cell]
-        if v < TOUCHED:
-            flat[cell] = miss[v] | TOUCHED
-            touched[n] = cell
-            n += 1
-        if next_j < next_i:
-            cell += step_j
-            next_j += per_j
-        else:
-            cell += step_i
-            next_i += per_i
+        flat[cell] = v | TOUCHED
+        n += v < TOUCHED
+        sideways = -int(next_j < next_i)  # all bits or none
+        cell += (sideways & step_j) | (~sideways & step_i)
+        next_j += sideways & width
+        next_i += ~sideways & height
     return n
 
 

@@ -79,19 +79,34 @@ def search_window(
 
     ``unit`` is the sum of cell values that a component far from the prior costs.
     """
-    width = 2 * n + 1
+    width, reach = 2 * n + 1, n * stride
+    rows, columns = values.shape
+    flat = values.reshape(-1)
     sums = np.empty((width, width), dtype=np.int64)
+    offsets = np.empty(len(points), dtype=np.int64)
     best, best_distance = -np.inf, 0.0
     best_a = best_j = best_i = best_sum = 0
     for a in range(-m, m + 1):
         c, s = np.cos(pose[2] + a * step), np.sin(pose[2] + a * step)
         sums[:] = 0
+        inside = 0
         for k in range(len(points)):
             px, py = points[k, 0], points[k, 1]
             u = (pose[0] + c * px - s * py) * scale - corner_j
             v = (pose[1] + s * px + c * py) * scale - corner_i
-            add_block(values, int(np.floor(u)) - n * stride, int(np.floor(v)) - n * stride,
-                      stride, sums)  # fmt: skip
+            j, i = int(np.floor(u)) - reach, int(np.floor(v)) - reach
+            if j >= 0 and i >= 0 and j + 2 * reach < columns and i + 2 * reach < rows:
+                offsets[inside] = i * columns + j
+                inside += 1
+            else:
+                add_block(values, j, i, stride, sums)
+        for r in range(width):
+            for q in range(width):
+                shift = (r * columns + q) * stride
+                total = 0
+                for k in range(inside):
+                    total += flat[np.uint64(offsets[k] + shift)]
+                sums[r, q] += total
         for r in range(width):
             for q in range(width):
                 di, dj = (r - n) * stride, (q - n) * stride
@@ -111,12 +126,6 @@ def add_block(
     """Add the cells (i, j), (i, j + stride) ... of a square to ``sums``; 0 outside the grid."""
     rows, columns = values.shape
     width = len(sums)
-    reach = (width - 1) * stride
-    if j >= 0 and i >= 0 and j + reach < columns and i + reach < rows:
-        for r in range(width):
-            for q in range(width):
-                sums[r, q] += values[i + r * stride, j + q * stride]
-        return
     for r in range(width):
         y = i + r * stride
         if 0 <= y < rows:
