@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.compiled import kernel
+from rlml_slam.compiled import kernel, part
 from rlml_slam.matching.scan_match import INLIER, sample
 from rlml_slam.matching.submap import Submap
 from rlml_slam.params import ScanMatch
@@ -27,7 +27,7 @@ CLUTTER = 0.25  # weight per axis of an end point that is on no line
 OPEN = 0.01  # share of the strongest direction's information below which one is left open
 
 
-@kernel
+@part
 def _accumulate(
     values: NDArray[np.uint16],
     corner_j: float,
@@ -96,22 +96,37 @@ def information(submap: Submap, points: Array, pose: Array, params: ScanMatch) -
     information zero.
     """
     j, i = submap.corner
-    H = _accumulate(
+    return _information(
         submap.values, float(j), float(i), 1.0 / submap.resolution,
         np.ascontiguousarray(points, dtype=np.float64),
         np.ascontiguousarray(pose, dtype=np.float64),
+        params.sigma_point, np.array(params.floor2),
     )  # fmt: skip
+
+
+@kernel
+def _information(
+    values: NDArray[np.uint16],
+    corner_j: float,
+    corner_i: float,
+    scale: float,
+    points: Array,
+    pose: Array,
+    sigma_point: float,
+    floor2: Array,
+) -> Array:
+    """Kernel of information()."""
+    H = _accumulate(values, corner_j, corner_i, scale, points, pose)
     # eigenvalues of metres and radians compare at the scan's own lever
     # what is taken off for noise can exceed what there is: a diagonal may be negative
     lever = max(math.sqrt(max(H[2, 2], 0.0) / max(H[0, 0] + H[1, 1], 1e-9)), 0.1)
     unit = np.array([1.0, 1.0, 1.0 / lever])
-    values, axes = np.linalg.eigh(H * np.outer(unit, unit))
-    values = np.maximum(values - OPEN * max(float(values[-1]), 0.0), 0.0)
-    H = (axes * values) @ axes.T / np.outer(unit, unit) / params.sigma_point**2
-    floor = np.zeros((3, 3))
-    floor[[0, 1, 2], [0, 1, 2]] = params.floor2
+    units = np.outer(unit, unit)
+    strength, axes = np.linalg.eigh(H * units)
+    strength = np.maximum(strength - OPEN * max(strength[2], 0.0), 0.0)
+    H = np.dot(axes * strength, axes.T.copy()) / units / sigma_point**2
     # (H^-1 + floor)^-1, written so that an open direction stays open
-    out: Array = np.linalg.solve(np.eye(3) + H @ floor, H)
+    out = np.linalg.solve(np.eye(3) + H * floor2, H)
     return 0.5 * (out + out.T)
 
 

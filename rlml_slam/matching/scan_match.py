@@ -317,12 +317,14 @@ def prior_term(
     return cost, weight
 
 
+@kernel
 def whitening_of(information: Array, theta: float) -> Array:
     """W (3, 3) with W^T W = information, its rows forward, sideways, turn of the base at theta."""
     c, s = np.cos(theta), np.sin(theta)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    body: Array = np.linalg.cholesky(R.T @ information @ R).T @ R.T
-    return body
+    L = np.linalg.cholesky(np.dot(np.dot(R.T.copy(), information), R))
+    W: Array = np.dot(L.T.copy(), R.T.copy())
+    return W
 
 
 @kernel
@@ -363,7 +365,9 @@ def match(
     points = thinning.thin(points, p.voxel, p.max_points)
     if not len(points) or not submap.values.size:
         return ScanMatchResult(prior_pose.copy(), np.zeros((3, 3)), 0.0, 0, False, 1.0)
-    W = whitening_of(np.asarray(prior_information, dtype=np.float64), float(prior_pose[2]))
+    W = whitening_of(
+        np.ascontiguousarray(prior_information, dtype=np.float64), float(prior_pose[2])
+    )
     solve = _Solve(submap, points, surfaces.constraints(points), prior_pose, W, p)
     if not searched:
         return solve.refined(prior_pose)

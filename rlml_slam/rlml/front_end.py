@@ -17,7 +17,8 @@ from rlml_slam.matching import association, observability, thinning
 from rlml_slam.matching.scan_match import match
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.health import Evidence, HealthMonitor
-from rlml_slam.rlml.joint_state import ANCHORS, JointState
+from rlml_slam.rlml.joint_state import JointState
+from rlml_slam.rlml.scan_update import fuse, prior_of
 from rlml_slam.rlml.submaps import Submaps
 from rlml_slam.rlml.tracks import Tracks
 from rlml_slam.se2 import Array
@@ -34,7 +35,6 @@ from rlml_slam.types import (
 )
 
 REFLECTOR_ITERATIONS = 4
-POSE_AND_TARGET = np.array([0, 1, 2, *range(ANCHORS[0], ANCHORS[0] + 3)])
 CONVERGED = np.array([1e-5, 1e-5, 1e-6])
 START_SIGMA = np.array([0.5, 0.5, 0.26])  # [m, m, rad] what RViz says of a pose set by hand
 
@@ -272,14 +272,7 @@ class FrontEnd:
         if submap is None or len(observation.points) < p.min_points:
             return Evidence(scan=submap is None, beams=len(observation.points))
         points = thinning.thin(observation.points, p.voxel, p.max_points)
-        anchor = self.state.anchor(0)
-        J_a, J_x = se2.between_jacobians(anchor, self.state.x[:3])
-        J = np.hstack([J_x, J_a])
-        cov = J @ self.state.P[np.ix_(POSE_AND_TARGET, POSE_AND_TARGET)] @ J.T
-        prior = se2.between(anchor, self.state.x[:3])
-        floor = np.zeros((3, 3))
-        floor[[0, 1, 2], [0, 1, 2]] = p.floor2
-        strength = np.linalg.inv(cov + floor)
+        prior, strength = prior_of(self.state.x, self.state.P, np.array(p.floor2))
         found = match(submap, points, prior, strength, p, searched=False)
         if found.score < p.good_score or found.prior_weight < 0.5:
             searched = match(submap, points, prior, strength, p)
@@ -287,28 +280,14 @@ class FrontEnd:
         if found.score < p.min_score:
             return Evidence(scan=True, beams=len(points), score=found.score)
         information = observability.information(submap, points, found.pose, p)
-        values, axes = np.linalg.eigh(information)
-        keep = values > 1e-6
-        # the match as independent measurements of the pose in the submap, unit variance each
-        root = (axes[:, keep] * np.sqrt(values[keep])).T
-        at_match = se2.between_jacobians(anchor, se2.compose(anchor, found.pose))
-        H = root @ np.hstack([at_match[1], at_match[0]])
-        offset = found.pose - prior
-        offset[2] = se2.wrapped(offset[2])
-        v = root @ offset
-        surprise = float(v @ np.linalg.solve(root @ cov @ root.T + np.eye(len(v)), v))
-        if surprise > p.prior_scale**2 * max(len(v), 1):
-            # the scan disagrees with the odometry and wins: the prior was wrong by what shows
-            seen = np.linalg.pinv(root) @ v
-            self.state.widen(np.outer(at_match[1].T @ seen, at_match[1].T @ seen))
-        self.state.apply(POSE_AND_TARGET, H, np.eye(len(v)), v)
+        fuse(self.state.x, self.state.P, found.pose, information, p.prior_scale)
         return Evidence(
             scan=True,
             used=True,
             beams=len(points),
             score=found.score,
             information=information,
-            heading=float(anchor[2]),
+            heading=float(self.state.anchor(0)[2]),
             prior_weight=found.prior_weight,
             iterations=found.iterations,
         )

@@ -93,7 +93,7 @@ class HealthMonitor:
                 reasons.append(f'nothing holds the position along {weak:.0f} deg of the map')
             elif not misfit:
                 reasons.append('position is held by odometry alone')
-        sigma = math.sqrt(float(np.linalg.eigvalsh(cov[:2, :2])[-1]))
+        sigma = math.sqrt(ends_of(cov[:2, :2])[1])
         if sigma > self._limits.sigma_degraded:
             reasons.append(f'position uncertain by {sigma:.2f} m (1 sigma)')
         if sigma > self._limits.sigma_lost or (misfit and (unmatched or not used)):
@@ -109,7 +109,16 @@ class HealthMonitor:
         info = evidence.information
         # marginal of the position: the heading is estimated along with it
         marginal = info[:2, :2] - np.outer(info[:2, 2], info[:2, 2]) / max(info[2, 2], 1e-12)
-        values, axes = np.linalg.eigh(marginal)
-        if values[0] >= self._limits.weak_sigma**-2:
+        if ends_of(marginal)[0] >= self._limits.weak_sigma**-2:
             return None
-        return math.degrees(math.atan2(axes[1, 0], axes[0, 0]) + evidence.heading) % 180.0
+        (a, b), (_, d) = marginal.tolist()
+        # the axis of the smaller eigenvalue, from the double angle of the larger one's
+        weak = 0.5 * math.atan2(2.0 * b, a - d) + 0.5 * math.pi
+        return math.degrees(weak + evidence.heading) % 180.0
+
+
+def ends_of(A: Array) -> tuple[float, float]:
+    """The smaller and the larger eigenvalue of a symmetric matrix (2, 2)."""
+    (a, b), (_, d) = A.tolist()
+    mean, half = 0.5 * (a + d), math.hypot(0.5 * (a - d), b)
+    return mean - half, mean + half

@@ -10,10 +10,13 @@ first sighting ties it to the pose of that moment.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
+from rlml_slam.compiled import kernel
 from rlml_slam.se2 import Array
 from rlml_slam.types import Motion
 
@@ -69,17 +72,9 @@ class JointState:
 
         ``walk`` is the variance that the bias gained meanwhile.
         """
-        if np.isfinite(motion.bias_var):
+        if math.isfinite(motion.bias_var):
             self._measure_bias(motion.bias, motion.bias_var)
-        P, gain = self.P, motion.bias_gain
-        delta = motion.delta + gain * self.x[BIAS]
-        J_a, J_b = se2.compose_jacobians(self.x[:3], delta)
-        self.x[:3] = se2.compose(self.x[:3], delta)
-        J_bias = J_b @ gain
-        P[:3, :] = J_a @ P[:3, :] + np.outer(J_bias, P[BIAS, :])
-        P[:, :3] = P[:, :3] @ J_a.T + np.outer(P[:, BIAS], J_bias)
-        P[:3, :3] += J_b @ motion.cov @ J_b.T
-        P[BIAS, BIAS] += walk
+        predict(self.x, self.P, motion.delta, motion.cov, motion.bias_gain, walk)
 
     def _measure_bias(self, bias: float, variance: float) -> None:
         """Scalar update with what IMU and wheels say of the bias, gated against slip."""
@@ -171,7 +166,7 @@ class JointState:
         """Marginalise out the reflectors where ``keep`` (m,) is false."""
         rows = np.concatenate([np.ones(LANDMARKS, dtype=np.bool_), np.repeat(keep, 2)])
         self.x = self.x[rows]
-        self.P = self.P[np.ix_(rows, rows)]
+        self.P = np.ascontiguousarray(self.P[np.ix_(rows, rows)])
 
     def active(self, landmarks: NDArray[np.int64]) -> NDArray[np.int64]:
         """Columns of pose, anchor 0 and the given reflectors: all that a measurement can touch."""
@@ -181,11 +176,53 @@ class JointState:
 
     def apply(self, columns: NDArray[np.int64], H: Array, R: Array, v: Array) -> None:
         """Kalman update of everything: v = H dx[columns] + noise of covariance R."""
-        PH = self.P[:, columns] @ H.T
-        S = H @ PH[columns] + R
-        K = np.linalg.solve(S, PH.T).T
-        self.x += K @ v
-        self.x[2] = se2.wrapped(self.x[2])
-        # Joseph form costs n^3; P - K S K^T, made symmetric, keeps it positive here because R > 0
-        self.P -= K @ PH.T
-        self.P = 0.5 * (self.P + self.P.T)
+        update(self.x, self.P, columns, H, R, v)
+
+
+@kernel
+def predict(x: Array, P: Array, delta: Array, cov: Array, gain: Array, walk: float) -> None:
+    """Eq. 5 and its covariance in place; see :meth:`JointState.predict`."""
+    c, s = math.cos(x[2]), math.sin(x[2])
+    dx, dy = delta[0] + gain[0] * x[BIAS], delta[1] + gain[1] * x[BIAS]
+    turn = x[2] + delta[2] + gain[2] * x[BIAS]
+    gx, gy = -s * dx - c * dy, c * dx - s * dy  # by the heading
+    bx, by, bt = c * gain[0] - s * gain[1], s * gain[0] + c * gain[1], gain[2]  # by the bias
+    x[0] += gy
+    x[1] -= gx
+    x[2] = np.pi - (np.pi - turn) % (2.0 * np.pi)
+    for k in range(len(x)):
+        heading, bias = P[2, k], P[BIAS, k]
+        P[0, k] += gx * heading + bx * bias
+        P[1, k] += gy * heading + by * bias
+        P[2, k] += bt * bias
+    for k in range(len(x)):
+        heading, bias = P[k, 2], P[k, BIAS]
+        P[k, 0] += gx * heading + bx * bias
+        P[k, 1] += gy * heading + by * bias
+        P[k, 2] += bt * bias
+    G = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    P[:3, :3] += np.dot(np.dot(G, cov), G.T.copy())
+    P[BIAS, BIAS] += walk
+
+
+@kernel
+def update(x: Array, P: Array, columns: NDArray[np.int64], H: Array, R: Array, v: Array) -> None:
+    """Kalman update in place; see :meth:`JointState.apply`."""
+    n = len(x)
+    PH = np.dot(P[:, columns], H.T.copy())
+    S = np.dot(H, PH[columns]) + R
+    K = np.linalg.solve(S, PH.T.copy()).T.copy()
+    x += np.dot(K, v)
+    x[2] = np.pi - (np.pi - x[2]) % (2.0 * np.pi)
+    # Joseph form costs n^3; P - K S K^T, made symmetric, keeps it positive here because R > 0
+    less = np.dot(K, PH.T.copy())
+    for i in range(n):
+        for j in range(i + 1):
+            P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i] - less[i, j] - less[j, i])
+
+
+def warm_up() -> None:
+    """Compile the kernels with the signatures that are used at run time."""
+    state = JointState(np.zeros(3), np.eye(3), 0.1)
+    predict(state.x, state.P, np.zeros(3), np.eye(3), np.zeros(3), 0.0)
+    state.apply(np.arange(3), np.eye(3), np.eye(3), np.zeros(3))
