@@ -237,6 +237,11 @@ class Submap(Group):
         "variance of a submap's own error, common to its scans",
         'm², m², rad²',
     )
+    grid_bias2: tuple[float, ...] = param(
+        (4e-4, 4e-4, 9e-6),
+        'variance of a fix in the grid of a saved map, common to its beams',
+        'm², m², rad²',
+    )
     size: int = param(90, 'insertions that complete a submap', '', 2, 10000)
     min_travel: float = param(0.1, 'travel between two insertions', 'm', 0.0, 10.0)
     min_turn: float = param(0.08, 'turn between two insertions', 'rad', 0.0, 3.2)
@@ -293,13 +298,23 @@ class HealthLimits(Group):
 
     patience: float = param(1.0, 'an input may fail for this long', 's', 0.0, 60.0)
     confirm_time: float = param(
-        5.0, 'LOST when no two reflectors of the saved map match for this long', 's', 0.0, 600.0
+        5.0, 'LOST when nothing matches the saved map for this long', 's', 0.0, 600.0
     )
     weak_sigma: float = param(
         0.15, 'a scan that holds a direction worse leaves it open', 'm', 1e-3, 10.0
     )
     sigma_degraded: float = param(0.5, 'DEGRADED beyond this position sigma', 'm', 1e-3, 100.0)
     sigma_lost: float = param(2.0, 'LOST beyond this position sigma', 'm', 1e-3, 1000.0)
+    doubt_share: float = param(
+        0.6, 'a scan that fits less than this share of the usual contradicts the map', '', 0.0, 1.0
+    )
+    lost_time: float = param(
+        0.6, 'LOST when what is seen contradicts the map for this long', 's', 0.0, 60.0
+    )
+    new_place_time: float = param(
+        5.0, 'while mapping, a place that is not found for this long is taken for a new one', 's',
+        0.0, 1e6,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -653,6 +668,12 @@ class Simulator(Group):
     turn_acceleration: float = param(3.0, 'highest turn acceleration', 'rad/s^2', 0.01, 50.0)
     lookahead: float = param(0.7, 'distance of the point on the route steered at', 'm', 0.1, 10.0)
     command_timeout: float = param(0.5, 'stops when cmd_vel is older than this', 's', 0.01, 60.0)
+    kidnap_time: float = param(
+        0.0, 'the robot is carried away after this long; 0 is never', 's', 0.0, 1e6
+    )
+    kidnap_distance: float = param(
+        -10.0, 'how far it is carried along its route, backwards if negative', 'm', -1e4, 1e4
+    )
     truth_rate: float = param(50.0, 'rate of the ground truth', 'Hz', 0.1, 1000.0)
     laser_pose: tuple[float, ...] = param(
         (0.2, 0.0, 0.0), 'pose of the laser in base_frame', 'm, m, rad'

@@ -144,6 +144,9 @@ class Frame:
     correction of the back end. Covariances are of (x, y, theta) in the axes of their frame.
     ``landmarks`` (n,) int64: the front end's key of each detection's reflector, -1 where it has
     none; ``statuses`` (n,) of Status. ``scan_used``: the scan fitted and moved the estimate.
+    ``doubtful``: what was seen contradicts the map, or nothing has confirmed the start in it yet;
+    nothing of it belongs into the map. ``jumped``: the place was found anew, and no motion leads
+    to it from the frame before.
     """
 
     stamp: int
@@ -157,6 +160,8 @@ class Frame:
     health: Health = field(default_factory=Health)
     scan_score: float = float('nan')
     scan_used: bool = False
+    doubtful: bool = False
+    jumped: bool = False
     chi2: float = 0.0
     iterations: int = 0
     wall_ms: float = 0.0

@@ -12,6 +12,7 @@ from rclpy.node import Node
 
 from rlml_slam import se2, warm_up
 from rlml_slam.ekf.estimator import Estimator
+from rlml_slam.maps.saved import SavedMap
 from rlml_slam.params import EkfParameters
 from rlml_slam.ros import convert
 from rlml_slam.ros.answers import FramePublisher
@@ -19,7 +20,6 @@ from rlml_slam.ros.declare import declare
 from rlml_slam.ros.ekf_services import EkfServices
 from rlml_slam.ros.feed import STREAMS
 from rlml_slam.ros.health import HealthPublisher
-from rlml_slam.ros.map_folder import SavedMap
 from rlml_slam.ros.products import TOPICS, MapProducts
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensors import RELIABLE, Sensors, checked

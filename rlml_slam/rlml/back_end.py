@@ -68,11 +68,15 @@ class BackEnd:
         began = time.perf_counter()
         if self._interval is not None:
             self._interval.add_motion(frame)
+            if frame.jumped:
+                self._interval.jump(frame)
+                self.scans.begin_piece()
         update = None
         if self._is_key(frame):
             update = self._add_keyframe(frame, began)
         assert self._interval is not None
-        self._interval.add_detections(frame)
+        if not frame.doubtful:
+            self._interval.add_detections(frame)
         self._stamps.append(frame.stamp)
         self._local.append(frame.T_local_base)
         self._key_of.append(len(self.keyframes) - 1)
@@ -81,6 +85,8 @@ class BackEnd:
     def _is_key(self, frame: Frame) -> bool:
         if not self.keyframes:
             return True
+        if frame.doubtful or frame.jumped:
+            return frame.jumped  # of a robot that does not know where it is, nothing is mapped
         p, last = self._p.back_end, self.keyframes[-1]
         step = se2.between(last.T_local, frame.T_local_base)
         distance, turn = math.hypot(step[0], step[1]), abs(step[2])

@@ -31,27 +31,32 @@ def find_place(
     reflectors: Reflectors,
     observation: Observation | None,
     p: Parameters,
+    complete: bool = True,
 ) -> Relocation:
-    """Search an observation in a map, both parts of which are in the map frame."""
+    """Search an observation in a map, both parts of which are in the map frame.
+
+    Of a map in the making, which is not ``complete``, what is missing speaks against no place.
+    """
     points = None if observation is None else observation.points
     seen = None if observation is None else observation.detections
     if seen is None or not p.node.use_reflectors:
-        return relocalize(grid, points, p)
+        return relocalize(grid, points, p, complete)
     stars = locate(seen.points, seen.cov, reflectors.points, reflectors.cov, p.relocalization)
     if stars.verdict is Verdict.UNIQUE:
         (best,) = stars.candidates
         scores = _scores(grid, points, stars, p)
         if scores is None:
             return Relocation(Verdict.UNIQUE, f'{stars.why}; no scan to confirm it', *_at(best))
-        if scores[0] >= p.loop_closure.min_score:
-            why = f'{stars.why}, and the scan fits with score {scores[0]:.2f}'
-            return Relocation(Verdict.UNIQUE, why, *_at(best), scores[0])
-        why = f'{stars.why}, but there the scan has a score of {scores[0]:.2f}'
-        return Relocation(Verdict.AMBIGUOUS, why, *_at(best), scores[0])
-    by_scan = relocalize(grid, points, p)
+        score = float(scores[0, 0])
+        if score >= p.loop_closure.min_score:
+            why = f'{stars.why}, and the scan fits with score {score:.2f}'
+            return Relocation(Verdict.UNIQUE, why, *_at(best), score)
+        why = f'{stars.why}, but there the scan has a score of {score:.2f}'
+        return Relocation(Verdict.AMBIGUOUS, why, *_at(best), score)
+    by_scan = relocalize(grid, points, p, complete)
     if stars.verdict is Verdict.IMPOSSIBLE:
         return by_scan
-    return _of_several(stars, by_scan, grid, points, p)
+    return _of_several(stars, by_scan, grid, points, p, complete)
 
 
 def _of_several(
@@ -60,9 +65,14 @@ def _of_several(
     grid: OccupancyGrid | None,
     points: Array | None,
     p: Parameters,
+    complete: bool,
 ) -> Relocation:
     """The verdict where the reflectors allow several places, or may fit by chance."""
     by_chance = stars.chance > p.relocalization.risk
+    scores = None if by_chance else _scores(grid, points, stars, p)
+    if not complete and scores is not None and _is_twin(scores):
+        why = f'{stars.why}; the scan may fit at more than one of these, as far as they are mapped'
+        return Relocation(Verdict.AMBIGUOUS, why, *_at(stars.candidates[0]))
     if by_scan.verdict is Verdict.UNIQUE and by_scan.pose is not None:
         if by_chance or any(_near(c.pose, by_scan.pose) for c in stars.candidates):
             return by_scan
@@ -71,25 +81,30 @@ def _of_several(
             Verdict.AMBIGUOUS, why, by_scan.pose, by_scan.cov, by_scan.score, by_scan.second
         )
     best = stars.candidates[0]
-    scores = None if by_chance else _scores(grid, points, stars, p)
     if scores is not None and len(scores) > 1:
-        second, first = np.argsort(scores)[-2:]
-        fits = scores[first] >= p.loop_closure.min_score
-        if fits and scores[second] <= MAX_SECOND * scores[first]:
+        first = int(np.argmax(scores[:, 0]))
+        score, second = float(scores[first, 0]), float(np.delete(scores[:, 0], first).max())
+        if score >= p.loop_closure.min_score and second <= MAX_SECOND * score:
             why = (
-                f'{stars.why}; of these, the scan fits one with score {scores[first]:.2f}, '
-                f'the next with {scores[second]:.2f}'
+                f'{stars.why}; of these, the scan fits one with score {score:.2f}, '
+                f'the next with {second:.2f}'
             )
-            at = _at(stars.candidates[int(first)])
-            return Relocation(Verdict.UNIQUE, why, *at, scores[first], scores[second])
+            return Relocation(Verdict.UNIQUE, why, *_at(stars.candidates[first]), score, second)
     why = f'{stars.why}; the scan does not tell either: {by_scan.why}'
     return Relocation(Verdict.AMBIGUOUS, why, *_at(best))
 
 
+def _is_twin(scores: Array) -> bool:
+    """Whether the scan may fit anywhere nearly as well as at the best candidate."""
+    first = int(np.argmax(scores[:, 0]))
+    rivals = np.delete(scores[:, 1], first)
+    return bool((rivals > MAX_SECOND * scores[first, 0]).any())
+
+
 def _scores(
     grid: OccupancyGrid | None, points: Array | None, stars: Constellation, p: Parameters
-) -> list[float] | None:
-    """How well the scan fits at each candidate, None without a scan or a map of scans."""
+) -> Array | None:
+    """How well the scan fits and may fit (q, 2) at each candidate; None without scan or map."""
     if grid is None or not is_mapped(grid):
         return None
     if points is None or len(points) < p.scan_match.min_points:

@@ -7,17 +7,24 @@ the latter two known exactly, the update below is eq. 3 and its covariance eq. 1
 
 from __future__ import annotations
 
+import math
 import time
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
+from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.maps.saved import SavedMap
 from rlml_slam.matching import association, observability, thinning
 from rlml_slam.matching.scan_match import match
 from rlml_slam.params import Parameters
+from rlml_slam.rlml.doubt import Doubt, consents
+from rlml_slam.rlml.grid_fix import Fix, SavedGrid
 from rlml_slam.rlml.health import Evidence, HealthMonitor
-from rlml_slam.rlml.joint_state import JointState
+from rlml_slam.rlml.joint_state import BIAS, JointState
+from rlml_slam.rlml.relocalize import is_mapped
 from rlml_slam.rlml.scan_update import fuse, prior_of
 from rlml_slam.rlml.submaps import Submaps
 from rlml_slam.rlml.tracks import Tracks
@@ -58,20 +65,27 @@ class FrontEnd:
         self.tracks = Tracks()
         self.submaps = Submaps(self._p.submap)
         self.health = HealthMonitor(self._p.health)
+        self.doubt = Doubt(self._p.health)
+        self._grid: SavedGrid | None = None
+        self._fix = Fix(math.nan)
+        self._jumped = False
         self._T_map_local = np.zeros(3)
         self._velocity = np.zeros(3)
         self._velocity_known = False
         self._has_odometry = False
+        self._map: SavedMap | None = None
         self._unconfirmed = False
         self._last_fit = 0
         self._last_stamp: int | None = None
 
-    def use_map(self, reflectors: Reflectors) -> None:
-        """Localise against given reflectors (map frame); they are never dropped.
+    def use_map(self, reflectors: Reflectors, grid: OccupancyGrid | None = None) -> None:
+        """Localise against given reflectors and grid (map frame), which never change.
 
         A start pose that is only assumed, with no covariance, is as good as a person's guess; and
-        it stays unconfirmed until two of the reflectors have matched.
+        it stays unconfirmed until what is seen agrees with the map.
         """
+        self._map = SavedMap(reflectors)
+        self.use_grid(grid)
         if not self.state.pose_cov.any():
             self.state.widen(np.diag(START_SIGMA**2))
         self._unconfirmed = True
@@ -80,6 +94,38 @@ class FrontEnd:
             self.tracks.append(
                 0, int(reflectors.ids[k]), float(reflectors.diameters[k]), surveyed=True
             )
+
+    def use_grid(self, grid: OccupancyGrid | None) -> None:
+        """Localise against a grid as well, or no longer."""
+        assert self._map is not None
+        self._map = replace(self._map, grid=grid)
+        self._grid = None
+        if grid is not None and is_mapped(grid):
+            self._grid = SavedGrid(grid, self._p)
+
+    def relocate(self, T_map_base: Array, cov: Array) -> None:
+        """Go on from another place (3,), (3, 3) of the map.
+
+        A submap begun where the robot was lies elsewhere; reflectors stay where they are.
+        """
+        T_local_map = se2.inverse(self._T_map_local)
+        pose, R = se2.compose(T_local_map, T_map_base), np.eye(3)
+        R[:2, :2] = se2.rotation(T_local_map[2])
+        cov = R @ cov @ R.T
+        if self._map is not None:
+            bias, variance = self.state.x[BIAS], self.state.P[BIAS, BIAS]
+            T_map_local, last = self._T_map_local, self._last_stamp
+            known = self._map
+            self.reset(pose, cov)
+            self.use_map(known.reflectors, known.grid)
+            self.state.x[BIAS], self.state.P[BIAS, BIAS] = bias, variance
+            self._T_map_local, self._last_stamp = T_map_local, last
+        else:
+            self.state.place(pose, cov)
+            self.submaps = Submaps(self._p.submap)
+            self.doubt = Doubt(self._p.health)
+            self._velocity_known = False
+        self._jumped = True
 
     def correct(self, T_map_local: Array) -> None:
         """Take over the back end's newest correction of the local frame."""
@@ -141,13 +187,17 @@ class FrontEnd:
         self.state.predict(self._motion(observation), self._bias_walk(observation.stamp))
         matched = _Matched.none(observation.detections)
         self._use_reflectors(observation, matched)
-        evidence = self._use_scan(observation)
+        evidence = self._use_scan(observation, matched)
+        self._use_grid(observation)
         self._use_reflectors(observation, matched)
-        self._map_reflectors(observation, matched)
-        self._map_scan(observation, evidence)
+        doubtful = self._is_doubtful(observation, matched, evidence)
+        self._map_reflectors(observation, matched, doubtful)
+        self._map_scan(observation, evidence, doubtful and evidence.misfit)
         self._remember_velocity(before, observation.stamp)
         health = self._judge(observation, matched, evidence)
-        return self._frame(observation, matched, evidence, health, began)
+        frame = self._frame(observation, matched, evidence, health, began)
+        jumped, self._jumped = self._jumped, False
+        return replace(frame, doubtful=doubtful or self._unconfirmed, jumped=jumped)
 
     # --- prior -----------------------------------------------------------------------------
 
@@ -239,10 +289,10 @@ class FrontEnd:
                 break
         self.state.apply(columns, H, noise, v)
 
-    def _map_reflectors(self, observation: Observation, matched: _Matched) -> None:
+    def _map_reflectors(self, observation: Observation, matched: _Matched, doubtful: bool) -> None:
         """New reflectors enter as candidates, candidates not seen again leave."""
         p, detections = self._p.reflector, observation.detections
-        if detections is not None and self._p.node.mode == 'mapping':
+        if detections is not None and self._p.node.mode == 'mapping' and not doubtful:
             for k in np.flatnonzero(matched.status == Status.NEW):
                 matched.index[k] = self.state.add_landmark(detections.points[k], detections.cov[k])
                 self.tracks.append(
@@ -263,7 +313,7 @@ class FrontEnd:
 
     # --- scan term ---------------------------------------------------------------------------
 
-    def _use_scan(self, observation: Observation) -> Evidence:
+    def _use_scan(self, observation: Observation, matched: _Matched) -> Evidence:
         """Match against the submap and update with the scan term (e_s of eq. 2)."""
         p = self._p.scan_match
         submap = self.submaps.target
@@ -277,13 +327,16 @@ class FrontEnd:
         if found.score < p.good_score or found.prior_weight < 0.5:
             searched = match(submap, points, prior, strength, p)
             found = searched if searched.score > found.score else found
-        if found.score < p.min_score:
-            return Evidence(scan=True, beams=len(points), score=found.score)
+        misfit = self.doubt.misfits(found.score, submap.insertions)
+        if found.score < p.min_score or (misfit and not matched.agrees):
+            return Evidence(scan=True, misfit=misfit, beams=len(points), score=found.score)
+        self.doubt.learn(found.score)
         information = observability.information(submap, points, found.pose, p)
         fuse(self.state.x, self.state.P, found.pose, information, p.prior_scale)
         return Evidence(
             scan=True,
             used=True,
+            misfit=misfit,
             beams=len(points),
             score=found.score,
             information=information,
@@ -292,13 +345,22 @@ class FrontEnd:
             iterations=found.iterations,
         )
 
-    def _map_scan(self, observation: Observation, evidence: Evidence) -> None:
+    def _use_grid(self, observation: Observation) -> None:
+        """Match against the grid of a saved map, where there is one."""
+        points = observation.points
+        if self._grid is None or points is None or len(points) < self._p.scan_match.min_points:
+            return
+        if self._grid.is_due(self.state.pose):
+            self._fix = self._grid.fix(self.state, points)
+
+    def _map_scan(self, observation: Observation, evidence: Evidence, elsewhere: bool) -> None:
         """Insert the scan into the submaps; a submap that is begun clones the pose.
 
         A single scan that does not fit is more likely a bad scan (a wrong stamp) than a new
         place, and would mislead all that follow; only where none fits for a while, it is new.
+        Where it was taken ``elsewhere``, it would hide that the robot is lost.
         """
-        if observation.points is None or observation.origin is None:
+        if observation.points is None or observation.origin is None or elsewhere:
             return
         if len(observation.points) < self._p.scan_match.min_points:
             return
@@ -310,22 +372,51 @@ class FrontEnd:
 
     # --- result --------------------------------------------------------------------------------
 
+    def _is_doubtful(
+        self, observation: Observation, matched: _Matched, evidence: Evidence
+    ) -> bool:
+        """Whether the frame contradicts the map; while mapping, a new place does not forever."""
+        contradicted = self.doubt.judge(
+            observation.stamp,
+            evidence.misfit,
+            evidence.used and self.health.weak_direction(evidence) is None,
+            len(matched.status),
+            matched.num_used,
+            bool(self.tracks.surveyed.any()),
+        )
+        p = self._p.health
+        if self._map is None and self.doubt.lasts(observation.stamp, p.new_place_time):
+            self.doubt, self.submaps = Doubt(p), Submaps(self._p.submap)
+            return False
+        return contradicted
+
     def _judge(self, observation: Observation, matched: _Matched, evidence: Evidence) -> Health:
+        unconfirmed = self._is_unconfirmed(matched)
+        lasts = self.doubt.lasts(observation.stamp, self._p.health.lost_time)
         return self.health.judge(
             observation.stamp,
             evidence,
             odometry=observation.motion.known,
             detections=None if observation.detections is None else len(observation.detections),
-            used=int((matched.status == Status.USED).sum()),
+            used=matched.num_used,
             cov=self.state.P[:3, :3],
-            unconfirmed=self._is_unconfirmed(),
+            unconfirmed=unconfirmed,
+            contradicted=lasts and not unconfirmed,
         )
 
-    def _is_unconfirmed(self) -> bool:
-        """Whether the pose in a given map is still the one that was told or assumed."""
+    def _is_unconfirmed(self, matched: _Matched) -> bool:
+        """Whether the pose in a given map is still the one that was told or assumed.
+
+        Two reflectors that are most of what is seen confirm it, where the scan does not say
+        otherwise; so does a scan that fits the grid and holds every direction.
+        """
         if self._unconfirmed:
-            matched = self.tracks.surveyed & (self.tracks.sightings > 0)
-            self._unconfirmed = int(matched.sum()) < 2
+            n, least = matched.num_used, self._p.loop_closure.min_score
+            seen = n >= 2 and 2 * n >= len(matched.status)
+            fits = self._fix.score >= least
+            self._unconfirmed = not (
+                (seen and not self._fix.score < least) or (fits and self._fix.held)
+            )
         return self._unconfirmed
 
     def _frame(
@@ -383,6 +474,16 @@ class _Matched:
     @classmethod
     def none(cls, detections: Detections | None) -> _Matched:
         return cls(0 if detections is None else len(detections))
+
+    @property
+    def num_used(self) -> int:
+        """Detections that moved the estimate."""
+        return int((self.status == Status.USED).sum())
+
+    @property
+    def agrees(self) -> bool:
+        """Whether enough of them match to speak for the map."""
+        return consents(len(self.status), self.num_used)
 
     @property
     def open(self) -> NDArray[np.bool_]:

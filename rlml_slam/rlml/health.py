@@ -17,11 +17,13 @@ from rlml_slam.types import Health, Level
 class Evidence:
     """What the scan said in one step.
 
-    ``information`` (3, 3) is in the axes of the submap, which is turned by ``heading`` [rad].
+    ``misfit``: it fits far worse than scans did lately. ``information`` (3, 3) is in the axes of
+    the submap, which is turned by ``heading`` [rad].
     """
 
     scan: bool = False
     used: bool = False
+    misfit: bool = False
     beams: int = 0
     score: float = float('nan')
     information: Array | None = None
@@ -51,18 +53,23 @@ class HealthMonitor:
         used: int,
         cov: Array,
         unconfirmed: bool = False,
+        contradicted: bool = False,
     ) -> Health:
         """Health at ``stamp`` [ns]; ``detections`` is None where none were looked for.
 
-        ``unconfirmed``: the pose in a given map is one that nothing measured agrees with so far.
+        ``unconfirmed``: the pose in a given map is one that nothing measured agrees with so far;
+        ``contradicted``: all that was seen for a while contradicts the map.
         """
         reasons: list[str] = []
         if unconfirmed:
-            reasons.append('no two reflectors of the saved map have matched yet')
+            reasons.append('nothing has matched the saved map yet')
         if self._first is None:
             self._first = stamp
             return Health(Level.DEGRADED if reasons else Level.OK, tuple(reasons))
         lost = unconfirmed and stamp - self._first > self._limits.confirm_time * 1e9
+        if contradicted:
+            lost = True
+            reasons.append('what is seen contradicts the map: was the robot carried away?')
         patience = int(self._limits.patience * 1e9)
 
         def failing(since: int) -> bool:
@@ -84,7 +91,7 @@ class HealthMonitor:
         misfit = failing(self._scan_fits)
         if misfit:
             reasons.append(f'scan fits the submap by {evidence.score:.2f} only')
-        weak = self._weak_direction(evidence)
+        weak = self.weak_direction(evidence)
         if evidence.used and weak is None:
             self._held_by_scan = stamp
         held = max(self._held_by_scan, self._held_by_reflectors)
@@ -102,7 +109,7 @@ class HealthMonitor:
             return Health(Level.LOST, tuple(reasons))
         return Health(Level.DEGRADED if reasons else Level.OK, tuple(reasons))
 
-    def _weak_direction(self, evidence: Evidence) -> float | None:
+    def weak_direction(self, evidence: Evidence) -> float | None:
         """Direction [deg, 0..180) in which the scan leaves the position open, if there is one."""
         if evidence.information is None:
             return None

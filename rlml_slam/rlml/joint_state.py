@@ -86,6 +86,12 @@ class JointState:
             self.x[2] = se2.wrapped(self.x[2])
             self.P -= np.outer(gain, gain) * S
 
+    def place(self, pose: Array, cov: Array) -> None:
+        """Put the pose (3,) elsewhere, with an error of covariance (3, 3) of its own."""
+        self.x[:3] = pose
+        self.P[:3, :] = self.P[:, :3] = 0.0
+        self.P[:3, :3] = cov
+
     def widen(self, cov: Array) -> None:
         """Add independent uncertainty (3, 3) to the pose."""
         self.P[:3, :3] += cov

@@ -13,6 +13,9 @@ from rlml_slam.motion import STILL, compose_motion
 from rlml_slam.se2 import Array
 from rlml_slam.types import ANONYMOUS, Frame, Motion
 
+# [m, m, rad] of an edge over a jump: it keeps the graph in one piece, and what is seen at both
+# of its ends, which the place was found with, says where they are
+JUMP_SIGMA = np.array([0.5, 0.5, 0.2])
 AGREE = 9.2  # 99 % of a chi-square with 2 degrees of freedom
 
 
@@ -74,6 +77,11 @@ class Interval:
         self.motion = compose_motion(self.motion, frame.observation.motion)
         motion = frame.observation.motion
         self.scanned |= bool(np.isfinite(frame.scan_score)) or bool(motion.bias_gain.any())
+
+    def jump(self, frame: Frame) -> None:
+        """The frame's place was found anew: only that place tells how far it is from here."""
+        delta = se2.between(self._T_local, frame.T_local_base)
+        self.motion = Motion(delta, np.diag(JUMP_SIGMA**2), known=False)
 
     def add_detections(self, frame: Frame) -> None:
         """Move the frame's associated detections to the keyframe and fuse them.

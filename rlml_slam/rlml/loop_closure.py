@@ -90,6 +90,11 @@ class ScanGraph:
             return ()
         return self._close(key, points)
 
+    def begin_piece(self) -> None:
+        """Complete the submaps that are being built: the robot goes on from elsewhere."""
+        self._finished += self._active
+        self._active = []
+
     def finish(self) -> None:
         """Nothing is held back for the end."""
 

@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.maps.saved import SavedMap
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.back_end import BackEnd, Update
 from rlml_slam.rlml.front_end import FrontEnd
+from rlml_slam.rlml.recovery import Recovery
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.sequence import Sequencer
 from rlml_slam.types import Detections, Frame, Imu, Observation, Odometry, Reflectors, Scan
@@ -24,7 +26,15 @@ class Slam:
         self.sequencer = Sequencer(params)
         self.front_end = FrontEnd(params)
         self.back_end = BackEnd(params)
+        self.recovery = Recovery(params)
         self.updates: list[Update] = []
+        self._saved: SavedMap | None = None
+        self._path: list[tuple[int, Array]] = []
+
+    def use_map(self, saved: SavedMap) -> None:
+        """Localise in a map that never changes, instead of making one."""
+        self._saved = saved
+        self.front_end.use_map(saved.reflectors, saved.grid)
 
     @property
     def counts(self) -> dict[str, dict[str, int]]:
@@ -54,32 +64,54 @@ class Slam:
     def finish(self) -> list[Frame]:
         """Everything that still waits; then the last optimisation."""
         frames = self._process(self.sequencer.flush())
-        self.back_end.finish()
+        if self._saved is None:
+            self.back_end.finish()
         return frames
 
     def _process(self, observations: Iterable[Observation]) -> list[Frame]:
         frames = []
         for observation in observations:
             frame = self.front_end.process(observation)
-            update = self.back_end.add(frame)
-            if update is not None:
-                self.updates.append(update)
-                if update.optimized:
-                    self.front_end.correct(update.T_map_local)
-                    belief = self.back_end.belief()
-                    if belief is not None and self.front_end.contradicts(belief):
-                        self.front_end.adopt(belief)
+            if self._saved is None:
+                self._map(frame)
+            else:
+                self._path.append((frame.stamp, frame.T_map_base))
+            found = self.recovery.look(frame, self.map, self._saved is not None)
+            if found is not None and found.pose is not None and found.cov is not None:
+                self.front_end.relocate(found.pose, found.cov)
             frames.append(frame)
         return frames
 
+    def _map(self, frame: Frame) -> None:
+        update = self.back_end.add(frame)
+        if update is None:
+            return
+        self.updates.append(update)
+        if update.optimized:
+            self.front_end.correct(update.T_map_local)
+            belief = self.back_end.belief()
+            if belief is not None and self.front_end.contradicts(belief):
+                self.front_end.adopt(belief)
+
+    def map(self) -> SavedMap:
+        """The map as it is now, or the one that never changes."""
+        if self._saved is not None:
+            return self._saved
+        return SavedMap(self.back_end.reflectors(), self.back_end.occupancy_grid())
+
     def trajectory(self) -> tuple[NDArray[np.int64], Array]:
-        """Stamps (n,) and optimised poses (n, 3), map frame, one per frame."""
+        """Stamps (n,) and poses (n, 3), map frame, one per frame; optimised where it maps."""
+        if self._saved is not None:
+            stamps = np.array([stamp for stamp, _ in self._path], dtype=np.int64)
+            return stamps, np.array([pose for _, pose in self._path]).reshape(-1, 3)
         return self.back_end.trajectory()
 
     def reflectors(self) -> Reflectors:
         """The reflector map."""
-        return self.back_end.reflectors()
+        return self._saved.reflectors if self._saved is not None else self.back_end.reflectors()
 
     def occupancy_grid(self) -> OccupancyGrid | None:
         """The map of the scans, None without any."""
+        if self._saved is not None:
+            return self._saved.grid
         return self.back_end.occupancy_grid()

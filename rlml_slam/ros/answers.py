@@ -71,9 +71,12 @@ class FramePublisher:
         self._last = frame
 
     def _twist(self, frame: Frame) -> tuple[Array, Array]:
-        """Body twist since the last frame, with the covariance of the motion model."""
+        """Body twist since the last frame, with the covariance of the motion model.
+
+        A place that was found anew is no motion: the twist before it goes on.
+        """
         dt = 0.0 if self._last is None else (frame.stamp - self._last.stamp) * 1e-9
-        if self._last is not None and dt >= SHORT:
+        if self._last is not None and dt >= SHORT and not frame.jumped:
             step = se2.log(se2.between(self._last.T_local_base, frame.T_local_base))
             self._twisted = (step / dt, frame.observation.motion.cov / dt**2)
         return self._twisted

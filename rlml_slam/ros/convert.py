@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.errors import InputError
+from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Reflector
 from rlml_slam.ros.cloud import column, read_cloud
 from rlml_slam.se2 import Array
@@ -262,3 +263,19 @@ def rotation_matrix(q: Any, where: str) -> Array:
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def occupancy_grid(msg: Any, topic: str) -> OccupancyGrid | None:
+    """An OccupancyGrid that is not turned; None where it has no cells."""
+    info, cells = msg.info, np.asarray(msg.data, dtype=np.int8)
+    rows, columns = int(info.height), int(info.width)
+    if rows * columns == 0:
+        return None
+    x, y = float(info.origin.position.x), float(info.origin.position.y)
+    resolution = float(info.resolution)
+    if len(cells) != rows * columns or not (resolution > 0.0 and np.isfinite(resolution + x + y)):
+        raise InputError(f'{topic}: {len(cells)} cells do not fill {rows} x {columns} of a map')
+    if abs(float(info.origin.orientation.z)) > 1e-6:
+        raise InputError(f'{topic}: a map that is turned cannot be used')
+    # the message has 32 bits for it, of 0.05 m as well
+    return OccupancyGrid(round(resolution, 7), (x, y), cells.reshape(rows, columns))

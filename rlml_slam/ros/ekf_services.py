@@ -11,9 +11,10 @@ from std_srvs.srv import Trigger
 
 from rlml_slam.ekf.estimator import Estimator
 from rlml_slam.errors import MapError, RlmlError
+from rlml_slam.maps.saved import SavedMap
 from rlml_slam.params import Node
 from rlml_slam.ros import build
-from rlml_slam.ros.map_folder import MapFolder, SavedMap
+from rlml_slam.ros.map_folder import MapFolder
 from rlml_slam.ros.messages import make_rclpy
 from rlml_slam.ros.services import refuse_map
 

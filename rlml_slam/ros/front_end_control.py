@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rlml_slam import se2
+from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.front_end import FrontEnd
 from rlml_slam.ros import convert
@@ -24,6 +25,7 @@ from rlml_slam.types import Frame, Observation, Reflectors
 RECENT = 1000  # frames that an initialpose or a correction may be of: both take their time
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 CLOUD = 'sensor_msgs/msg/PointCloud2'
+GRID = 'nav_msgs/msg/OccupancyGrid'
 
 
 class FrontEndControl:
@@ -38,12 +40,15 @@ class FrontEndControl:
         self._answers = answers
         self.front_end = FrontEnd(params)
         self.map: Reflectors | None = None
+        self.grid: OccupancyGrid | None = None
         self.last: Frame | None = None
         self._recent: deque[tuple[int, Array]] = deque(maxlen=RECENT)
         for kind, topic, callback, qos in (
             (POSE, 'initialpose', self.start_at, RELIABLE),
             (POSE, 'correction', self.correct, LATCHED),
             (CLOUD, 'belief', self.believe, RELIABLE),
+            (POSE, 'relocation', self.relocate, RELIABLE),
+            (GRID, 'localization_grid', self.use_grid, LATCHED),
             (CLOUD, 'localization_map', self.use_map, LATCHED),
         ):
             node.create_subscription(rclpy_class(kind), topic, checked(node, callback), qos)
@@ -69,6 +74,29 @@ class FrontEndControl:
         self._begin(pose, start.cov)
         self._logger.info(f'begins at {np.round(pose, 3).tolist()}')
 
+    def relocate(self, msg: Any) -> None:
+        """Go on in the same map from where the back end found a frame that was lost.
+
+        Who has found itself meanwhile, or was told another place, does not jump.
+        """
+        found = convert.pose_estimate(msg, 'relocation')
+        front_end = self.front_end
+        if not front_end.doubt.since:
+            return
+        for stamp, T_local_base in self._recent:
+            if stamp == found.stamp and stamp >= front_end.doubt.since:
+                moved = se2.between(T_local_base, front_end.state.pose)
+                front_end.relocate(se2.compose(found.pose, moved), found.cov)
+                self._recent.clear()
+                self._logger.info(f'found again at {np.round(found.pose, 3).tolist()}')
+                return
+
+    def use_grid(self, msg: Any) -> None:
+        """The grid that belongs to the map of the back end; one without cells is none."""
+        self.grid = convert.occupancy_grid(msg, 'localization_grid')
+        if self.map is not None:
+            self.front_end.use_grid(self.grid)
+
     def use_map(self, msg: Any) -> None:
         """Localise in the map of the back end from where the robot is; without fields, map."""
         self.map = read_reflector_map(msg, 'localization_map') if msg.fields else None
@@ -85,7 +113,7 @@ class FrontEndControl:
     def _begin(self, pose: Array, cov: Array) -> None:
         self.front_end.reset(pose, cov)
         if self.map is not None:
-            self.front_end.use_map(self.map)
+            self.front_end.use_map(self.map, self.grid)
         self._recent.clear()
         self._answers.begin_session()
 

@@ -3,21 +3,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from rlml_slam.errors import MapError
 from rlml_slam.maps import occupancy, reflector_file
-from rlml_slam.maps.occupancy import OccupancyGrid
-from rlml_slam.types import Reflectors
-
-
-@dataclass(frozen=True)
-class SavedMap:
-    """Reflectors and, where scans were used, the grid."""
-
-    reflectors: Reflectors
-    grid: OccupancyGrid | None = None
+from rlml_slam.maps.saved import SavedMap
 
 
 class MapFolder:

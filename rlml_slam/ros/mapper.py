@@ -11,14 +11,17 @@ import numpy as np
 
 from rlml_slam import se2
 from rlml_slam.errors import MapError
+from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.maps.saved import SavedMap
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.find_place import find_place
+from rlml_slam.rlml.recovery import Recovery
 from rlml_slam.ros import build
 from rlml_slam.ros.associated import build_reflector_map
 from rlml_slam.ros.beliefs import StampedBelief, build_belief
 from rlml_slam.ros.frames import Record
-from rlml_slam.ros.map_folder import MapFolder, SavedMap
+from rlml_slam.ros.map_folder import MapFolder
 from rlml_slam.ros.messages import make_rclpy, rclpy_class
 from rlml_slam.ros.products import MapProducts
 from rlml_slam.ros.sensors import LATCHED
@@ -54,6 +57,7 @@ class Mapper:
         if params.node.mode == 'localization':
             self.saved = self._loaded = self.folder.load(params.node.map_file_name)
         self.back_end = BackEnd(params)
+        self.recovery = Recovery(params)
         self.worker = Worker()
         self.products = MapProducts(node, params.node)
         # stamp and T_map_odom (3,), None at first; two threads use it, so the two come as one
@@ -61,6 +65,7 @@ class Mapper:
         self._has_odometry = False  # in any session: odom is the robot's, not the front end's
         self._newest: Frame | None = None
         self._session: int | None = None
+        self._told: int | None = None  # session of a lost front end that knows its place by now
         self._sent = 0
         self._heard = 0.0
         self._tf = TransformPublisher(node)
@@ -70,6 +75,9 @@ class Mapper:
         self._belief = node.create_publisher(cloud, 'belief', 5)
         self._updates = node.create_publisher(cloud, 'updates', 50)
         self._initialpose = node.create_publisher(kind, 'initialpose', 10)
+        self._relocation = node.create_publisher(kind, 'relocation', 10)
+        grid = rclpy_class('nav_msgs/msg/OccupancyGrid')
+        self._grid = node.create_publisher(grid, 'localization_grid', LATCHED)
         self._localization = node.create_publisher(cloud, 'localization_map', LATCHED)
         if self.saved is not None:
             self.worker.submit(self._use_saved)
@@ -103,9 +111,32 @@ class Mapper:
                     self._send_correction()
                     self._send_belief(record)
         self._place_odom(frame)
+        self._recover(record)
         due = self.saved is None and self.products.is_due(frame.stamp)
         if due and self.worker.backlog < MAX_BACKLOG:
             self.publish_map()
+
+    def _recover(self, record: Record) -> None:
+        """Look for a lost robot, and tell the front end what is found.
+
+        While localizing, it begins anew there. A map in the making goes on with the same session:
+        nothing that was seen while it was lost is in it.
+        """
+        frame = record.frame
+        if record.paused or record.session == self._told:
+            return
+        found = self.recovery.look(frame, self.current, self.saved is not None)
+        if found is None or found.pose is None or found.cov is None:
+            return
+        self._logger.info(f'found again: {found.why}')
+        if self.saved is not None:
+            self._told = record.session  # what is still to come of it is answered
+            self._tell_pose(frame.stamp, found.pose, found.cov)
+        else:
+            name = self._p.node.map_frame
+            self._relocation.publish(
+                build.pose_with_covariance(make_rclpy, frame.stamp, name, found.pose, found.cov)
+            )
 
     def _place_odom(self, frame: Frame) -> None:
         """Map to odom by a frame; one that lacks the odometry there is leaves it as it was."""
@@ -201,6 +232,8 @@ class Mapper:
         """Publish the map that never changes, and tell the front end to localize in it."""
         assert self.saved is not None
         frame, reflectors = self._p.node.map_frame, self.saved.reflectors
+        grid = self.saved.grid or OccupancyGrid(1.0, (0.0, 0.0), np.zeros((0, 0), dtype=np.int8))
+        self._grid.publish(build.occupancy_grid(make_rclpy, self.stamp, frame, grid))
         message = build_reflector_map(make_rclpy, self.stamp, frame, reflectors)
         self._localization.publish(message)
         self.publish_map()

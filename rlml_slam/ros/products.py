@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from rlml_slam.errors import MapError
 from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.maps.saved import SavedMap
 from rlml_slam.params import Node
 from rlml_slam.ros import build
 from rlml_slam.ros.associated import build_reflector_map
-from rlml_slam.ros.map_folder import SavedMap
 from rlml_slam.ros.markers import graph_markers, reflector_markers
 from rlml_slam.ros.messages import make_rclpy, rclpy_class
 from rlml_slam.ros.sensors import LATCHED

@@ -46,6 +46,12 @@ class RouteFollower:
         """Begin the route again."""
         self._progress = 0.0
 
+    def skip(self, distance: float) -> tuple[float, float, float]:
+        """Go on from ``distance`` [m] farther along the route, or back; the pose there."""
+        self._progress = min(max(self._progress + distance, 0.0), self.length)
+        dx, dy = self._directions[self._leg(self._progress)]
+        return *self.point(self._progress), math.atan2(dy, dx)
+
     def _leg(self, distance: float) -> int:
         """Index of the leg at a distance along the route."""
         k = bisect_right(self._ends, distance) - 1
@@ -107,8 +113,8 @@ def approach(now: float, wanted: float, most: float) -> float:
 
 @kernel
 def _along(knots: Array, count: int, first: int, step: int, stamps: NDArray[np.int64]) -> Array:
-    """Columns of the track (n, 7) at stamps not before ``first``, by exact arcs from the knots."""
-    out = np.empty((len(stamps), 7))
+    """Columns of the track (n, 8) at stamps not before ``first``, by exact arcs from the knots."""
+    out = np.empty((len(stamps), 8))
     for i in range(len(stamps)):
         k = min((stamps[i] - first) // step, count - 1)
         row = knots[k]
@@ -122,6 +128,7 @@ def _along(knots: Array, count: int, first: int, step: int, stamps: NDArray[np.i
         out[i, 2] = row[2] + row[5] * dt
         out[i, 3:6] = row[3:6]
         out[i, 6] = row[6] + row[3] * dt
+        out[i, 7] = row[7] + row[5] * dt
     return out
 
 
@@ -136,10 +143,11 @@ class Track:
     def __init__(self, stamp: int, pose: Array, step: int = 10_000_000) -> None:
         self._first = stamp
         self._step = step
-        # x, y, theta of the knot; vx, vy, omega from it on; wheel travel so far
-        self._knots = np.zeros((self.CAPACITY, 7))
+        # x, y, theta of the knot; vx, vy, omega from it on; travel and turn so far of the wheels
+        self._knots = np.zeros((self.CAPACITY, 8))
         self._count = 1
         self._knots[0, :3] = pose
+        self._knots[0, 7] = pose[2]
 
     @property
     def stamp(self) -> int:
@@ -162,6 +170,10 @@ class Track:
         """Choose the twist from the newest knot on."""
         self._knots[self._count - 1, 3:6] = v, lateral, omega
 
+    def carry(self, pose: Array) -> None:
+        """Put the robot elsewhere (3,) at the newest knot; wheels and gyro feel nothing."""
+        self._knots[self._count - 1, :3] = pose
+
     def advance(self) -> None:
         """Append the next knot; the twist goes on."""
         row = self._rows(self.stamp + self._step)[0]
@@ -177,7 +189,7 @@ class Track:
         return self._columns(np.array(stamps, dtype=np.int64))
 
     def _columns(self, stamps: NDArray[np.int64]) -> Array:
-        """All columns (n, 7) at the stamps; the newest twist holds beyond the newest knot."""
+        """All columns (n, 8) at the stamps; the newest twist holds beyond the newest knot."""
         if len(stamps) and np.min(stamps) < self._first:
             raise InputError('the simulated track does not reach back that far')
         return _along(self._knots, self._count, self._first, self._step, stamps)
@@ -199,7 +211,7 @@ class Track:
     def wheel_motion(self, start: int, end: int) -> tuple[float, float]:
         """Forward travel [m] and turn [rad] between two stamps, as perfect wheels measure them."""
         a, b = self._rows(start, end)
-        return float(b[6] - a[6]), float(b[2] - a[2])
+        return float(b[6] - a[6]), float(b[7] - a[7])
 
     def turn_rate(self, stamp: int) -> float:
         """Mean turn rate [rad/s] over one step around the stamp.
@@ -208,7 +220,7 @@ class Track:
         """
         start, end = max(stamp - self._step // 2, self._first), stamp + self._step // 2
         a, b = self._rows(start, end)
-        return float(b[2] - a[2]) * SECOND / (end - start)
+        return float(b[7] - a[7]) * SECOND / (end - start)
 
 
 def warm_up() -> None:

@@ -84,6 +84,7 @@ class Simulation:
         self._command = (0.0, 0.0)
         self._commanded = -(10**18)
         self._arrived: int | None = None
+        self._kidnapped = False
         self._steer()
 
     def _generator(self, name: str) -> np.random.Generator:
@@ -137,6 +138,11 @@ class Simulation:
         self._command = (speed, turn_rate)
         self._commanded = self.time
 
+    def kidnap(self, distance: float) -> None:
+        """Carry the robot ``distance`` [m] along its route, at once; no sensor but sight tells."""
+        if self._route.length > 0.0:
+            self._track.carry(np.array(self._route.skip(distance)))
+
     def __iter__(self) -> Iterator[Event]:
         while not self.done:
             yield from self.step()
@@ -147,6 +153,10 @@ class Simulation:
         if not self._pushed:
             self._sense()
         self._track.advance()
+        n = self.parameters.node
+        if 0.0 < n.kidnap_time * SECOND <= self.time - START and not self._kidnapped:
+            self._kidnapped = True
+            self.kidnap(n.kidnap_distance)
         self._steer()
         self._sense()
         return self._arrivals(self.time)

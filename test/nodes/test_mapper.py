@@ -13,10 +13,11 @@ import pytest
 from rlml_slam import se2
 from rlml_slam.errors import MapError
 from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.maps.saved import SavedMap
 from rlml_slam.params import Parameters
 from rlml_slam.ros.associated import read_reflector_map
 from rlml_slam.ros.frames import Record
-from rlml_slam.ros.map_folder import MapFolder, SavedMap
+from rlml_slam.ros.map_folder import MapFolder
 from rlml_slam.ros.mapper import Mapper
 from rlml_slam.types import Frame, Motion, Observation, Reflectors
 

@@ -15,7 +15,7 @@ from rlml_slam.params import (
     Transport,
     Wheels,
 )
-from rlml_slam.simulation.robot import SECOND
+from rlml_slam.simulation.robot import SECOND, RouteFollower
 from rlml_slam.simulation.simulation import START, GroundTruth, Simulation
 from rlml_slam.simulation.world_file import load_world, world_names
 from rlml_slam.types import Detections, Imu, Odometry, Scan
@@ -233,3 +233,34 @@ def test_worlds_can_lose_their_reflectors_and_movers():
     seen = of(list(Simulation(world, SHORT)), Detections)
     assert seen
     assert sum(map(len, seen)) <= 2  # ghosts
+
+
+def test_carried_robot_is_elsewhere_on_its_route_and_only_sight_tells():
+    world = load_world('room')
+    p = SimulatorParameters(node=Simulator(duration=8.0, kidnap_time=6.0, kidnap_distance=5.0))
+    q = dataclasses.replace(p, node=dataclasses.replace(p.node, kidnap_time=0.0))
+    carried, left = (list(Simulation(world, c, seed=3)) for c in (p, q))
+    before = [e for e in carried if e.time < START + 6 * SECOND]
+    assert [e.time for e in before] == [e.time for e in left if e.time < START + 6 * SECOND]
+    path = {
+        e.message.stamp: e.message.T_world_base
+        for e in carried
+        if isinstance(e.message, GroundTruth)
+    }
+    steps = {
+        t: np.hypot(*(path[t][:2] - path[last][:2]))
+        for last, t in zip(list(path), list(path)[1:], strict=False)
+    }
+    jumps = {t: d for t, d in steps.items() if d > 0.1}
+    (stamp,) = jumps
+    assert stamp == START + 6 * SECOND
+    # the route has corners: the straight way is shorter
+    assert 3.0 < jumps[stamp] <= 5.2
+    route = RouteFollower(world.route, p.node)
+    dense = np.array([route.point(s) for s in np.arange(0.0, route.length, 0.05)])
+    assert np.hypot(*(dense - path[stamp][:2]).T).min() < 0.05
+    # wheels and gyro feel nothing of it
+    rates = [e.message.yaw_rate for e in carried if isinstance(e.message, Imu)]
+    assert np.abs(rates).max() < 1.5
+    odometry = [e.message.pose for e in carried if isinstance(e.message, Odometry)]
+    assert np.hypot(*np.diff(np.array(odometry)[:, :2], axis=0).T).max() < 0.03
