@@ -132,6 +132,11 @@ class FrontEnd:
         self._T_map_local = np.array(T_map_local, dtype=np.float64)
 
     @property
+    def T_map_local(self) -> Array:
+        """The local frame's pose (3,) in the map, as the back end corrected it last."""
+        return self._T_map_local
+
+    @property
     def newest(self) -> int | None:
         """Stamp of the newest observation, None before the first."""
         return self._last_stamp
@@ -427,23 +432,22 @@ class FrontEnd:
         health: Health,
         began: float,
     ) -> Frame:
-        R = np.eye(3)
-        R[:2, :2] = se2.rotation(self._T_map_local[2])
-        cov = self.state.pose_cov
+        pose, cov = self.state.pose, self.state.pose_cov
+        T_map_base, cov_map = in_map(self._T_map_local, pose, cov)
         used = matched.status == Status.USED
         return Frame(
             stamp=observation.stamp,
             observation=observation,
-            T_local_base=self.state.pose,
+            T_local_base=pose,
             cov_local=cov,
-            T_map_base=se2.compose(self._T_map_local, self.state.x[:3]),
-            cov_map=R @ cov @ R.T,
+            T_map_base=T_map_base,
+            cov_map=cov_map,
             landmarks=matched.keys,
             statuses=matched.status,
             health=health,
             scan_score=evidence.score,
             scan_used=evidence.used,
-            chi2=float(np.nansum(matched.distance2[used])),
+            chi2=float(np.nansum(matched.distance2[used])) if used.any() else 0.0,
             iterations=evidence.iterations,
             wall_ms=(time.perf_counter() - began) * 1e3,
         )
@@ -460,6 +464,13 @@ class FrontEnd:
             self.tracks.sightings[keep],
             self.tracks.diameters[keep],
         )
+
+
+def in_map(T_map_local: Array, pose: Array, cov: Array) -> tuple[Array, Array]:
+    """A pose (3,) of the local frame and its covariance (3, 3), both in the map frame."""
+    R = np.eye(3)
+    R[:2, :2] = se2.rotation(T_map_local[2])
+    return se2.compose(T_map_local, pose), R @ cov @ R.T
 
 
 class _Matched:

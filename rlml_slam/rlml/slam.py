@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,17 +15,34 @@ from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved import SavedMap
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.back_end import BackEnd, Update
-from rlml_slam.rlml.front_end import FrontEnd
+from rlml_slam.rlml.front_end import FrontEnd, in_map
 from rlml_slam.rlml.recovery import Recovery
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.sequence import Sequencer
-from rlml_slam.types import Detections, Frame, Imu, Observation, Odometry, Reflectors, Scan
+from rlml_slam.types import (
+    Detections,
+    Frame,
+    Imu,
+    Level,
+    Observation,
+    Odometry,
+    Reflectors,
+    Scan,
+)
+
+AHEAD = 200  # frames that the front end may be ahead of the back end
 
 
 class Slam:
-    """Sequencer, front end and back end; each ``add_…`` returns the frames that became ready."""
+    """Sequencer, front end and back end; each ``add_…`` returns the frames that became ready.
 
-    def __init__(self, params: Parameters) -> None:
+    With ``parallel`` the back end works in a thread of its own, up to AHEAD frames behind, and
+    frames come later by as many; they are the same to the last bit. The front end's local frame
+    depends on nothing that the back end says, as long as there are no reflectors and the robot is
+    not lost: with the first reflector both take turns for good, and at a lost frame once.
+    """
+
+    def __init__(self, params: Parameters, parallel: bool = False) -> None:
         self.sequencer = Sequencer(params)
         self.front_end = FrontEnd(params)
         self.back_end = BackEnd(params)
@@ -30,6 +50,8 @@ class Slam:
         self.updates: list[Update] = []
         self._saved: SavedMap | None = None
         self._path: list[tuple[int, Array]] = []
+        self._thread = ThreadPoolExecutor(1, 'back end') if parallel else None
+        self._pending: deque[tuple[Frame, Future[Update | None]]] = deque()
 
     def use_map(self, saved: SavedMap) -> None:
         """Localise in a map that never changes, instead of making one."""
@@ -63,7 +85,7 @@ class Slam:
 
     def finish(self) -> list[Frame]:
         """Everything that still waits; then the last optimisation."""
-        frames = self._process(self.sequencer.flush())
+        frames = self._process(self.sequencer.flush()) + self._take_turns()
         if self._saved is None:
             self.back_end.finish()
         return frames
@@ -71,27 +93,59 @@ class Slam:
     def _process(self, observations: Iterable[Observation]) -> list[Frame]:
         frames = []
         for observation in observations:
+            if self._saved is not None or observation.detections:
+                frames += self._take_turns()
             frame = self.front_end.process(observation)
-            if self._saved is None:
-                self._map(frame)
-            else:
+            if self._saved is not None:
                 self._path.append((frame.stamp, frame.T_map_base))
+                frames.append(frame)
+            elif self._thread is not None:
+                self._pending.append((frame, self._thread.submit(self.back_end.add, frame)))
+                is_lost = frame.health.level is Level.LOST or frame.doubtful
+                frames += self._settle(0 if is_lost else AHEAD)
+            else:
+                if self._take_over(self.back_end.add(frame)):
+                    self._believe()
+                frames.append(frame)
             found = self.recovery.look(frame, self.map, self._saved is not None)
             if found is not None and found.pose is not None and found.cov is not None:
                 self.front_end.relocate(found.pose, found.cov)
-            frames.append(frame)
         return frames
 
-    def _map(self, frame: Frame) -> None:
-        update = self.back_end.add(frame)
+    def _take_turns(self) -> list[Frame]:
+        """End the back end's thread, if there is one; the frames that waited for it."""
+        frames = self._settle(0)
+        if self._thread is not None:
+            self._thread.shutdown()
+            self._thread = None
+        return frames
+
+    def _settle(self, most: int) -> list[Frame]:
+        """The oldest of the frames that wait for the back end, so that ``most`` are left."""
+        frames = []
+        while len(self._pending) > most:
+            frame, update = self._pending.popleft()
+            T_map_base, cov_map = in_map(
+                self.front_end.T_map_local, frame.T_local_base, frame.cov_local
+            )
+            frames.append(replace(frame, T_map_base=T_map_base, cov_map=cov_map))
+            self._take_over(update.result())
+        return frames
+
+    def _take_over(self, update: Update | None) -> bool:
+        """Give the front end the correction of an update; whether there is one."""
         if update is None:
-            return
+            return False
         self.updates.append(update)
         if update.optimized:
             self.front_end.correct(update.T_map_local)
-            belief = self.back_end.belief()
-            if belief is not None and self.front_end.contradicts(belief):
-                self.front_end.adopt(belief)
+        return update.optimized
+
+    def _believe(self) -> None:
+        """Let the front end go on from the graph where the graph contradicts it."""
+        belief = self.back_end.belief()
+        if belief is not None and self.front_end.contradicts(belief):
+            self.front_end.adopt(belief)
 
     def map(self) -> SavedMap:
         """The map as it is now, or the one that never changes."""

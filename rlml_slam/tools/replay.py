@@ -30,7 +30,7 @@ from rlml_slam.tools.tum import Trajectory, read_tum
 
 # name -> the type of its parameters and its constructor
 SYSTEMS: Mapping[str, tuple[type[Any], Callable[[Any], Slam | EkfSlam]]] = {
-    'rlml': (Parameters, Slam),
+    'rlml': (Parameters, lambda params: Slam(params, parallel=True)),
     'ekf': (EkfParameters, EkfSlam),
 }
 

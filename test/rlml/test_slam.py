@@ -6,7 +6,8 @@ import pytest
 from made_worlds import FIRST, ROOM, SECOND, STEP, detections_of, drive, errors, messages
 
 from rlml_slam import se2
-from rlml_slam.params import Node, Parameters
+from rlml_slam.params import BackEnd, LoopClosure, Node, Parameters
+from rlml_slam.rlml import slam as slam_module
 from rlml_slam.rlml.slam import Slam
 from rlml_slam.types import Detections, Imu, Level, Odometry, Scan
 
@@ -165,3 +166,32 @@ def test_front_end_goes_on_from_the_newest_correction():
                 np.testing.assert_allclose(f.T_map_base, T, atol=1e-12)
                 checked += 1
     assert checked > 3
+
+
+@pytest.mark.parametrize('reflectors', [False, True])
+def test_back_end_in_a_thread_changes_no_bit(reflectors):
+    sent = messages(ROOM, CURVE, reflectors=reflectors, rng=np.random.default_rng(5))
+    # small submaps, so that loops are closed on a short way
+    params = Parameters(back_end=BackEnd(submap_size=4), loop_closure=LoopClosure(every=1))
+    slams = [Slam(params, parallel) for parallel in (False, True)]
+    one, other = ([f for m in sent for f in add(slam, m)] + slam.finish() for slam in slams)
+    assert [f.stamp for f in one] == [f.stamp for f in other]
+    assert sum(u.optimized for u in slams[0].updates) > 1
+    for a, b in zip(one, other, strict=True):
+        assert a.T_map_base.tobytes() == b.T_map_base.tobytes()
+        assert a.cov_map.tobytes() == b.cov_map.tobytes()
+        assert a.T_local_base.tobytes() == b.T_local_base.tobytes()
+    assert slams[0].trajectory()[1].tobytes() == slams[1].trajectory()[1].tobytes()
+
+
+def test_frames_wait_for_the_back_end_by_a_fixed_number(monkeypatch):
+    monkeypatch.setattr(slam_module, 'AHEAD', 7)
+    sent = messages(ROOM, CURVE, reflectors=False)
+    slam = Slam(Parameters(), parallel=True)
+    frames, processed = 0, 0
+    for m in sent:
+        frames += len(add(slam, m))
+        processed = slam.counts.get('scan', {}).get('used', 0)
+        assert frames == max(processed - 7, 0)
+    assert frames > 0
+    assert frames + len(slam.finish()) == len(CURVE)
