@@ -84,6 +84,7 @@ COMMANDS: Table = {
         'measured speed and quality against other libraries',
         {
             'back-end': Command('bench_back_end', 'the graph solver against other libraries'),
+            'front-end': Command('bench_front_end', 'CPU time per scan against a scan matcher'),
             'live': Command('bench_live', 'whether the live nodes keep up with a fast laser'),
         },
     ),
