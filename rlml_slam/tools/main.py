@@ -52,6 +52,9 @@ COMMANDS: Table = {
     'study': Group(
         'experiments that answer one question each',
         {
+            'front-end': Command(
+                'study_ablation', 'each sensor alone and together, faults, kidnapping'
+            ),
             'worlds': Command('study_front_end', 'accuracy and consistency over seeds and worlds'),
             'deformable': Command(
                 'study_deformable', 'deformable-feature SLAM: EKF against NLS over many seeds'

@@ -9,6 +9,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,9 @@ import numpy as np
 
 from rlml_slam import warm_up
 from rlml_slam.ekf.slam import EkfSlam
-from rlml_slam.errors import BagError, InputError, MapError
+from rlml_slam.errors import BagError, InputError, MapError, ParameterError
+from rlml_slam.maps import saved
+from rlml_slam.maps.saved import SavedMap
 from rlml_slam.params import EkfParameters, Parameters, from_mapping, read_yaml
 from rlml_slam.rlml.slam import Slam
 from rlml_slam.ros.bag import BagReader
@@ -51,6 +54,10 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         '--truth', metavar='TUM', type=Path, help='ground truth, aligned before it is compared'
     )
+    parser.add_argument(
+        '--map', metavar='DIR', type=Path,
+        help='localize in the map of this folder, which a replay wrote or save_map as `map`',
+    )  # fmt: skip
     parser.add_argument('--json', action='store_true', help='print metrics.json and no more')
 
 
@@ -60,7 +67,8 @@ def run(args: argparse.Namespace) -> int:
     params = from_mapping(read_yaml(args.config), kind) if args.config else kind()
     make_folder(args.out)  # before the work, not after it
     truth = Truth(read_tum(args.truth), is_map=False) if args.truth else None
-    result = replay(args.bag, params, truth, args.system, quiet=args.json)
+    known = saved.load(args.map) if args.map else None
+    result = replay(args.bag, params, truth, args.system, quiet=args.json, known=known)
     figures = write_outputs(result, args.out)
     if args.json:
         print(json.dumps(figures))
@@ -79,16 +87,24 @@ def replay(
     truth: Truth | None = None,
     system: str = 'rlml',
     quiet: bool = True,
+    known: SavedMap | None = None,
 ) -> Run:
     """Drive the system with a bag's messages in the order of the log.
 
-    ``truth`` replaces that of the bag. A damaged bag, or one whose clock jumps back, gives what
-    came before, and ``Run.problem`` says so. Raises BagError if there is nothing to use at all.
+    ``truth`` replaces that of the bag; ``known`` is a map to localize in, from the pose
+    ``map_start_pose`` or from where the robot finds itself. A damaged bag, or one whose clock
+    jumps back, gives what came before, and ``Run.problem`` says so. Raises BagError if there is
+    nothing to use at all.
     """
     warm_up.compile_loaded()
     with BagReader(path) as bag:
         inputs = BagInputs(bag, params)
         slam = SYSTEMS[system][1](params)
+        if known is not None:
+            if not isinstance(slam, Slam):
+                raise ParameterError('replay: --map is for --system rlml')
+            slam = Slam(replace(params, node=replace(params.node, mode='localization')))
+            slam.use_map(known)
         log, problem = FrameLog(), ''
         began = time.perf_counter()
         try:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rlml_slam import se2
 from rlml_slam.maps import occupancy
 from rlml_slam.params import Parameters
 from rlml_slam.ros import build
@@ -49,6 +50,31 @@ def test_room_is_mapped(replayed):
     assert f['reflectors_spurious'] == 0
     assert f['inputs']['scan']['invalid'] == 0
     assert len(read_tum(replayed / 'a' / 'trajectory.tum')) == f['scans']
+
+
+def test_bag_is_localized_in_the_map_that_another_replay_made(replayed, tmp_path):
+    """The robot starts elsewhere than assumed, and the map comes out as it went in."""
+    start = tmp_path / 'start.yaml'
+    start.write_text('/**:\n  ros__parameters:\n    map_start_pose: [4.0, 3.0, 1.0]\n')
+    arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out')]
+    arguments += ['--map', str(replayed / 'a'), '--config', str(start)]
+    assert main(arguments) == 0
+    f = json.loads((tmp_path / 'out' / 'metrics.json').read_text())
+    assert f['keyframes'] == 0
+    assert f['health']['OK'] > 0.95
+    for name in ('map.pgm', 'map.yaml', 'reflectors.csv'):
+        assert (tmp_path / 'out' / name).read_bytes() == (replayed / 'a' / name).read_bytes()
+    found = read_tum(tmp_path / 'out' / 'trajectory.tum')
+    mapped = read_tum(replayed / 'a' / 'trajectory.tum')
+    error = se2.between(mapped.poses, found.poses)[10:]
+    assert np.hypot(error[:, 0], error[:, 1]).max() < 0.04
+    assert np.abs(error[:, 2]).max() < 0.02
+
+
+def test_folder_without_a_map_is_refused(tmp_path, capsys):
+    arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out')]
+    assert main([*arguments, '--map', str(tmp_path)]) == 1
+    assert 'neither reflectors.csv nor map.csv' in capsys.readouterr().err
 
 
 def test_given_truth_is_aligned(replayed, tmp_path, capsys):
