@@ -59,7 +59,7 @@ COLUMNS: dict[str, tuple[str, float, int]] = {
 def add_parser(subparsers: Any) -> None:
     """Declare ``rlml study front-end``."""
     parser = subparsers.add_parser(
-        'front-end', help='each sensor alone and together, faults, consistency, kidnapping'
+        'front-end', help='each sensor alone and together, faults, kidnapping'
     )
     parser.add_argument('--seeds', type=int, default=5, metavar='N', help='default: %(default)s')
     parser.add_argument('--world', nargs='+', default=list(WORLDS), choices=WORLDS)
