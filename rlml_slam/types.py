@@ -110,7 +110,11 @@ class Observation:
 
 
 class Status(IntEnum):
-    """What became of one reflector detection."""
+    """What became of one reflector detection.
+
+    GATED fits no reflector and is too near to one to be another; NEW begins a candidate; GHOST is
+    of no reflector of a map that does not change; AMBIGUOUS fits more than one.
+    """
 
     USED = 0
     GATED = 1

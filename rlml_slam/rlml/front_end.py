@@ -297,7 +297,10 @@ class FrontEnd:
     def _map_reflectors(self, observation: Observation, matched: _Matched, doubtful: bool) -> None:
         """New reflectors enter as candidates, candidates not seen again leave."""
         p, detections = self._p.reflector, observation.detections
-        if detections is not None and self._p.node.mode == 'mapping' and not doubtful:
+        if self._p.node.mode != 'mapping':
+            # a map that never changes has all reflectors that there are
+            matched.status[matched.status == Status.NEW] = Status.GHOST
+        elif detections is not None and not doubtful:
             for k in np.flatnonzero(matched.status == Status.NEW):
                 matched.index[k] = self.state.add_landmark(detections.points[k], detections.cov[k])
                 self.tracks.append(

@@ -13,9 +13,10 @@ from rlml_slam.params import Node
 from rlml_slam.ros import build
 from rlml_slam.ros.associated import build_associated
 from rlml_slam.ros.frames import build_points, build_record
+from rlml_slam.ros.markers import detection_markers
 from rlml_slam.ros.messages import make_rclpy, rclpy_class
 from rlml_slam.se2 import Array
-from rlml_slam.types import Frame
+from rlml_slam.types import Detections, Frame
 
 CLOUD = 'sensor_msgs/msg/PointCloud2'
 TOPICS = {
@@ -23,6 +24,7 @@ TOPICS = {
     'odometry/filtered': ('nav_msgs/msg/Odometry', 10),
     'deskewed_points': (CLOUD, 50),
     'reflectors/associated': (CLOUD, 50),
+    'reflectors/statuses': ('visualization_msgs/msg/MarkerArray', 5),
     'frames': (CLOUD, 50),
 }
 SHORT = 0.005  # [s] steps of several lidars: too short to tell a speed
@@ -66,9 +68,20 @@ class FramePublisher:
         if observation.detections is not None:
             associated = build_associated(make, frame, p.base_frame)
             self._publishers['reflectors/associated'].publish(associated)
+            self._show_statuses(frame, observation.detections)
         record = build_record(make, frame, self.session, p.local_frame)
         self._publishers['frames'].publish(record)
         self._last = frame
+
+    def _show_statuses(self, frame: Frame, detections: Detections) -> None:
+        """The detections in colour, where somebody looks at them."""
+        publisher = self._publishers['reflectors/statuses']
+        if publisher.get_subscription_count() > 0:
+            publisher.publish(
+                detection_markers(
+                    make_rclpy, frame.stamp, self._p.base_frame, detections.points, frame.statuses
+                )
+            )
 
     def _twist(self, frame: Frame) -> tuple[Array, Array]:
         """Body twist since the last frame, with the covariance of the motion model.

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -12,7 +13,7 @@ from rclpy.clock_type import ClockType
 from rlml_slam.ros import build
 from rlml_slam.ros.messages import make_rclpy, rclpy_class
 from rlml_slam.ros.sensors import Sensors
-from rlml_slam.types import Frame, Health, Level
+from rlml_slam.types import Frame, Health, Level, Status
 
 PERIOD = 1.0  # [s] of a clock that goes on without any input
 
@@ -31,6 +32,7 @@ class HealthPublisher:
         self._figures = figures
         self._frame: Frame | None = None
         self._frames = 0
+        self._statuses: Counter[int] = Counter()
         self._reported = 0
         self._publisher = node.create_publisher(
             rclpy_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', 10
@@ -47,6 +49,7 @@ class HealthPublisher:
         """The newest frame."""
         self._frame = frame
         self._frames += 1
+        self._statuses.update(frame.statuses.tolist())
 
     def _inputs(self) -> dict[str, object]:
         if self._sensors is None:
@@ -64,6 +67,8 @@ class HealthPublisher:
     def publish(self) -> None:
         """Send the status."""
         figures: dict[str, object] = {'frames': self._frames, **self._inputs()}
+        if self._statuses:
+            figures |= {f'detections {s.name.lower()}': self._statuses[s] for s in Status}
         health, stamp = Health(Level.DEGRADED, ('no input yet',)), 0
         if self._frame is not None:
             health, stamp = self._frame.health, self._frame.stamp

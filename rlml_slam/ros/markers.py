@@ -14,7 +14,7 @@ from rlml_slam.graph.table import FactorKind
 from rlml_slam.ros import build
 from rlml_slam.ros.messages import Make
 from rlml_slam.se2 import Array
-from rlml_slam.types import Reflectors
+from rlml_slam.types import Reflectors, Status
 
 # visualization_msgs/Marker
 CYLINDER, LINE_LIST, SPHERE_LIST, TEXT, DELETEALL = 3, 5, 7, 9, 3
@@ -24,6 +24,13 @@ HEIGHT = 1.5  # [m] of the cylinder drawn for a reflector
 ORANGE = (1.0, 0.55, 0.1, 1.0)
 YELLOW = (1.0, 0.9, 0.2, 0.5)
 WHITE = (1.0, 1.0, 1.0, 1.0)
+STATUS_COLORS = {
+    Status.USED: (0.1, 0.8, 0.3, 1.0),
+    Status.GATED: (0.9, 0.1, 0.1, 1.0),
+    Status.NEW: (0.2, 0.5, 1.0, 1.0),
+    Status.GHOST: (0.6, 0.6, 0.6, 1.0),
+    Status.AMBIGUOUS: (1.0, 0.9, 0.2, 1.0),
+}
 EDGE_COLORS = {
     FactorKind.ODOMETRY: (0.6, 0.6, 0.6, 1.0),
     FactorKind.SCAN: (0.2, 0.5, 1.0, 1.0),
@@ -119,6 +126,19 @@ def reflector_markers(make: Make, stamp: int, frame_id: str, reflectors: Reflect
         out.add('ellipses', CYLINDER, YELLOW, flat, np.array([x, y, heading]))
         size = (0.0, 0.0, 0.3)
         out.add('keys', TEXT, WHITE, size, at, HEIGHT + 0.3, text=str(int(reflectors.keys[k])))
+    return out.array()
+
+
+def detection_markers(
+    make: Make, stamp: int, frame_id: str, points: Array, statuses: NDArray[np.int64]
+) -> Any:
+    """MarkerArray: detections (n, 2), a colour and a namespace for each status (n,)."""
+    out = _Markers(make, stamp, frame_id)
+    for status, color in STATUS_COLORS.items():
+        of_status = statuses == status
+        if of_status.any():
+            size = (0.25, 0.25, 0.25)
+            out.add(status.name.lower(), SPHERE_LIST, color, size, points=points[of_status])
     return out.array()
 
 

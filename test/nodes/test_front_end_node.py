@@ -43,6 +43,7 @@ def node(live):
         ('pose', 'geometry_msgs/msg/PoseWithCovarianceStamped'),
         ('odometry/filtered', 'nav_msgs/msg/Odometry'),
         ('reflectors/associated', 'sensor_msgs/msg/PointCloud2'),
+        ('reflectors/statuses', 'visualization_msgs/msg/MarkerArray'),
         ('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray'),
     ):
         live.listen(topic, kind)
@@ -88,6 +89,17 @@ def test_detections_are_told_what_became_of_them(live, node):
     assert last.detections.frame_id == 'base_link'
     assert (last.statuses == Status.USED).sum() >= 2
     assert (last.landmarks[last.statuses == Status.USED] >= 0).all()
+    drawn = live.heard['reflectors/statuses'][-1].markers
+    green = next(m for m in drawn if m.ns == 'used')
+    assert len(green.points) == (last.statuses == Status.USED).sum()
+    heard = [read_associated(m).statuses for m in live.heard['reflectors/associated']]
+    live.heard['/diagnostics'].clear()
+    node.health.publish()
+    live.spin_until(lambda: live.heard['/diagnostics'])
+    told = {v.key: v.value for v in live.heard['/diagnostics'][0].status[0].values}
+    for status in Status:
+        count = int((np.concatenate(heard) == status).sum())
+        assert told[f'detections {status.name.lower()}'] == str(count)
 
 
 def test_correction_moves_the_map_pose_only(live, node):

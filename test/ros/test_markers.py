@@ -10,9 +10,15 @@ import pytest
 
 from rlml_slam import se2
 from rlml_slam.graph.graph import Graph
-from rlml_slam.ros.markers import SCALE_95, ellipse, graph_markers, reflector_markers
+from rlml_slam.ros.markers import (
+    SCALE_95,
+    detection_markers,
+    ellipse,
+    graph_markers,
+    reflector_markers,
+)
 from rlml_slam.ros.messages import make_bag, make_rclpy, rclpy_class
-from rlml_slam.types import EdgeKind, Reflectors
+from rlml_slam.types import EdgeKind, Reflectors, Status
 
 MAKES = [make_bag]
 if rclpy_class('visualization_msgs/msg/Marker') is not None:
@@ -45,6 +51,21 @@ def test_each_reflector_has_body_ellipse_and_key(make):
     assert len({m.id for m in markers}) == len(markers)
     assert [m.text for m in markers if m.ns == 'keys'] == ['10', '11']
     assert markers[1].scale.x == pytest.approx(0.08)
+
+
+@pytest.mark.parametrize('make', MAKES)
+def test_detections_are_drawn_by_what_became_of_them(make):
+    points = np.arange(12.0).reshape(6, 2)
+    statuses = np.array([Status.USED, Status.NEW, Status.USED, Status.GATED, Status.GHOST, 4])
+    drawn = detection_markers(make, 1, 'base_link', points, statuses).markers
+    assert drawn[0].action == 3
+    found = {m.ns: [(p.x, p.y) for p in m.points] for m in drawn[1:]}
+    assert found == {
+        'used': [(0.0, 1.0), (4.0, 5.0)], 'new': [(2.0, 3.0)], 'gated': [(6.0, 7.0)],
+        'ghost': [(8.0, 9.0)], 'ambiguous': [(10.0, 11.0)],
+    }  # fmt: skip
+    colors = {(m.color.r, m.color.g, m.color.b) for m in drawn[1:]}
+    assert len(colors) == 5
 
 
 @pytest.mark.parametrize('make', MAKES)
