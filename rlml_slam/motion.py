@@ -74,6 +74,8 @@ def integrate(
 
 def compose_motion(first: Motion, second: Motion) -> Motion:
     """Two motions, one after the other; their errors are independent."""
+    if first is STILL:
+        return second
     J_a, J_b = se2.compose_jacobians(first.delta, second.delta)
     cov = J_a @ first.cov @ J_a.T + J_b @ second.cov @ J_b.T
     gain = J_a @ first.bias_gain + J_b @ second.bias_gain

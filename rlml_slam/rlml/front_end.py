@@ -492,7 +492,7 @@ class _Matched:
     @property
     def num_used(self) -> int:
         """Detections that moved the estimate."""
-        return int((self.status == Status.USED).sum())
+        return int((self.status == Status.USED).sum()) if len(self.status) else 0
 
     @property
     def agrees(self) -> bool:

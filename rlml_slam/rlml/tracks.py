@@ -62,6 +62,8 @@ class Tracks:
 
     def stale(self, now: int, min_sightings: int, timeout: float) -> NDArray[np.bool_]:
         """(m,): candidates to drop, by age and, beyond MAX_CANDIDATES, the longest unseen."""
+        if not len(self.keys):
+            return np.zeros(0, dtype=np.bool_)
         candidate = ~self.confirmed(min_sightings)
         drop = candidate & (now - self.last_seen > timeout * 1e9)
         left = np.flatnonzero(candidate & ~drop)

@@ -8,6 +8,7 @@ can be judged only in context (order of stamps, known frames) is left to the seq
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,7 @@ from rlml_slam.se2 import Array
 from rlml_slam.types import ANONYMOUS, Detections, Imu, Odometry, Scan
 
 MAX_TILT = 0.35  # [rad] a larger roll or pitch is not a planar pose
+MIN_UPRIGHT = math.cos(MAX_TILT)
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # (x, y, yaw) of ROS's 6 x 6 covariances
 MAX_VARIANCE = 1e6  # [m^2], [rad^2] of a start: from 1e9 or so, updates lose all their digits
 _ROUNDING = 1e-9  # of the largest variance
@@ -235,27 +237,27 @@ def transforms(msg: Any, topic: str = '/tf_static') -> list[Transform]:
 
 def planar_pose(pose: Any, where: str) -> Array:
     """(x, y, yaw) of a Pose; z and a small tilt are left out, a large tilt is an InputError."""
-    p = np.array([pose.position.x, pose.position.y], dtype=np.float64)
-    if not np.isfinite(p).all():
+    x, y = float(pose.position.x), float(pose.position.y)
+    if not (math.isfinite(x) and math.isfinite(y)):
         raise InputError(f'{where}.position is not finite')
-    return np.array([*p, yaw(rotation_matrix(pose.orientation, where), where)])
+    return np.array([x, y, yaw(rotation_matrix(pose.orientation, where), where)])
 
 
 def yaw(R: NDArray[np.float64], where: str) -> float:
     """Angle of a rotation (3, 3) about z; InputError if it tilts by more than MAX_TILT."""
-    if R[2, 2] < np.cos(MAX_TILT):
+    if R[2, 2] < MIN_UPRIGHT:
         tilt = np.degrees(np.arccos(np.clip(R[2, 2], -1.0, 1.0)))
         raise InputError(f'{where} is not planar: it tilts by {tilt:.0f} degrees')
-    return float(np.arctan2(R[1, 0], R[0, 0]))
+    return math.atan2(R[1, 0], R[0, 0])
 
 
 def rotation_matrix(q: Any, where: str) -> Array:
     """R (3, 3) of a quaternion of about unit length; InputError otherwise."""
-    v = np.array([q.x, q.y, q.z, q.w], dtype=np.float64)
-    norm = float(np.linalg.norm(v))
+    x, y, z, w = float(q.x), float(q.y), float(q.z), float(q.w)
+    norm = math.hypot(x, y, z, w)
     if not abs(norm - 1.0) < 0.01:  # also true for NaN
         raise InputError(f'{where}: quaternion has the length {norm:.3g} instead of 1')
-    x, y, z, w = v / norm
+    x, y, z, w = x / norm, y / norm, z / norm, w / norm
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],

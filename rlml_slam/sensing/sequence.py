@@ -307,13 +307,15 @@ class Sequencer:
     def _motion(self, last: int, stamp: int) -> Motion:
         """Motion since the last observation; what was extrapolated is made good afterwards."""
         newest = self.buffer.newest
-        start, used = self._extrapolated or (last, np.zeros(3))
+        start, used = self._extrapolated or (last, None)
         if newest is not None and newest < stamp:
             motion = self.buffer.extrapolate(start, stamp)
             self._extrapolated = (start, motion.delta)
         else:
             motion = self.buffer.motion(start, stamp)
             self._extrapolated = None
+        if used is None:
+            return motion
         return dataclasses.replace(motion, delta=se2.between(used, motion.delta))
 
     def _in_base(self, d: Detections) -> Detections:

@@ -51,7 +51,8 @@ class FrameLog:
             self.add_pose(f.stamp, f.T_map_base, f.cov_map, f.health)
             self.wall_ms.append(f.wall_ms)
             self.seen.append(len(f.statuses))
-            self.used.append(int(np.sum(f.statuses == Status.USED)))
+            used = f.statuses == Status.USED
+            self.used.append(int(used.sum()) if len(used) else 0)
 
     def add_pose(self, stamp: int, pose: Array, cov: Array, health: Health | None = None) -> None:
         """Note one published pose (3,) with covariance (3, 3)."""
