@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -39,7 +40,8 @@ class Slam:
     With ``parallel`` the back end works in a thread of its own, up to AHEAD frames behind, and
     frames come later by as many; they are the same to the last bit. The front end's local frame
     depends on nothing that the back end says, as long as there are no reflectors and the robot is
-    not lost: with the first reflector both take turns for good, and at a lost frame once.
+    not lost: with the first reflector both take turns for good, and at a lost frame once. Their
+    times in milliseconds are then those of the processor, without the waits for one another.
     """
 
     def __init__(self, params: Parameters, parallel: bool = False) -> None:
@@ -95,12 +97,14 @@ class Slam:
         for observation in observations:
             if self._saved is not None or observation.detections:
                 frames += self._take_turns()
+            began = time.thread_time()
             frame = self.front_end.process(observation)
             if self._saved is not None:
                 self._path.append((frame.stamp, frame.T_map_base))
                 frames.append(frame)
             elif self._thread is not None:
-                self._pending.append((frame, self._thread.submit(self.back_end.add, frame)))
+                frame = replace(frame, wall_ms=1e3 * (time.thread_time() - began))
+                self._pending.append((frame, self._thread.submit(self._add, frame)))
                 is_lost = frame.health.level is Level.LOST or frame.doubtful
                 frames += self._settle(0 if is_lost else AHEAD)
             else:
@@ -111,6 +115,14 @@ class Slam:
             if found is not None and found.pose is not None and found.cov is not None:
                 self.front_end.relocate(found.pose, found.cov)
         return frames
+
+    def _add(self, frame: Frame) -> Update | None:
+        """In the back end's thread: one frame."""
+        began = time.thread_time()
+        update = self.back_end.add(frame)
+        if update is None:
+            return None
+        return replace(update, wall_ms=1e3 * (time.thread_time() - began))
 
     def _take_turns(self) -> list[Frame]:
         """End the back end's thread, if there is one; the frames that waited for it."""
