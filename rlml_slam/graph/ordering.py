@@ -22,7 +22,10 @@ def minimum_degree(start: Ints, neighbours: Ints, weight: Ints) -> Ints:
     """Elimination order (n,) of a graph in compressed rows: order[k] is eliminated k-th.
 
     ``neighbours[start[i]:start[i + 1]]`` are those of node i: symmetric, without i itself and
-    without repetition. ``weight`` (n,) > 0 is the number of scalar rows of each node.
+    without repetition. ``weight`` (n,) is the number of scalar rows of each node; a node of weight
+    0 is one that has been eliminated before, whose neighbours touch each other therefore. Such
+    nodes come first among the neighbours of another one, and have no such neighbours themselves.
+    The neighbours of a node that is heavier than all others together are eliminated last.
     """
     n = len(start) - 1
     if n == 0:
@@ -50,21 +53,34 @@ def minimum_degree(start: Ints, neighbours: Ints, weight: Ints) -> Ints:
     for i in range(n):
         first[i] = start[i]
         length[i] = start[i + 1] - start[i]
-        elements[i] = 0
+        elements[i] = 0 if weight[i] > 0 else -1
         size[i] = weight[i]
         mark[i] = 1
         absorbed[i] = rank[i] = bucket[i] = chain[i] = -1
         total += weight[i]
+        degree[i] = 0
+        for p in range(start[i], start[i + 1]):
+            degree[i] += weight[neighbours[p]]
     head = np.empty(total + 1, np.int64)  # lists of variables by degree
     for d in range(total + 1):
         head[d] = -1
+    largest = 0
     for i in range(n):
-        d = 0
+        if weight[i] == 0:
+            largest = max(largest, degree[i])
+            continue
+        d = degree[i]
         for p in range(start[i], start[i + 1]):
-            d += weight[neighbours[p]]
-        degree[i] = d
-        _link(head, after, before, d, i)
-    done, lowest, flag, largest, pivots = 0, 0, 2, 0, 0
+            e = neighbours[p]
+            if weight[e] > 0:
+                break
+            elements[i] += 1
+            d += degree[e] - weight[i]
+        degree[i] = min(d, total - weight[i])
+        if 2 * weight[i] > total:
+            degree[i] = total
+        _link(head, after, before, degree[i], i)
+    done, lowest, flag, pivots = 0, 0, 2, 0
     while done < total:
         while head[lowest] < 0:
             lowest += 1

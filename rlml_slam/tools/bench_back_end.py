@@ -77,7 +77,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _graphs(paths: list[Path], generated: bool) -> Iterator[tuple[str, Graph]]:
+def read_graphs(paths: list[Path]) -> Iterator[tuple[str, Graph]]:
+    """The graph files among ``paths`` and in folders among them."""
     for path in paths:
         files = sorted(p for p in path.rglob('*') if p.is_file()) if path.is_dir() else [path]
         for file in files:
@@ -87,6 +88,10 @@ def _graphs(paths: list[Path], generated: bool) -> Iterator[tuple[str, Graph]]:
                 except RlmlError:
                     if not path.is_dir():
                         raise
+
+
+def _graphs(paths: list[Path], generated: bool) -> Iterator[tuple[str, Graph]]:
+    yield from read_graphs(paths)
     if generated:
         yield 'city 10 000', city(10_000)
         yield 'warehouse 1000', warehouse(1000, 150)

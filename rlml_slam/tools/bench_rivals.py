@@ -14,11 +14,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlml_slam import params
 from rlml_slam.graph import factors
 from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.solver import optimize
+from rlml_slam.se2 import Array
 
 
 @dataclass(frozen=True)
@@ -139,11 +141,7 @@ def run_gtsam(graph: Graph, iterations: int, algorithm: str) -> Run:
         noise = gaussian.Information(info)
         fg.add(gtsam.BetweenFactorPose2(int(i), int(j), gtsam.Pose2(*z), noise))
     for (i, k), z, info in zip(s.nodes, s.measured, s.information, strict=True):
-        r = float(np.hypot(*z))
-        J = np.array([[-z[1] / r**2, z[0] / r**2], z / r])  # of (bearing, range) in (x, y)
-        noise = gaussian.Covariance(J @ np.linalg.inv(info) @ J.T)
-        bearing = gtsam.Rot2(float(np.arctan2(z[1], z[0])))
-        fg.add(gtsam.BearingRangeFactor2D(int(i), int(n + k), bearing, r, noise))
+        fg.add(bearing_range(int(i), int(n + k), z, info))
     for fixed in np.flatnonzero(graph.fixed_poses):
         exact = gtsam.noiseModel.Constrained.All(3)
         fg.add(gtsam.PriorFactorPose2(int(fixed), gtsam.Pose2(*graph.poses[fixed]), exact))
@@ -157,6 +155,78 @@ def run_gtsam(graph: Graph, iterations: int, algorithm: str) -> Run:
     for k in range(len(graph.landmarks)):
         graph.landmarks[k] = np.ravel(result.atPoint2(n + k))
     return Run(ms, int(optimizer.iterations()))
+
+
+class Isam:
+    """GTSAM's iSAM2 with its default thresholds, relinearising at every step."""
+
+    def __init__(self, source: Graph) -> None:
+        import gtsam
+
+        self.gtsam, self.source = gtsam, source
+        parameters = gtsam.ISAM2Params()
+        parameters.relinearizeSkip = 1
+        self.solver = gtsam.ISAM2(parameters)
+        self.seen: set[int] = set()
+
+    def step(self, index: int, edges: NDArray[np.int64], sightings: NDArray[np.int64]) -> float:
+        """CPU time of the update with a pose, its edges and its sightings [ms]."""
+        gtsam, source = self.gtsam, self.source
+        values, fg = gtsam.Values(), gtsam.NonlinearFactorGraph()
+        pose = self._start(index, edges)
+        values.insert(index, pose)
+        if source.fixed_poses[index]:
+            fg.add(gtsam.PriorFactorPose2(index, pose, gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)))
+        e, s = source.edges, source.sightings
+        for row in edges:
+            i, j = (int(k) for k in e.nodes[row])
+            noise = gtsam.noiseModel.Gaussian.Information(e.information[row])
+            fg.add(gtsam.BetweenFactorPose2(i, j, gtsam.Pose2(*e.measured[row]), noise))
+        for row in sightings:
+            k, z = len(source.poses) + int(s.nodes[row, 1]), s.measured[row]
+            if k not in self.seen:
+                self.seen.add(k)
+                values.insert(k, pose.transformFrom(z))
+            fg.add(bearing_range(index, k, z, s.information[row]))
+
+        def update() -> None:
+            self.solver.update(fg, values)
+            self.solver.calculateEstimatePose2(index)
+
+        return timed(update)[0]
+
+    def _start(self, index: int, edges: NDArray[np.int64]) -> Any:
+        """The new pose from an edge to an earlier one, the preceding one if there is such."""
+        gtsam, e = self.gtsam, self.source.edges
+        if not len(edges):
+            return gtsam.Pose2(*self.source.poses[index])
+        nodes = e.nodes[edges]
+        row = int(np.argmin(np.abs(np.abs(nodes[:, 0] - nodes[:, 1]) - 1)))
+        i, j = (int(k) for k in nodes[row])
+        delta = gtsam.Pose2(*e.measured[edges[row]])
+        if j == index:
+            return self.solver.calculateEstimatePose2(i).compose(delta)
+        return self.solver.calculateEstimatePose2(j).compose(delta.inverse())
+
+    def estimate(self) -> None:
+        """Write the estimate into the graph."""
+        values, n = self.solver.calculateEstimate(), len(self.source.poses)
+        for i in range(n):
+            T = values.atPose2(i)
+            self.source.poses[i] = [T.x(), T.y(), T.theta()]
+        for k in self.seen:
+            self.source.landmarks[k - n] = np.ravel(values.atPoint2(k))
+
+
+def bearing_range(i: int, k: int, z: Array, information: Array) -> Any:
+    """A sighting (2,) as GTSAM's bearing and range factor, with the covariance carried over."""
+    import gtsam
+
+    r = float(np.hypot(*z))
+    J = np.array([[-z[1] / r**2, z[0] / r**2], z / r])  # of (bearing, range) in (x, y)
+    noise = gtsam.noiseModel.Gaussian.Covariance(J @ np.linalg.inv(information) @ J.T)
+    bearing = gtsam.Rot2(float(np.arctan2(z[1], z[0])))
+    return gtsam.BearingRangeFactor2D(i, k, bearing, r, noise)
 
 
 def run_ceres(graph: Graph, iterations: int) -> Run:

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Incremental least squares over a growing graph: each step costs what it changes.
+
+A step relinearises the factors whose linear model has become wrong, takes the cliques that they
+and the new factors touch out of the tree of the factorisation, with all cliques above them, orders
+and factors this part anew, and updates what feels it. In the limit of small thresholds a step is
+one of Gauss-Newton on the whole graph (Kaess et al., "iSAM2", IJRR 31 (2012)).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from rlml_slam.compiled import kernel, part
+from rlml_slam.errors import SolverError
+from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.increments import (
+    CLIQUES,
+    FACTORS,
+    FREE_CLIQUE,
+    LISTED,
+    SEEDS,
+    STEP,
+    TOP,
+    UNKNOWNS,
+    State,
+    ask,
+    grown,
+    new_state,
+)
+from rlml_slam.graph.partial import take_out
+from rlml_slam.graph.propagate import propagate
+from rlml_slam.graph.refactor import make_cliques, refactor, reserve
+from rlml_slam.graph.relinearize import judge, refer_all, take
+from rlml_slam.graph.system import Tables
+from rlml_slam.se2 import Array
+from rlml_slam.types import EdgeKind
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """How far off things may be before something is done about it.
+
+    A factor is relinearised when its linear model is off by ``due`` standard deviations or its
+    pose has turned by ``turn`` [rad], else only where it has to be assembled anyway. A move of a
+    variable by less than ``still`` standard deviations is not passed on.
+    """
+
+    due: float = 0.05
+    turn: float = 0.1
+    still: float = 0.02
+
+
+class Step(NamedTuple):
+    """What one update did, as counts: the work that it took.
+
+    ``relinearized`` factors that were due, ``factors`` assembled, ``refactored`` poses and
+    landmarks eliminated anew, ``kept`` subtrees below them, ``solved`` and ``moved`` nodes.
+    """
+
+    relinearized: int
+    factors: int
+    refactored: int
+    kept: int
+    solved: int
+    moved: int
+
+
+@kernel
+def advance(
+    state: State, pool: Array, tables: Tables, poses: Array, landmarks: Array,
+    whole: bool, due: float, turn: float, still: float,
+) -> tuple[Array, int, Step]:  # fmt: skip
+    """(pool, unknown at which the equations are singular or -1, what was done) of one step."""
+    count, losses = state.counts, tables.losses
+    count[STEP] += 1
+    count[SEEDS] = 0
+    take(state, tables, poses, landmarks)
+    relinearized = 0
+    if whole:
+        relinearized = _start_over(state, poses, landmarks)
+    for k in range(count[LISTED]):
+        f = state.due[k]
+        ask(state, state.factors[f]['a'])
+        ask(state, state.factors[f]['b'])
+        relinearized += 1
+    count[LISTED] = 0
+    if count[SEEDS] == 0:
+        return pool, -1, Step(0, 0, 0, 0, 0, 0)
+    anew = take_out(state, pool.view(np.int64))
+    pool = reserve(state, pool, anew)
+    numbers = pool.view(np.int64)
+    of_front = make_cliques(state, numbers, anew)
+    failed, factors = refactor(state, pool, numbers, anew, of_front, losses, poses, landmarks)
+    for n in range(len(anew.unknowns)):
+        state.unknowns[anew.unknowns[n]]['local'] = -1
+    moved, solved = 0, 0
+    if failed < 0:
+        who = np.empty(count[UNKNOWNS], np.int64)
+        moved, solved = propagate(state, pool, numbers, of_front, poses, landmarks, still, who)
+        judge(state, who[:moved], losses, poses, landmarks, due, turn)
+    work = Step(relinearized, factors, len(anew.unknowns), len(anew.cliques), solved, moved)
+    return pool, failed, work
+
+
+@part
+def _start_over(state: State, poses: Array, landmarks: Array) -> int:
+    """Forget the tree and relinearise everything; how many factors."""
+    count = state.counts
+    refer_all(state, poses, landmarks)
+    count[CLIQUES] = count[TOP] = count[LISTED] = 0
+    count[FREE_CLIQUE] = -1
+    for k in range(len(state.free)):
+        state.free[k] = -1
+    for v in range(count[UNKNOWNS]):
+        state.unknowns[v]['clique'] = state.unknowns[v]['local'] = -1
+        if state.unknowns[v]['links'] > 0:
+            ask(state, v)
+    return int(count[FACTORS])
+
+
+class Incremental:
+    """Keeps the estimate in ``graph`` at the minimum of its cost while the graph grows.
+
+    Add nodes and factors to the graph, or switch factors off and on (``enabled``), then call
+    ``update``. New nodes enter with the estimate that they were added with; from then on the
+    estimate is this object's to change. Nodes that no enabled factor touches stay.
+    """
+
+    def __init__(self, graph: Graph, thresholds: Thresholds | None = None) -> None:
+        self.graph = graph
+        self.thresholds = thresholds or Thresholds()
+        self._losses = graph.losses
+        self._state = new_state(64, 64, 64, 256)
+        self._pool = np.empty(1 << 14)
+        self._whole = False
+
+    def update(self, whole: bool = False) -> Step:
+        """One step; with ``whole`` everything is relinearised, ordered and factored anew.
+
+        Raises SolverError, naming the node, if the equations are singular; the next update then
+        starts over.
+        """
+        graph, limits = self.graph, self.thresholds
+        if graph.losses is not self._losses:
+            self._losses, self._whole = graph.losses, True
+        self._reserve()
+        self._pool, failed, step = advance(
+            self._state, self._pool, graph.tables(), graph.poses, graph.landmarks,
+            whole or self._whole, limits.due, limits.turn, limits.still,
+        )  # fmt: skip
+        self._whole = failed >= 0
+        if self._whole:
+            node = self._state.unknowns[failed]
+            name = 'pose' if node['size'] == 3 else 'landmark'
+            raise SolverError(
+                f'normal equations are singular near {name} {node["index"]}: what it is connected '
+                'to is not tied to the map, or has too few measurements'
+            )
+        return step
+
+    def _reserve(self) -> None:
+        """Make room for all that is in the graph."""
+        graph, state = self.graph, self._state
+        tables = graph.edges, graph.sightings, graph.pose_priors, graph.landmark_priors
+        need = (
+            len(graph.poses), len(graph.landmarks), max(map(len, tables)), sum(map(len, tables)),
+        )  # fmt: skip
+        have = (
+            len(state.of_pose), len(state.of_landmark), state.on.shape[1], len(state.factors),
+        )  # fmt: skip
+        if any(n > h for n, h in zip(need, have, strict=True)):
+            sizes = [h if n <= h else max(n, 2 * h) for n, h in zip(need, have, strict=True)]
+            self._state = grown(state, *sizes)
+
+
+def warm_up() -> None:
+    """Compile the kernels of the incremental solver."""
+    graph = Graph()
+    graph.add_pose([0.0, 0.0, 0.0], fixed=True)
+    graph.add_pose([1.0, 0.0, 0.0])
+    graph.add_edge(EdgeKind.ODOMETRY, 0, 1, [1.0, 0.0, 0.0], np.eye(3))
+    Incremental(graph).update()

@@ -1,0 +1,274 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numeric factorisation of a part of the tree: assemble, take up the children, eliminate.
+
+The right-hand side is the last row of every front, so the forward solve comes with the factor.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rlml_slam.compiled import part
+from rlml_slam.graph.dense import partial_cholesky, rank_update
+from rlml_slam.graph.fronts import SINGULAR, highest
+from rlml_slam.graph.increments import (
+    STEP,
+    TOP,
+    State,
+    hang,
+    room_of,
+    take_block,
+    take_clique,
+    with_room,
+)
+from rlml_slam.graph.partial import Part
+from rlml_slam.graph.relinearize import linearize_factor
+from rlml_slam.graph.structure import Ints
+from rlml_slam.se2 import Array
+
+
+@part
+def reserve(state: State, pool: Array, anew: Part) -> Array:
+    """The pool with room for all new cliques."""
+    need = 0
+    for s in range(len(anew.fronts) - 1):
+        width, height = anew.fronts[s]['width'], anew.fronts[s]['height']
+        entries = anew.fronts[s + 1]['start'] - anew.fronts[s]['start']
+        need += room_of(_size(width, height, entries))[1]
+    return with_room(pool, state.counts[TOP], need)
+
+
+@part
+def _size(width: int, height: int, members: int) -> int:
+    below = height + 1 - width
+    return width * (height + 1) + below * below + members
+
+
+@part
+def make_cliques(state: State, numbers: Ints, anew: Part) -> Ints:
+    """Records and blocks of the new cliques, linked; the clique of each front, or -1."""
+    fronts, entries, order = anew.fronts, anew.entries, anew.order
+    m, num = len(anew.unknowns), len(fronts) - 1
+    of_front = np.empty(num, np.int64)
+    for s in range(num - 1, -1, -1):
+        of_front[s] = -1
+        start, end = fronts[s]['start'], fronts[s + 1]['start']
+        own = fronts[s + 1]['first'] - fronts[s]['first']
+        width, height = fronts[s]['width'], fronts[s]['height']
+        if width == 0:
+            continue
+        c = of_front[s] = take_clique(state.cliques, state.counts)
+        clique = state.cliques[c]
+        room, elements = room_of(_size(width, height, end - start))
+        clique['room'], clique['width'], clique['height'] = room, width, height
+        clique['block'] = take_block(state.free, state.counts, numbers, room, elements)
+        clique['child'], clique['mark'] = -1, state.counts[STEP]
+        parent = fronts[s]['parent'] if height > width else -1
+        hang(state.cliques, c, of_front[parent] if parent >= 0 else -1)
+        w = first = clique['block']
+        for p in range(start, end):
+            n = order[entries[p]['position']]
+            if n < m:
+                numbers[w] = anew.unknowns[n]
+                w += 1
+                if p < start + own:
+                    clique['own'] = w - first
+                    state.unknowns[anew.unknowns[n]]['clique'] = c
+            elif n > m and p < start + own:
+                hang(state.cliques, anew.cliques[n - m - 1], c)
+        clique['members'] = w - first
+        clique['panel'] = w
+    return of_front
+
+
+@part
+def refactor(
+    state: State, pool: Array, numbers: Ints, anew: Part, of_front: Ints,
+    losses: Array, poses: Array, landmarks: Array,
+) -> tuple[int, int]:  # fmt: skip
+    """Factor the new cliques: (unknown where that is impossible or -1, factors assembled)."""
+    fronts, entries = anew.fronts, anew.entries
+    most = highest(fronts) + 1
+    row_of = np.empty(len(anew.position), np.int64)
+    column = np.empty(most, np.int64)
+    rows = np.empty(most, np.int64)
+    floor = np.empty(most)
+    assembled = 0
+    for s in range(len(fronts) - 1):
+        c = of_front[s]
+        if c < 0:
+            continue
+        clique = state.cliques[c]
+        at, width, height = clique['panel'], clique['width'], clique['height']
+        tall, below = height + 1, height + 1 - width
+        update = at + width * tall
+        for j in range(height):
+            column[j] = at + j * tall if j < width else update + (j - width) * below - width
+        for k in range(at, update + below * below):
+            pool[k] = 0.0
+        for p in range(fronts[s]['start'], fronts[s + 1]['start']):
+            row_of[anew.order[entries[p]['position']]] = entries[p]['local']
+        for k in range(fronts[s]['first'], fronts[s + 1]['first']):
+            n = anew.order[k]
+            if n < len(anew.unknowns):
+                assembled += _assemble(
+                    state, pool, anew, n, row_of, column, height, losses, poses, landmarks
+                )
+        child = clique['child']
+        while child >= 0:
+            _extend(state, pool, numbers, child, row_of, column, height, rows)
+            child = state.cliques[child]['next']
+        for j in range(width):
+            floor[j] = SINGULAR * pool[at + j * (tall + 1)]
+        if not partial_cholesky(pool, at, width, tall, floor):
+            return numbers[clique['block']], assembled
+        for j in range(0, below - 1, 4):
+            rank_update(
+                pool, update + j * (below + 1), below, min(4, below - 1 - j),
+                pool, at + width + j, tall, width, below - j,
+            )  # fmt: skip
+    return -1, assembled
+
+
+@part
+def _assemble(
+    state: State, pool: Array, anew: Part, n: int, row_of: Ints, column: Ints, height: int,
+    losses: Array, poses: Array, landmarks: Array,
+) -> int:  # fmt: skip
+    """Add the factors of which unknown n of the part is eliminated first; how many."""
+    unknowns, position, num = state.unknowns, anew.position, 0
+    link = unknowns[anew.unknowns[n]]['head']
+    while link >= 0:
+        f, end = link // 2, link % 2
+        z = state.factors[f]
+        link = z['next_a'] if end == 0 else z['next_b']
+        other = z['b'] if end == 0 else z['a']
+        m = n
+        if other >= 0:
+            m = unknowns[other]['local']
+            if m < 0 or position[m] < position[n]:
+                continue
+        linearize_factor(state, f, losses, poses, landmarks)
+        row, row_other = row_of[n], row_of[m]
+        a, b = (row, row_other) if end == 0 else (row_other, row)
+        size = 3
+        if z['a'] < 0:
+            a = -1
+        if z['b'] < 0:
+            b = -1
+        else:
+            size = unknowns[z['b']]['size']
+        _add_factor(z, pool, column, height, a, b, size)
+        num += 1
+    return num
+
+
+@part
+def _add_factor(
+    z: np.void, v: Array, column: Ints, height: int, a: int, b: int, size: int
+) -> None:
+    """Add a factor at rows a and b (-1: none) of a front, with the formulas of linearize.py."""
+    c, s, dx, dy, w = z['C'], z['S'], z['dx'], z['dy'], z['weight']
+    I00, I01, I02 = w * z['I00'], w * z['I01'], w * z['I02']
+    I11, I12, I22 = w * z['I11'], w * z['I12'], w * z['I22']
+    e0, e1, e2 = z['e0'], z['e1'], z['e2']
+    q0 = I00 * e0 + I01 * e1 + I02 * e2
+    q1 = I01 * e0 + I11 * e1 + I12 * e2
+    u0, u1, u2 = c * q0 - s * q1, s * q0 + c * q1, I02 * e0 + I12 * e1 + I22 * e2
+    t00, t01 = I00 * c - I01 * s, I00 * s + I01 * c
+    t10, t11 = I01 * c - I11 * s, I01 * s + I11 * c
+    M00, M01, M11 = c * t00 - s * t10, c * t01 - s * t11, s * t01 + c * t11
+    M02, M12, M22 = c * I02 - s * I12, s * I02 + c * I12, I22
+    n0 = dx * M01 - dy * M00 + M02
+    n1 = dx * M11 - dy * M01 + M12
+    n2 = dx * M12 - dy * M02 + M22
+    if a >= 0:
+        k, k1, k2 = column[a] + a, column[a + 1] + a, column[a + 2] + a
+        v[k] += M00
+        v[k + 1] += M01
+        v[k + 2] += n0
+        v[k1 + 1] += M11
+        v[k1 + 2] += n1
+        v[k2 + 2] += dx * n1 - dy * n0 + n2
+        r = height - a
+        v[k + r] -= u0
+        v[k1 + r] -= u1
+        v[k2 + r] -= dx * u1 - dy * u0 + u2
+    if b >= 0:
+        k, k1 = column[b] + b, column[b + 1] + b
+        r = height - b
+        v[k] += M00
+        v[k + 1] += M01
+        v[k1 + 1] += M11
+        v[k + r] += u0
+        v[k1 + r] += u1
+        if size == 3:
+            k2 = column[b + 2] + b
+            v[k + 2] += M02
+            v[k1 + 2] += M12
+            v[k2 + 2] += M22
+            v[k2 + r] += u2
+    if a < 0 or b < 0:
+        return
+    if a < b:  # H_ba = -M A
+        k, k1, k2 = column[a] + b, column[a + 1] + b, column[a + 2] + b
+        v[k] -= M00
+        v[k + 1] -= M01
+        v[k1] -= M01
+        v[k1 + 1] -= M11
+        v[k2] -= n0
+        v[k2 + 1] -= n1
+        if size == 3:
+            v[k + 2] -= M02
+            v[k1 + 2] -= M12
+            v[k2 + 2] -= n2
+    else:  # H_ab = -A^T M
+        k, k1 = column[b] + a, column[b + 1] + a
+        v[k] -= M00
+        v[k + 1] -= M01
+        v[k + 2] -= n0
+        v[k1] -= M01
+        v[k1 + 1] -= M11
+        v[k1 + 2] -= n1
+        if size == 3:
+            k2 = column[b + 2] + a
+            v[k2] -= M02
+            v[k2 + 1] -= M12
+            v[k2 + 2] -= n2
+
+
+@part
+def _extend(
+    state: State, pool: Array, numbers: Ints, c: int, row_of: Ints, column: Ints, height: int,
+    rows: Ints,
+) -> None:  # fmt: skip
+    """Add the update matrix of clique c to the front of its parent.
+
+    A clique that was there before may have its rows in another order than its new parent.
+    """
+    clique = state.cliques[c]
+    first = clique['block']
+    w, ascending = 0, True
+    for p in range(first + clique['own'], first + clique['members']):
+        u = state.unknowns[numbers[p]]
+        row = row_of[u['local']]
+        ascending = ascending and (w == 0 or row > rows[w - 1])
+        for r in range(u['size']):
+            rows[w] = row + r
+            w += 1
+    rows[w] = height
+    below = w + 1
+    source = clique['panel'] + clique['width'] * (clique['height'] + 1)
+    for j in range(w):
+        t = rows[j]
+        to = column[t]
+        if ascending:
+            for i in range(j, below):
+                pool[to + rows[i]] += pool[source + i]
+        else:
+            for i in range(j, below):
+                if rows[i] >= t:
+                    pool[to + rows[i]] += pool[source + i]
+                else:
+                    pool[column[rows[i]] + t] += pool[source + i]
+        source += below

@@ -1,0 +1,331 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Factors of the incremental solver: taken from the graph, linearised, and judged.
+
+The coordinates are the raw ones of factors.py, so a factor's linear model stays a function of the
+estimate itself and each factor has a linearisation point of its own. With phi and eta what
+theta_i and t_j - t_i have moved by since, p = R^T eta and q = R^T (t_j - t_i), the residual
+differs from its linear model by
+
+    r = (R(phi)^T - 1) q + phi K (q - p),   K = [0 -1; 1 0],
+
+of second order and nothing where only positions moved; and its Jacobian has turned by phi. A
+factor is relinearised when r, or what the change of its robust weight amounts to, is a
+considerable share of its standard deviation, or when phi is.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rlml_slam.compiled import part
+from rlml_slam.graph.increments import (
+    EDGES,
+    FACTORS,
+    LANDMARK_PRIORS,
+    LANDMARKS,
+    LISTED,
+    POSE_PRIORS,
+    POSES,
+    ROWS,
+    SIGHTINGS,
+    STEP,
+    UNKNOWNS,
+    State,
+    ask,
+)
+from rlml_slam.graph.linearize import wrapped
+from rlml_slam.graph.robust import loss
+from rlml_slam.graph.structure import Ints
+from rlml_slam.graph.system import Factors, Flags, Tables
+from rlml_slam.se2 import Array
+
+# what factors are stretched by at most, in sigmas
+USUAL = 4.0
+# the share of the limits above which a factor is relinearised with others
+NEAR = 1.0 / 3.0
+
+
+@part
+def take(state: State, tables: Tables, poses: Array, landmarks: Array) -> None:
+    """Take over what is new in the graph: nodes, factors, factors switched on or off."""
+    count = state.counts
+    for i in range(count[POSES], len(poses)):
+        state.of_pose[i] = -1
+        if not tables.fixed_poses[i]:
+            state.of_pose[i] = _new_unknown(state, 3, i)
+            _refer(state, state.of_pose[i], poses[i, 0], poses[i, 1], poses[i, 2])
+    count[POSES] = len(poses)
+    for i in range(count[LANDMARKS], len(landmarks)):
+        state.of_landmark[i] = -1
+        if not tables.fixed_landmarks[i]:
+            state.of_landmark[i] = _new_unknown(state, 2, i)
+            _refer(state, state.of_landmark[i], landmarks[i, 0], landmarks[i, 1], 0.0)
+    count[LANDMARKS] = len(landmarks)
+    _take_factors(state, EDGES, tables.edges)
+    _take_factors(state, SIGHTINGS, tables.sightings)
+    _take_factors(state, POSE_PRIORS, tables.pose_priors)
+    _take_factors(state, LANDMARK_PRIORS, tables.landmark_priors)
+
+
+@part
+def _new_unknown(state: State, size: int, index: int) -> int:
+    v: int = state.counts[UNKNOWNS]
+    state.counts[UNKNOWNS] += 1
+    u = state.unknowns[v]
+    u['size'], u['index'] = size, index
+    u['clique'] = u['head'] = u['local'] = -1
+    u['links'] = 0
+    u['seeded'] = u['late'] = u['moved'] = 0
+    u['stiff'] = u['turn'] = 0.0
+    return v
+
+
+@part
+def _refer(state: State, v: int, x: float, y: float, theta: float) -> None:
+    """Measure d from this estimate on."""
+    u = state.unknowns[v]
+    u['x'], u['y'], u['theta'] = x, y, theta
+    u['dx'] = u['dy'] = u['dtheta'] = u['sx'] = u['sy'] = u['stheta'] = 0.0
+
+
+@part
+def refer_all(state: State, poses: Array, landmarks: Array) -> None:
+    """Measure all d from the estimate at hand."""
+    for v in range(state.counts[UNKNOWNS]):
+        i = state.unknowns[v]['index']
+        if state.unknowns[v]['size'] == 3:
+            _refer(state, v, poses[i, 0], poses[i, 1], poses[i, 2])
+        else:
+            _refer(state, v, landmarks[i, 0], landmarks[i, 1], 0.0)
+
+
+@part
+def _take_factors(state: State, table: int, factors: Factors) -> None:
+    known: int = state.counts[ROWS + table]
+    rows = len(factors.nodes)
+    on = state.on[table]
+    # 64 flags at a time, which the compiler turns into one comparison
+    for start in range(0, known, 64):
+        end = min(start + 64, known)
+        if _differ(on, factors.enabled, start, end):
+            for r in range(start, end):
+                if on[r] != factors.enabled[r]:
+                    on[r] = not on[r]
+                    _switch(state, state.of_row[table, r], on[r])
+    for r in range(known, rows):
+        f: int = state.counts[FACTORS]
+        state.counts[FACTORS] += 1
+        state.of_row[table, r] = f
+        _copy(state, f, table, factors, r)
+        on[r] = factors.enabled[r]
+        if on[r]:
+            _switch(state, f, True)
+    state.counts[ROWS + table] = rows
+
+
+@part
+def _differ(a: Flags, b: Flags, start: int, end: int) -> bool:
+    different = False
+    for r in range(start, end):
+        different |= a[r] != b[r]
+    return different
+
+
+@part
+def _copy(state: State, f: int, table: int, factors: Factors, r: int) -> None:
+    """Row r of a table into record f."""
+    z, nodes = state.factors[f], factors.nodes
+    measured, info = factors.measured, factors.information
+    z['table'], z['kind'] = table, factors.kinds[r]
+    z['next_a'] = z['next_b'] = z['i'] = z['a'] = -1
+    z['checked'] = 0
+    z['j'] = nodes[r, nodes.shape[1] - 1]
+    if table in (EDGES, SIGHTINGS):
+        z['i'] = nodes[r, 0]
+        z['a'] = state.of_pose[z['i']]
+    on_landmark = table in (SIGHTINGS, LANDMARK_PRIORS)
+    z['b'] = state.of_landmark[z['j']] if on_landmark else state.of_pose[z['j']]
+    x, y = measured[r, 0], measured[r, 1]
+    z['c'], z['s'], z['x'], z['y'], z['theta'] = 1.0, 0.0, x, y, 0.0
+    z['I00'], z['I01'], z['I11'] = info[r, 0, 0], info[r, 0, 1], info[r, 1, 1]
+    z['I02'] = z['I12'] = z['I22'] = 0.0
+    if not on_landmark:
+        z['I02'], z['I12'], z['I22'] = info[r, 0, 2], info[r, 1, 2], info[r, 2, 2]
+        z['theta'] = measured[r, 2]
+    if table == EDGES:
+        c, s = math.cos(z['theta']), math.sin(z['theta'])
+        z['c'], z['s'], z['x'], z['y'] = c, s, c * x + s * y, c * y - s * x
+
+
+@part
+def _switch(state: State, f: int, on: bool) -> None:
+    """Let a factor take part, or no longer."""
+    z = state.factors[f]
+    for end in range(2):
+        v = z['a'] if end == 0 else z['b']
+        if v < 0:
+            continue
+        u = state.unknowns[v]
+        if on:
+            if end == 0:
+                z['next_a'] = u['head']
+            else:
+                z['next_b'] = u['head']
+            u['head'] = 2 * f + end
+            u['links'] += 1
+        else:
+            _unlink(state, v, 2 * f + end)
+            u['links'] -= 1
+        sign = 1.0 if on else -1.0
+        stiff = z['I00'] + z['I11']
+        arm = z['x'] * z['x'] + z['y'] * z['y'] if end == 0 else 0.0
+        u['stiff'] += sign * stiff
+        u['turn'] += sign * (z['I22'] + arm * stiff)
+        u['late'] = state.counts[STEP]
+        ask(state, v)
+
+
+@part
+def _unlink(state: State, v: int, link: int) -> None:
+    """Take a factor's end out of the chain of unknown v."""
+    after = _next(state, link)
+    k = state.unknowns[v]['head']
+    if k == link:
+        state.unknowns[v]['head'] = after
+        return
+    while _next(state, k) != link:
+        k = _next(state, k)
+    if k % 2 == 0:
+        state.factors[k // 2]['next_a'] = after
+    else:
+        state.factors[k // 2]['next_b'] = after
+
+
+@part
+def _next(state: State, link: int) -> int:
+    z = state.factors[link // 2]
+    after: int = z['next_a'] if link % 2 == 0 else z['next_b']
+    return after
+
+
+@part
+def linearize_factor(state: State, f: int, losses: Array, poses: Array, landmarks: Array) -> None:
+    """Linearise a factor at the estimate at hand."""
+    z, unknowns = state.factors[f], state.unknowns
+    i, j, a, b = z['i'], z['j'], z['a'], z['b']
+    on_landmark = z['table'] in (SIGHTINGS, LANDMARK_PRIORS)
+    dx, dy = (landmarks[j, 0], landmarks[j, 1]) if on_landmark else (poses[j, 0], poses[j, 1])
+    c, s, theta = z['c'], z['s'], 0.0
+    if i >= 0:
+        theta = poses[i, 2]
+        cos, sin = math.cos(theta), math.sin(theta)
+        c, s = cos * z['c'] - sin * z['s'], sin * z['c'] + cos * z['s']
+        dx -= poses[i, 0]
+        dy -= poses[i, 1]
+    e0, e1 = c * dx + s * dy - z['x'], c * dy - s * dx - z['y']
+    e2 = 0.0 if on_landmark else wrapped(poses[j, 2] - theta - z['theta'])
+    z['C'], z['S'], z['dx'], z['dy'] = c, s, dx, dy
+    z['from'] = unknowns[a]['theta'] + unknowns[a]['dtheta'] if a >= 0 else theta
+    z['arm'] = math.sqrt((z['I00'] + z['I11']) * (dx * dx + dy * dy))
+    z['weight'] = loss(losses[z['kind'], 0], losses[z['kind'], 1], _squared(z, e0, e1, e2))[1]
+    # e + J d is linear, so where all d are zero it is e - J d
+    x = y = t = 0.0
+    if b >= 0:
+        x, y, t = unknowns[b]['dx'], unknowns[b]['dy'], unknowns[b]['dtheta']
+    if a >= 0:
+        t_a = unknowns[a]['dtheta']
+        x -= unknowns[a]['dx'] - dy * t_a
+        y -= unknowns[a]['dy'] + dx * t_a
+        t -= t_a
+    z['e0'], z['e1'] = e0 - (c * x + s * y), e1 - (c * y - s * x)
+    z['e2'] = 0.0 if on_landmark else e2 - t
+
+
+@part
+def _squared(z: np.void, e0: float, e1: float, e2: float) -> float:
+    q0 = z['I00'] * e0 + z['I01'] * e1 + z['I02'] * e2
+    q1 = z['I01'] * e0 + z['I11'] * e1 + z['I12'] * e2
+    q2 = z['I02'] * e0 + z['I12'] * e1 + z['I22'] * e2
+    total: float = e0 * q0 + e1 * q1 + e2 * q2
+    return total
+
+
+@part
+def judge(
+    state: State, moved: Ints, losses: Array, poses: Array, landmarks: Array, due: float,
+    turn: float,
+) -> None:  # fmt: skip
+    """List the factors of the unknowns ``moved`` that have to be relinearised.
+
+    That is nothing unless a linear model is off by ``due`` sigmas or a pose has turned by
+    ``turn``; then it is all that are a third as far: forces of factors that were linearised at
+    different headings do not balance, so what turned together is relinearised together.
+    """
+    counts = state.counts
+    robust = False
+    for k in range(len(losses)):
+        robust = robust or losses[k, 0] != 0
+    worst = 0.0
+    for n in range(len(moved)):
+        u = state.unknowns[moved[n]]
+        if not robust and u['size'] == 2:
+            continue
+        link = u['head']
+        while link >= 0:
+            f, end = link // 2, link % 2
+            z = state.factors[f]
+            link = z['next_a'] if end == 0 else z['next_b']
+            if not robust:
+                # factors are stretched by some sigmas at most: most need no closer look
+                phi = abs(u['theta'] + u['dtheta'] - z['from'])
+                small = phi < NEAR * turn and phi * (USUAL + 0.5 * phi * z['arm']) < NEAR * due
+                if end == 1 or small:
+                    continue
+            if z['checked'] == counts[STEP]:
+                continue
+            z['checked'] = counts[STEP]
+            error = _error(state, f, losses, poses, landmarks, due, turn)
+            if error > NEAR * NEAR:
+                worst = max(worst, error)
+                state.due[counts[LISTED]] = f
+                counts[LISTED] += 1
+    if worst < 1.0:
+        counts[LISTED] = 0
+
+
+@part
+def _error(
+    state: State, f: int, losses: Array, poses: Array, landmarks: Array, due: float, turn: float
+) -> float:
+    """Squared error of a factor's linear model, 1 where it is due."""
+    z = state.factors[f]
+    i, j, kind = z['i'], z['j'], z['kind']
+    robust = losses[kind, 0] != 0
+    if i < 0 and not robust:
+        return 0.0
+    on_landmark = z['table'] in (SIGHTINGS, LANDMARK_PRIORS)
+    dx, dy = (landmarks[j, 0], landmarks[j, 1]) if on_landmark else (poses[j, 0], poses[j, 1])
+    theta = 0.0
+    if i >= 0:
+        theta = poses[i, 2]
+        dx -= poses[i, 0]
+        dy -= poses[i, 1]
+    C, S = z['C'], z['S']
+    phi = wrapped(theta - z['from'])
+    q0, q1 = C * dx + S * dy, C * dy - S * dx
+    cos, sin = math.cos(phi), math.sin(phi)
+    # R(phi)^T q, and phi K R^T d_0 with q - p = R^T d_0
+    e0, e1 = cos * q0 + sin * q1, cos * q1 - sin * q0
+    d0, d1 = C * z['dx'] + S * z['dy'], C * z['dy'] - S * z['dx']
+    r0, r1 = e0 - q0 - phi * d1, e1 - q1 + phi * d0
+    w = z['weight']
+    error: float = w * _squared(z, r0, r1, 0.0)
+    if robust:
+        e2 = 0.0 if on_landmark else wrapped(poses[j, 2] - theta - z['theta'])
+        squared = _squared(z, e0 - z['x'], e1 - z['y'], e2)
+        new = loss(losses[kind, 0], losses[kind, 1], squared)[1]
+        # a weight that changes by dw pulls like a residual that changes by dw / w
+        error += (new - w) * (new - w) * squared / max(w, new, 1e-6)
+    return error / (due * due) + phi * phi / (turn * turn)
