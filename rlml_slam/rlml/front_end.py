@@ -384,11 +384,14 @@ class FrontEnd:
         self, observation: Observation, matched: _Matched, evidence: Evidence
     ) -> bool:
         """Whether the frame contradicts the map; while mapping, a new place does not forever."""
+        d = observation.detections
+        # one that tells who it is tells the back end more than that it does not fit here
+        told = 0 if d is None else int(((d.ids != ANONYMOUS) & matched.open).sum())
         contradicted = self.doubt.judge(
             observation.stamp,
             evidence.misfit,
             evidence.used and self.health.weak_direction(evidence) is None,
-            len(matched.status),
+            len(matched.status) - told,
             matched.num_used,
             bool(self.tracks.surveyed.any()),
         )

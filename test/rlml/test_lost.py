@@ -236,3 +236,16 @@ def test_recovery_leaves_a_robot_alone_that_is_not_lost():
     for f in frames:
         recovery.look(replace(f, doubtful=True), lambda: looks.append(1) or slam.map(), False)
         assert bool(looks) == (f.stamp - FIRST >= 6 * STEP)
+
+
+def test_reflectors_that_tell_who_they_are_are_left_to_the_back_end():
+    """They were moved, not the robot: the ids say so, and the map has to learn it."""
+    moved = replace(ROOM, reflectors=ROOM.reflectors[::-1].copy())
+    kw = {'scan': False, 'rng': np.random.default_rng(0)}
+    front_end = FrontEnd(Parameters())
+    for o in observations(ROOM, LOOP[:40], ids=True, **kw):
+        assert not front_end.process(o).doubtful
+    for ids in (True, False):
+        (o,) = observations(moved, [np.array([0.7, 0.9, 2.0])], ids=ids, **kw)
+        later = replace(o, stamp=FIRST + (41 - ids) * STEP)
+        assert front_end.process(later).doubtful is not ids
