@@ -18,11 +18,14 @@ SHARE = 1.0 / 3.0  # of the detections that must match, ghosts being up to half 
 
 
 class Doubt:
-    """Judges frame by frame; ``since`` is the stamp [ns] of the first contradiction, or None."""
+    """Judges frame by frame; ``since`` is the stamp [ns] of the first contradiction, or None.
+
+    ``usual`` is the score of scans lately.
+    """
 
     def __init__(self, limits: HealthLimits) -> None:
         self._limits = limits
-        self._usual = 0.0
+        self.usual = 0.0
         self._fits = 0
         self._matched = -(2**62)
         self.since: int | None = None
@@ -31,7 +34,7 @@ class Doubt:
         """Whether a scan fits far worse than usual a submap of so many scans."""
         if self._fits < SETTLED or insertions < SETTLED:
             return False
-        return score < self._limits.doubt_share * self._usual
+        return score < self._limits.doubt_share * self.usual
 
     def judge(
         self,
@@ -63,7 +66,7 @@ class Doubt:
         """How well a scan fitted that was used."""
         self._fits += 1
         weight = max(MEMORY, 1.0 / self._fits)
-        self._usual += weight * (score - self._usual)
+        self.usual += weight * (score - self.usual)
 
     def lasts(self, stamp: int, duration: float) -> bool:
         """Whether every frame has contradicted for this long [s]."""

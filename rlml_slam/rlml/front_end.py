@@ -26,6 +26,7 @@ from rlml_slam.rlml.health import Evidence, HealthMonitor
 from rlml_slam.rlml.joint_state import BIAS, JointState
 from rlml_slam.rlml.relocalize import is_mapped
 from rlml_slam.rlml.scan_update import fuse, prior_of
+from rlml_slam.rlml.second_look import second_look
 from rlml_slam.rlml.submaps import Submaps
 from rlml_slam.rlml.tracks import Tracks
 from rlml_slam.se2 import Array
@@ -336,6 +337,9 @@ class FrontEnd:
             searched = match(submap, points, prior, strength, p)
             found = searched if searched.score > found.score else found
         misfit = self.doubt.misfits(found.score, submap.insertions)
+        if misfit and not matched.agrees and not self._lasts(observation.stamp):
+            found = second_look(submap, points, prior, self.doubt.usual, self._p) or found
+            misfit = self.doubt.misfits(found.score, submap.insertions)
         if found.score < p.min_score or (misfit and not matched.agrees):
             return Evidence(scan=True, misfit=misfit, beams=len(points), score=found.score)
         self.doubt.learn(found.score)
@@ -401,9 +405,12 @@ class FrontEnd:
             return False
         return contradicted
 
+    def _lasts(self, stamp: int) -> bool:
+        """Whether the contradiction lasts for so long that the robot is lost."""
+        return self.doubt.lasts(stamp, self._p.health.lost_time)
+
     def _judge(self, observation: Observation, matched: _Matched, evidence: Evidence) -> Health:
         unconfirmed = self._is_unconfirmed(matched)
-        lasts = self.doubt.lasts(observation.stamp, self._p.health.lost_time)
         return self.health.judge(
             observation.stamp,
             evidence,
@@ -412,7 +419,7 @@ class FrontEnd:
             used=matched.num_used,
             cov=self.state.P[:3, :3],
             unconfirmed=unconfirmed,
-            contradicted=lasts and not unconfirmed,
+            contradicted=self._lasts(observation.stamp) and not unconfirmed,
         )
 
     def _is_unconfirmed(self, matched: _Matched) -> bool:
