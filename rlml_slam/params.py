@@ -197,12 +197,15 @@ class Reflector(Group):
     blur: float = param(
         4.0, 'anonymous reflectors within this many sigmas of a detection are one', '', 0.0, 100.0
     )
-    ambiguity: float = param(
-        0.0,
-        'lead of the best match over the next, in squared sigmas, to be used; 0 is off',
-        '',
-        0.0,
-        100.0,
+    density: float = param(
+        0.02, 'reflectors per area that may stand unmapped: what a match competes with', '1/m²',
+        1e-6, 10.0,
+    )  # fmt: skip
+    sure: float = param(
+        0.99, 'probability of a match of an anonymous reflector to be used at once', '', 0.5, 1.0
+    )
+    track_timeout: float = param(
+        3.0, 'a reflector seen within this time is the same one without a doubt', 's', 0.0, 60.0
     )
     min_separation: float = param(
         0.25, 'reflectors closer than this cannot be told apart', 'm', 0.0, 10.0

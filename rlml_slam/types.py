@@ -113,7 +113,9 @@ class Status(IntEnum):
     """What became of one reflector detection.
 
     GATED fits no reflector and is too near to one to be another; NEW begins a candidate; GHOST is
-    of no reflector of a map that does not change; AMBIGUOUS fits more than one.
+    of no reflector of a map that does not change; AMBIGUOUS fits more than one. DOUBTFUL may be a
+    known one, but the pose is too uncertain to tell: it is kept apart like a new one, until the
+    back end can say which it is.
     """
 
     USED = 0
@@ -121,6 +123,7 @@ class Status(IntEnum):
     NEW = 2
     GHOST = 3
     AMBIGUOUS = 4
+    DOUBTFUL = 5
 
 
 class Level(IntEnum):

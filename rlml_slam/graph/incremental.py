@@ -177,7 +177,7 @@ class Incremental:
             self._state = grown(state, *sizes)
 
 
-def warm_up() -> None:
+def compile_kernels() -> None:
     """Compile the kernels of the incremental solver."""
     graph = Graph()
     graph.add_pose([0.0, 0.0, 0.0], fixed=True)

@@ -7,6 +7,7 @@ errors that they share (a turned robot, a shifted map) do not count twice.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ from rlml_slam.params import Reflector
 from rlml_slam.se2 import Array
 from rlml_slam.types import ANONYMOUS, Detections, Status
 
+WIDE = math.log(16.0)  # of the area of an ellipse, squared: each axis twice the detection's
 MAX_NODES = 400  # of the joint compatibility search: bounds its time, never reached in the hall
 
 
@@ -26,13 +28,17 @@ MAX_NODES = 400  # of the joint compatibility search: bounds its time, never rea
 class Believed:
     """Reflectors as believed; ``cov`` (3 + 2m, 3 + 2m) is joint, with the pose first.
 
-    ``pose`` (3,), ``points`` (m, 2), ``ids`` (m,).
+    ``pose`` (3,), ``points`` (m, 2), ``ids`` (m,). ``recent`` (m,): seen so shortly ago that what
+    is there now is the same one; where it is given, any other anonymous match must be sure.
+    ``spread2`` (m,) [m²] is variance per axis that every detection of a reflector has besides.
     """
 
     pose: Array
     points: Array
     ids: NDArray[np.int64]
     cov: Array
+    recent: NDArray[np.bool_] | None = None
+    spread2: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -83,49 +89,70 @@ class Associator:
         status = np.full(k, Status.NEW, dtype=np.int64)
         distance2 = np.full(k, np.nan)
         if k == 0 or m == 0:
+            if believed.recent is not None:
+                self._keep_apart(detections, status)
             return Association(match, status, distance2)
         z, J, Rt = predict(believed.pose, believed.points)
         nu = detections.points[:, None, :] - z[None, :, :]
         S = _innovation_cov(believed.cov, J, Rt)[None] + detections.cov[:, None]
+        if believed.spread2 is not None:
+            S = S + believed.spread2[:, None, None] * np.eye(2)
         d2 = _mahalanobis2(nu, S)
         log_det = np.log(S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0])
         compatible = self._compatible(detections, believed, d2)
         rows, cols = self._nearest(d2 + log_det - log_det.min(), compatible)
         if self._in_doubt(rows, cols, nu, compatible, believed, J, Rt, detections):
             rows, cols = self._jointly(nu, d2, compatible, believed, J, Rt, detections)
-        if len(rows) and self._p.ambiguity > 0.0:
-            sure = self._sure(rows, cols, d2 + log_det, compatible, detections)
+        anonymous = detections.ids == ANONYMOUS
+        wide = np.zeros(k, dtype=np.bool_)
+        recent = believed.recent
+        if recent is not None:
+            wide = anonymous & self._is_wide(log_det, d2 + log_det, detections.cov)
+            wide &= ~self._inseparable(detections, believed.points[recent], believed.pose)
+            wide &= ~(d2[:, recent] < self._new_gate).any(axis=1)
+            odds = self._odds(rows, cols, d2, log_det)
+            sure = ~anonymous[rows] | recent[cols] | (odds > self._p.sure)
             rows, cols = rows[sure], cols[sure]
         match[rows] = cols
         status[rows] = Status.USED
         distance2[rows] = d2[rows, cols]
         # what lies near a known reflector without matching it is neither used nor new
-        near = (d2.min(axis=1) < self._new_gate) | self._inseparable(detections, believed)
+        near = (d2.min(axis=1) < self._new_gate) | self._inseparable(
+            detections, believed.points, believed.pose
+        )
         known = np.isin(detections.ids, believed.ids) & (detections.ids != ANONYMOUS)
         unknown = (detections.ids != ANONYMOUS) & ~known
         gated = (match < 0) & (near | known) & ~unknown
         status[gated] = np.where(compatible[gated].any(axis=1), Status.AMBIGUOUS, Status.GATED)
+        status[gated & wide] = Status.DOUBTFUL
+        if recent is not None:
+            self._keep_apart(detections, status)
         return Association(match, status, distance2)
 
-    def _sure(
-        self,
-        rows: NDArray[np.int64],
-        cols: NDArray[np.int64],
-        cost: Array,
-        compatible: NDArray[np.bool_],
-        detections: Detections,
-    ) -> NDArray[np.bool_]:
-        """(q,): no other reflector explains the detection nearly as well; ids are always sure.
+    def _odds(
+        self, rows: NDArray[np.int64], cols: NDArray[np.int64], d2: Array, log_det: Array
+    ) -> Array:
+        """Probability (q,) of each match, against all other reflectors and one not yet mapped.
 
-        A detection that could be of two reflectors waits until others have told them apart: one
-        wrong match costs more than many that are not used.
+        The latter stands anywhere with ``density``, so a match counts for nothing where the pose
+        is so uncertain that an unknown reflector would be expected within its ellipse as well.
+        One wrong match costs more than many that wait.
         """
-        others = np.where(compatible, cost, np.inf)
-        own = others[rows, cols]
-        others[rows, cols] = np.inf
-        lead = others[rows].min(axis=1) - own
-        sure: NDArray[np.bool_] = (lead > self._p.ambiguity) | (detections.ids[rows] != ANONYMOUS)
-        return sure
+        peak = np.exp(-0.5 * log_det[rows]) / (2.0 * math.pi)
+        likelihood = peak * np.exp(-0.5 * d2[rows])
+        i = np.arange(len(rows))
+        against_others = likelihood[i, cols] / likelihood.sum(axis=1)
+        against_unknown = peak[i, cols] / (peak[i, cols] + self._p.density)
+        odds: Array = against_others * against_unknown
+        return odds
+
+    @staticmethod
+    def _is_wide(log_det: Array, cost: Array, cov: Array) -> NDArray[np.bool_]:
+        """(k,): the likeliest reflector's place is less certain than the detection itself."""
+        likeliest = np.argmin(cost, axis=1)
+        own = np.log(np.linalg.det(cov))
+        wide: NDArray[np.bool_] = log_det[np.arange(len(cov)), likeliest] > own + WIDE
+        return wide
 
     def _compatible(
         self, detections: Detections, believed: Believed, d2: Array
@@ -137,19 +164,48 @@ class Associator:
         ok: NDArray[np.bool_] = (same & (d2 < self._new_gate)) | (anonymous & (d2 < self._gate))
         return ok
 
-    def _inseparable(self, detections: Detections, believed: Believed) -> NDArray[np.bool_]:
+    def doubles(self, detections: Detections, match: NDArray[np.int64]) -> NDArray[np.int64]:
+        """(k,): the match that an anonymous unmatched detection cannot be told from, or -1."""
+        out = np.full(len(detections), -1, dtype=np.int64)
+        matched = np.flatnonzero(match >= 0)
+        if not len(matched):
+            return out
+        limit = self._separable(detections)
+        for k in np.flatnonzero((match < 0) & (detections.ids == ANONYMOUS)):
+            gap = np.linalg.norm(detections.points[matched] - detections.points[k], axis=-1)
+            near = int(np.argmin(gap))
+            if gap[near] < limit[k]:
+                out[k] = matched[near]
+        return out
+
+    def _inseparable(
+        self, detections: Detections, points: Array, pose: Array
+    ) -> NDArray[np.bool_]:
         """(k,): closer to a known reflector than two reflectors can be told apart.
 
         That is ``min_separation``, and never less than what the detection's own noise allows: of
         two markers within it, an anonymous detection can be of either, and both count as one.
         """
-        p = se2.transform(believed.pose, detections.points)
-        gap = np.linalg.norm(p[:, None] - believed.points[None], axis=-1)
+        p = se2.transform(pose, detections.points)
+        gap = np.linalg.norm(p[:, None] - points[None], axis=-1)
+        near: NDArray[np.bool_] = (gap < self._separable(detections)[:, None]).any(axis=1)
+        return near
+
+    def _separable(self, detections: Detections) -> Array:
+        """Distance (k,) from which on two reflectors can be told apart."""
         noise = np.sqrt(np.linalg.eigvalsh(detections.cov)[:, -1])
         blur = np.where(detections.ids == ANONYMOUS, self._p.blur * noise, 0.0)
-        limit = np.maximum(self._p.min_separation, blur)
-        near: NDArray[np.bool_] = gap.min(axis=1) < limit
-        return near
+        return np.maximum(self._p.min_separation, blur)
+
+    def _keep_apart(self, detections: Detections, status: NDArray[np.int64]) -> None:
+        """Of unknown detections that cannot be told apart, only the first begins a reflector."""
+        fresh = np.flatnonzero(np.isin(status, (Status.NEW, Status.DOUBTFUL)))
+        limit = self._separable(detections)
+        for i, k in enumerate(fresh):
+            gap = np.linalg.norm(detections.points[fresh[:i]] - detections.points[k], axis=-1)
+            begun = status[fresh[:i]] != Status.AMBIGUOUS
+            if detections.ids[k] == ANONYMOUS and (begun & (gap < limit[k])).any():
+                status[k] = Status.AMBIGUOUS
 
     @staticmethod
     def _nearest(

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from rlml_slam.graph.robust import Loss, Losses, LossKind
 from rlml_slam.graph.solver import optimize
 from rlml_slam.maps.occupancy import OccupancyGrid, render
 from rlml_slam.params import Parameters
+from rlml_slam.rlml.deferred import DeferredMatches
 from rlml_slam.rlml.keyframes import Interval, Keyframe
 from rlml_slam.rlml.loop_closure import Closure, ScanGraph
 from rlml_slam.rlml.reflector_graph import ReflectorGraph
@@ -56,7 +57,9 @@ class BackEnd:
         self.keyframes: list[Keyframe] = []
         self.scans = ScanGraph(p, self.graph)
         self.reflector_graph = ReflectorGraph(p.reflector, self.graph)
+        self.deferred = DeferredMatches(p.reflector, self.graph, self.reflector_graph)
         self.T_map_local = np.zeros(3)
+        self._optimized = False
         self._interval: Interval | None = None
         self._since_optimized = 0
         self._stamps: list[int] = []
@@ -96,19 +99,19 @@ class BackEnd:
         return moved and (frame.stamp - last.stamp) * 1e-9 >= p.minimum_time
 
     def _add_keyframe(self, frame: Frame, began: float) -> Update:
+        self._optimized = False
         key = self._node(frame)
         closures: tuple[Closure, ...] = ()
         if key.points is not None:
             closures = self.scans.add(key)
         self._since_optimized += 1
         due = self._since_optimized >= self._p.back_end.optimize_every
-        changed = due and (self.scans.changed or self.reflector_graph.changed)
-        if changed:
+        if due and (self.scans.changed or self.reflector_graph.changed):
             self.optimize()
         return Update(
             key.index,
             self.T_map_local,
-            changed,
+            self._optimized,
             closures,
             (time.perf_counter() - began) * 1e3,
         )
@@ -121,7 +124,7 @@ class BackEnd:
             index = self.graph.add_pose(frame.T_local_base, fixed=True)
             since, scanned = o.motion, False
         else:
-            self.reflector_graph.add(len(self.keyframes) - 1, interval)
+            self._see_reflectors(interval)
             since, scanned = interval.motion, interval.scanned
             last = self.keyframes[-1]
             # with scans the front end's motion is the better mean; without, it holds the
@@ -140,6 +143,7 @@ class BackEnd:
             self.graph.add_edge(
                 EdgeKind.ODOMETRY, index - 1, index, delta, relative_information(delta, cov)
             )
+            self.deferred.move(delta, cov)
         # a scan that the front end could not place has no place in the map either
         placed = frame.scan_used or not self.keyframes
         key = Keyframe(
@@ -150,13 +154,35 @@ class BackEnd:
         self._interval = Interval(frame.T_local_base)
         return key
 
+    def _see_reflectors(self, interval: Interval) -> None:
+        """The reflectors seen near the newest keyframe, and what they tell of earlier ones."""
+        pose = len(self.keyframes) - 1
+        if self.deferred.begins(interval):
+            self.optimize()
+        self.deferred.see(pose, interval)
+        self.reflector_graph.add(pose, interval)
+        if self.deferred.decide():
+            self._rejoin()
+
+    def _rejoin(self) -> None:
+        """Solve after reflectors were joined that stood apart, as far as the drift had gone.
+
+        To the robust losses such a joint looks like an outlier: they come second.
+        """
+        robust = self.graph.losses
+        self.graph.losses = replace(robust, odometry=Loss(), reflector=Loss())
+        optimize(self.graph, self._p.solver)
+        self.graph.losses = robust
+        self.optimize()
+
     def optimize(self) -> None:
         """Solve eq. 13, merge reflectors that turned out to be one, correct the local frame."""
         if len(self.keyframes) < 2:
             return
         optimize(self.graph, self._p.solver)
-        if self.reflector_graph.merge():
+        if self.reflector_graph.merge(self.deferred.pending):
             optimize(self.graph, self._p.solver)
+        self._optimized = True
         self._since_optimized = 0
         self.scans.changed = self.reflector_graph.changed = False
         last = self.keyframes[-1]
@@ -171,9 +197,11 @@ class BackEnd:
     def finish(self) -> None:
         """Use what is still collected, look for the last closures and optimise."""
         if self._interval is not None and self.keyframes:
-            self.reflector_graph.add(len(self.keyframes) - 1, self._interval)
+            self._see_reflectors(self._interval)
             self._interval = Interval(self.keyframes[-1].T_local)
             self.scans.finish()
+            if self.deferred.decide(final=True):
+                self._rejoin()
             self.optimize()
 
     # --- products ------------------------------------------------------------------------------

@@ -148,8 +148,6 @@ class FrontEnd:
         Both come from the same detections, so a difference beyond the gate is no noise: one of
         them linearised too early, or took one reflector for another, and it is not the graph.
         """
-        if set(belief.aliases) & {int(k) for k in self.tracks.keys}:
-            return True
         mine, theirs = self._common(belief)
         if not len(mine):
             return False
@@ -197,6 +195,7 @@ class FrontEnd:
         self._use_grid(observation)
         self._use_reflectors(observation, matched)
         doubtful = self._is_doubtful(observation, matched, evidence)
+        observation = self._with_spread(observation, matched)
         self._map_reflectors(observation, matched, doubtful)
         self._map_scan(observation, evidence, doubtful and evidence.misfit)
         self._remember_velocity(before, observation.stamp)
@@ -247,6 +246,8 @@ class FrontEnd:
                 self.state.landmarks(),
                 self.tracks.ids,
                 self.state.pose_and_landmarks_cov(),
+                self._recent(observation.stamp),
+                self.tracks.spread2,
             ),
         )
         taken = np.isin(result.match, matched.index[matched.index >= 0]) & (result.match >= 0)
@@ -257,8 +258,37 @@ class FrontEnd:
         k, index = rows[used], result.match[used]
         matched.index[k] = index
         matched.distance2[k] = result.distance2[used]
-        self._update_reflectors(detections.points[k], detections.cov[k], index, matched, k)
+        R = detections.cov[k] + self.tracks.spread2[index][:, None, None] * np.eye(2)
+        self._update_reflectors(detections.points[k], R, index, matched, k)
         self.tracks.see(index, observation.stamp, detections.ids[k])
+
+    def _with_spread(self, observation: Observation, matched: _Matched) -> Observation:
+        """The observation with what its detections' groups add to their noise; learns of groups.
+
+        Where two detections at once are of one reflector, that is several which cannot be told
+        apart, and each detection is of any of them.
+        """
+        detections = observation.detections
+        if detections is None or not len(detections):
+            return observation
+        seen = np.flatnonzero(matched.index >= 0)
+        spread2 = np.zeros(len(detections))
+        spread2[seen] = self.tracks.spread2[matched.index[seen]]
+        if self._p.node.mode == 'mapping':
+            double = self._associator.doubles(detections, matched.index)
+            for k in np.flatnonzero(double >= 0):
+                gap = detections.points[k] - detections.points[double[k]]
+                self.tracks.see_double(int(matched.index[double[k]]), float(np.linalg.norm(gap)))
+        if not spread2.any():
+            return observation
+        cov = detections.cov + spread2[:, None, None] * np.eye(2)
+        return replace(observation, detections=replace(detections, cov=cov))
+
+    def _recent(self, stamp: int) -> NDArray[np.bool_] | None:
+        """(m,): reflectors that were in view a moment ago; a given map needs no such care."""
+        if self._p.node.mode != 'mapping':
+            return None
+        return stamp - self.tracks.last_seen < self._p.reflector.track_timeout * 1e9
 
     def _update_reflectors(
         self,
@@ -302,7 +332,7 @@ class FrontEnd:
             # a map that never changes has all reflectors that there are
             matched.status[matched.status == Status.NEW] = Status.GHOST
         elif detections is not None and not doubtful:
-            for k in np.flatnonzero(matched.status == Status.NEW):
+            for k in np.flatnonzero(np.isin(matched.status, (Status.NEW, Status.DOUBTFUL))):
                 matched.index[k] = self.state.add_landmark(detections.points[k], detections.cov[k])
                 self.tracks.append(
                     observation.stamp, int(detections.ids[k]), float(detections.diameters[k])

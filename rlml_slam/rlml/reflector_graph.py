@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -57,12 +58,16 @@ class ReflectorGraph:
             # errors of a sensor are alike from one message to the next: many do not average out
             worth = 1.0 / (1.0 + self._p.alike * (s.count - 1))
             landmark.sightings.append((pose, s.z, worth * s.information, -1))
-            if landmark.index >= 0:
-                self._link(landmark, len(landmark.sightings) - 1)
-            elif landmark.count >= self._p.min_sightings:
+            if landmark.index < 0 and landmark.count >= self._p.min_sightings:
                 point = transform(self._graph.poses[pose], s.z[None])[0]
                 landmark.index = self._graph.add_landmark(point)
-                for k in range(len(landmark.sightings)):
+            self._link_all(landmark)
+
+    def _link_all(self, landmark: _Landmark) -> None:
+        """Give a landmark of the graph the factors that it still lacks."""
+        if landmark.index >= 0:
+            for k, (_, _, _, factor) in enumerate(landmark.sightings):
+                if factor < 0:
                     self._link(landmark, k)
 
     def _link(self, landmark: _Landmark, k: int) -> None:
@@ -79,9 +84,18 @@ class ReflectorGraph:
     def _alive(self) -> list[_Landmark]:
         return [m for m in self._landmarks.values() if m.index >= 0]
 
-    def merge(self) -> bool:
-        """Make one of each pair that is close, statistically equal and never seen together."""
-        alive = self._alive()
+    def is_mapped(self, key: int) -> bool:
+        """Whether the reflector has entered the graph."""
+        landmark = self._landmarks.get(self.resolve(key))
+        return landmark is not None and landmark.index >= 0
+
+    def merge(self, pending: Collection[int] = ()) -> bool:
+        """Make one of each pair that is close, statistically equal and never seen together.
+
+        Where the two places are uncertain, that could as well be two reflectors, and is left;
+        those whose keys are ``pending`` are another's to decide.
+        """
+        alive = [m for m in self._alive() if m.key not in pending]
         if len(alive) < 2:
             return False
         points = self._graph.landmarks[[m.index for m in alive]]
@@ -96,10 +110,13 @@ class ReflectorGraph:
         for i, j in sorted(pairs, key=lambda p: gap[p[0], p[1]]):
             if i in merged or j in merged:
                 continue
-            cov = _difference_cov(marginals, alive[i].index, alive[j].index)
+            cov = _difference_cov(marginals, alive[i].index, alive[j].index) + 1e-6 * np.eye(2)
+            peak = 1.0 / (2.0 * math.pi * math.sqrt(np.linalg.det(cov)))
+            if peak < self._p.sure * (peak + self._p.density):
+                continue
             d = points[i] - points[j]
             near = gap[i, j] < self._p.min_separation
-            if near or d @ np.linalg.solve(cov + 1e-6 * np.eye(2), d) < limit:
+            if near or d @ np.linalg.solve(cov, d) < limit:
                 self._absorb(alive[i], alive[j])
                 merged |= {i, j}
         return bool(merged)
@@ -111,18 +128,30 @@ class ReflectorGraph:
             return True
         return not {s[0] for s in a.sightings}.isdisjoint(s[0] for s in b.sightings)
 
+    def join(self, a: int, b: int) -> None:
+        """The reflectors of two keys are one; the one that the graph has longer goes on."""
+        first, second = (
+            self._landmarks.setdefault(key, _Landmark(key)) for key in map(self.resolve, (a, b))
+        )
+        if first is second:
+            return
+        if first.index < 0 <= second.index:
+            first, second = second, first
+        self._absorb(first, second)
+
     def _absorb(self, keep: _Landmark, gone: _Landmark) -> None:
         for pose, z, information, factor in gone.sightings:
-            self._graph.sightings.enabled[factor] = False
+            if factor >= 0:
+                self._graph.sightings.enabled[factor] = False
             keep.sightings.append((pose, z, information, -1))
-            self._link(keep, len(keep.sightings) - 1)
+        self._link_all(keep)
         keep.count += gone.count
         keep.id = gone.id if keep.id == ANONYMOUS else keep.id
         keep.diameter = gone.diameter if math.isnan(keep.diameter) else keep.diameter
         self._alias[gone.key] = keep.key
         del self._landmarks[gone.key]
 
-    def belief(self, pose: int) -> Belief:
+    def belief(self, pose: int, marginals: Marginals | None = None) -> Belief:
         """Pose ``pose`` and all reflectors with their joint covariance."""
         alive = sorted(self._alive(), key=lambda m: m.key)
         index = [m.index for m in alive]
@@ -130,7 +159,7 @@ class ReflectorGraph:
             self._graph.poses[pose].copy(),
             np.array([m.key for m in alive], dtype=np.int64),
             self._graph.landmarks[index].reshape(-1, 2),
-            Marginals(self._graph).joint([pose], index),
+            (marginals or Marginals(self._graph)).joint([pose], index),
             {key: self.resolve(key) for key in self._alias},
         )
 

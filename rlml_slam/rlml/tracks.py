@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rlml_slam.se2 import Array
 from rlml_slam.types import ANONYMOUS
 
+MEMORY = 50  # occasions over which the spread of a group is averaged
 MAX_CANDIDATES = 40  # seldom seen ones beyond this make room: ghosts must not fill the state
 
 
@@ -24,6 +25,8 @@ class Tracks:
 
     ``keys`` never repeat, ``ids`` are the reflectors' own (ANONYMOUS), ``sightings`` counts, and
     ``last_seen`` is a stamp [ns]; ``surveyed`` ones come from a map and are never dropped.
+    ``spread2`` [m²]: variance per axis of where in a group that cannot be told apart a detection
+    is, the mean of ``doubles`` occasions on which two of it were seen at once; zero without any.
     """
 
     keys: NDArray[np.int64] = field(default_factory=_ints)
@@ -32,6 +35,8 @@ class Tracks:
     last_seen: NDArray[np.int64] = field(default_factory=_ints)
     surveyed: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     diameters: Array = field(default_factory=lambda: np.zeros(0))
+    spread2: Array = field(default_factory=lambda: np.zeros(0))
+    doubles: NDArray[np.int64] = field(default_factory=_ints)
     next_key: int = 0
 
     def __len__(self) -> int:
@@ -47,6 +52,8 @@ class Tracks:
         self.last_seen = np.append(self.last_seen, stamp)
         self.surveyed = np.append(self.surveyed, surveyed)
         self.diameters = np.append(self.diameters, diameter)
+        self.spread2 = np.append(self.spread2, 0.0)
+        self.doubles = np.append(self.doubles, 0)
         return key
 
     def see(self, index: NDArray[np.int64], stamp: int, ids: NDArray[np.int64]) -> None:
@@ -55,6 +62,12 @@ class Tracks:
         self.last_seen[index] = stamp
         told = ids != ANONYMOUS
         self.ids[index[told]] = ids[told]
+
+    def see_double(self, index: int, distance: float) -> None:
+        """Two detections ``distance`` [m] apart are both of the reflector at ``index``."""
+        self.doubles[index] += 1
+        gain = 1.0 / min(int(self.doubles[index]), MEMORY)
+        self.spread2[index] += gain * (0.25 * distance**2 - self.spread2[index])
 
     def confirmed(self, min_sightings: int) -> NDArray[np.bool_]:
         """(m,): seen often enough, or from a map."""
@@ -73,11 +86,15 @@ class Tracks:
         return drop
 
     def rename(self, aliases: dict[int, int]) -> None:
-        """Give merged reflectors the key that goes on."""
-        for k in range(len(self.keys)):
-            self.keys[k] = aliases.get(int(self.keys[k]), int(self.keys[k]))
+        """Give merged reflectors the key that goes on, and all of one key the newest sighting."""
+        self.keys = np.array([aliases.get(k, k) for k in self.keys.tolist()], dtype=np.int64)
+        for key in set(aliases.values()):
+            same = self.keys == key
+            if same.any():
+                self.last_seen[same] = self.last_seen[same].max()
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Forget all where the mask (m,) is false."""
-        for name in ('keys', 'ids', 'sightings', 'last_seen', 'surveyed', 'diameters'):
+        for name in ('keys', 'ids', 'sightings', 'last_seen', 'surveyed', 'diameters',
+                     'spread2', 'doubles'):  # fmt: skip
             setattr(self, name, getattr(self, name)[mask])

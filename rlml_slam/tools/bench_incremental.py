@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from rlml_slam import se2
 from rlml_slam.graph.graph import Graph
-from rlml_slam.graph.incremental import Incremental, warm_up
+from rlml_slam.graph.incremental import Incremental, compile_kernels
 from rlml_slam.graph.solver import optimize
 from rlml_slam.se2 import Array
 from rlml_slam.tools.bench_back_end import read_graphs
@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure and print."""
     for name in ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS'):
         os.environ.setdefault(name, '1')
-    warm_up()
+    compile_kernels()
     with_rival = not args.alone and importlib.util.find_spec('gtsam') is not None
     results = []
     for name, graph in _graphs(args.graphs, args.generated):

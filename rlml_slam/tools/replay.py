@@ -98,6 +98,7 @@ def replay(
     """
     warm_up.compile_loaded()
     with BagReader(path) as bag:
+        params = _patient(params)
         inputs = BagInputs(bag, params)
         slam = SYSTEMS[system][1](params)
         if known is not None:
@@ -125,6 +126,13 @@ def replay(
     ended = f'{problem}; the results hold what came before' if problem else ''
     result.problem = '; '.join(filter(None, (ended, result.problem)))
     return result
+
+
+def _patient(params: Parameters) -> Parameters:
+    """Nobody waits for the pose: a pause of the odometry that can be bridged is waited for."""
+    n = params.node
+    longest = max(n.transform_timeout, params.motion.max_gap)
+    return replace(params, node=replace(n, transform_timeout=longest))
 
 
 def _drive(

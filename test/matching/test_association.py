@@ -220,14 +220,47 @@ def test_wrong_match_is_given_up_where_the_hypothesis_as_a_whole_does_not_fit():
     np.testing.assert_array_equal(result.match, [0, 1, 2, -1])
 
 
-def test_required_lead_leaves_twins_alone():
-    twins = believed([[4.0, 0.0], [4.0, 0.1], [-2.0, 1.0]], pose=(0.0, 0.0, 0.0))
-    d = detections([[4.0, 0.045], [-2.0, 1.0]])
-    eager = Associator(Reflector(ambiguity=0.0)).associate(d, twins)
+def wary(b, recent=()):
+    return replace(b, recent=np.isin(np.arange(len(b.points)), recent))
+
+
+def test_of_two_that_explain_it_alike_neither_is_used():
+    twins = believed([[4.0, 0.0], [4.0, 0.3], [-2.0, 1.0]], pose=(0.0, 0.0, 0.0), sigma=0.05)
+    d = detections([[4.0, 0.14], [-2.0, 1.0]], sigma=0.05)
+    eager = Associator(Reflector()).associate(d, twins)
     np.testing.assert_array_equal(eager.match, [0, 2])
-    careful = Associator(Reflector(ambiguity=4.0)).associate(d, twins)
+    careful = Associator(Reflector()).associate(d, wary(twins))
     np.testing.assert_array_equal(careful.match, [-1, 2])
     assert careful.status[0] == Status.AMBIGUOUS
+
+
+def test_match_of_a_lost_pose_is_doubtful_and_of_a_sure_one_used():
+    sure = wary(believed())
+    np.testing.assert_array_equal(Associator(Reflector()).associate(seen(sure), sure).status, 0)
+    lost = wary(believed(pose_sigma=1.0))
+    result = Associator(Reflector()).associate(seen(lost, [1]), lost)
+    assert (result.match[0], result.status[0]) == (-1, Status.DOUBTFUL)
+
+
+def test_reflector_seen_a_moment_ago_and_one_with_an_id_need_no_proof():
+    lost = wary(believed(pose_sigma=1.0), recent=[1])
+    assert Associator(Reflector()).associate(seen(lost, [1]), lost).match[0] == 1
+    told = wary(believed(pose_sigma=1.0, ids=[7, 8, 9, 10]))
+    result = Associator(Reflector()).associate(seen(told, [1], ids=[8]), told)
+    assert (result.match[0], result.status[0]) == (1, Status.USED)
+
+
+def test_the_denser_unknown_reflectors_may_stand_the_surer_a_match_must_be():
+    b = wary(believed(pose_sigma=0.3))
+    d = seen(b, [1])
+    assert Associator(Reflector(density=1e-4)).associate(d, b).match[0] == 1
+    assert Associator(Reflector(density=1.0)).associate(d, b).match[0] == -1
+
+
+def test_unknown_detections_side_by_side_begin_one_reflector():
+    b = wary(believed())
+    status = Associator(Reflector()).associate(detections([[9.0, -7.0], [9.0, -6.9]]), b).status
+    np.testing.assert_array_equal(status, [Status.NEW, Status.AMBIGUOUS])
 
 
 def test_share_of_true_matches_inside_the_gate_is_the_gates():
