@@ -190,7 +190,7 @@ def test_reflector_map_travels():
 
 
 def test_statuses_are_those_of_the_enumeration():
-    frame = dataclasses.replace(a_frame(n=5), statuses=np.arange(5))
+    frame = dataclasses.replace(a_frame(n=len(Status)), statuses=np.arange(len(Status)))
     got = read_associated(build_associated(make_bag, frame, 'base_link'))
     assert [Status(s) for s in got.statuses] == list(Status)
 
