@@ -63,6 +63,9 @@ class Hypotheses:
     def __len__(self) -> int:
         return len(self._sizes)
 
+    def __contains__(self, key: int) -> bool:
+        return key in self._column
+
     @property
     def pending(self) -> frozenset[int]:
         """Keys that may still be one thing or another."""

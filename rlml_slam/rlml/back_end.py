@@ -57,7 +57,7 @@ class BackEnd:
         self.keyframes: list[Keyframe] = []
         self.scans = ScanGraph(p, self.graph)
         self.reflector_graph = ReflectorGraph(p.reflector, self.graph)
-        self.deferred = DeferredMatches(p.reflector, self.graph, self.reflector_graph)
+        self.deferred = DeferredMatches(p.reflector, self.reflector_graph)
         self.T_map_local = np.zeros(3)
         self._optimized = False
         self._interval: Interval | None = None
@@ -106,7 +106,7 @@ class BackEnd:
             closures = self.scans.add(key)
         self._since_optimized += 1
         due = self._since_optimized >= self._p.back_end.optimize_every
-        if due and (self.scans.changed or self.reflector_graph.changed):
+        if due and self._is_behind:
             self.optimize()
         return Update(
             key.index,
@@ -154,12 +154,19 @@ class BackEnd:
         self._interval = Interval(frame.T_local_base)
         return key
 
+    @property
+    def _is_behind(self) -> bool:
+        """Whether the graph has gained anything that the estimate does not show."""
+        return self.scans.changed or self.reflector_graph.changed
+
     def _see_reflectors(self, interval: Interval) -> None:
         """The reflectors seen near the newest keyframe, and what they tell of earlier ones."""
         pose = len(self.keyframes) - 1
         if self.deferred.begins(interval):
-            self.optimize()
-        self.deferred.see(pose, interval)
+            if self._is_behind:
+                self.optimize()
+            self.deferred.begin(pose)
+        self.deferred.see(interval)
         self.reflector_graph.add(pose, interval)
         if self.deferred.decide():
             self._rejoin()

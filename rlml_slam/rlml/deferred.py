@@ -7,8 +7,6 @@ from collections import Counter
 
 import numpy as np
 
-from rlml_slam.graph.graph import Graph
-from rlml_slam.graph.marginals import Marginals
 from rlml_slam.matching.hypotheses import Hypotheses, Sight
 from rlml_slam.params import Reflector
 from rlml_slam.rlml.keyframes import Interval, Sighting
@@ -32,9 +30,8 @@ class DeferredMatches:
     counts, and cost nothing while no reflector is new.
     """
 
-    def __init__(self, params: Reflector, graph: Graph, reflectors: ReflectorGraph) -> None:
+    def __init__(self, params: Reflector, reflectors: ReflectorGraph) -> None:
         self._p = params
-        self._graph = graph
         self._reflectors = reflectors
         self._counts: Counter[int] = Counter()
         self._hypotheses: Hypotheses | None = None
@@ -57,20 +54,27 @@ class DeferredMatches:
             )
         )
 
-    def see(self, pose: int, interval: Interval) -> None:
-        """The reflectors seen near keyframe ``pose``, before the graph has them."""
-        if self.begins(interval):
-            belief = self._reflectors.belief(pose, Marginals(self._graph))
-            self._hypotheses = Hypotheses(
-                belief.T_map_base, belief.keys, belief.points, belief.cov, self._p.density
-            )
+    def begin(self, pose: int) -> None:
+        """Open the question at keyframe ``pose``, from what the graph knows."""
+        belief = self._reflectors.belief(pose)
+        self._hypotheses = Hypotheses(
+            belief.T_map_base, belief.keys, belief.points, belief.cov, self._p.density
+        )
+
+    def see(self, interval: Interval) -> None:
+        """The reflectors seen near the newest keyframe, before the graph has them.
+
+        One that tells its id is no question: it counts where it is known, and is none's answer.
+        """
         sights = []
         for key, groups in interval.sightings.items():
-            key = self._reflectors.resolve(key)
-            self._counts[key] += _count(groups)
-            if self._counts[key] >= self._p.min_sightings:
+            known = self._reflectors.resolve(key)
+            self._counts[known] += _count(groups)
+            if self._hypotheses is None or self._counts[known] < self._p.min_sightings:
+                continue
+            if known in self._hypotheses or key not in interval.ids:
                 most = max(groups, key=lambda g: g.count)
-                sights.append(Sight(key, most.z, _noise(most)))
+                sights.append(Sight(known, most.z, _noise(most)))
         if self._hypotheses is not None:
             self._hypotheses.see(sights)
 

@@ -124,16 +124,19 @@ class ReflectorGraph:
     @staticmethod
     def _distinct(a: _Landmark, b: _Landmark) -> bool:
         """Whether the two were seen from one keyframe, or tell different ids."""
-        if a.id != ANONYMOUS and b.id != ANONYMOUS and a.id != b.id:
+        if _named_apart(a, b):
             return True
         return not {s[0] for s in a.sightings}.isdisjoint(s[0] for s in b.sightings)
 
     def join(self, a: int, b: int) -> None:
-        """The reflectors of two keys are one; the one that the graph has longer goes on."""
+        """The reflectors of two keys are one, if their ids do not say otherwise.
+
+        The first goes on, or the one that the graph has.
+        """
         first, second = (
             self._landmarks.setdefault(key, _Landmark(key)) for key in map(self.resolve, (a, b))
         )
-        if first is second:
+        if first is second or _named_apart(first, second):
             return
         if first.index < 0 <= second.index:
             first, second = second, first
@@ -151,7 +154,7 @@ class ReflectorGraph:
         self._alias[gone.key] = keep.key
         del self._landmarks[gone.key]
 
-    def belief(self, pose: int, marginals: Marginals | None = None) -> Belief:
+    def belief(self, pose: int) -> Belief:
         """Pose ``pose`` and all reflectors with their joint covariance."""
         alive = sorted(self._alive(), key=lambda m: m.key)
         index = [m.index for m in alive]
@@ -159,7 +162,7 @@ class ReflectorGraph:
             self._graph.poses[pose].copy(),
             np.array([m.key for m in alive], dtype=np.int64),
             self._graph.landmarks[index].reshape(-1, 2),
-            (marginals or Marginals(self._graph)).joint([pose], index),
+            Marginals(self._graph).joint([pose], index),
             {key: self.resolve(key) for key in self._alias},
         )
 
@@ -176,6 +179,11 @@ class ReflectorGraph:
             np.array([m.count for m in alive], dtype=np.int64),
             np.array([m.diameter for m in alive], dtype=np.float64),
         )
+
+
+def _named_apart(a: _Landmark, b: _Landmark) -> bool:
+    """Whether the two tell different ids."""
+    return a.id != ANONYMOUS and b.id != ANONYMOUS and a.id != b.id
 
 
 def _difference_cov(marginals: Marginals, a: int, b: int) -> Array:

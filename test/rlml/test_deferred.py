@@ -9,7 +9,7 @@ from rlml_slam import se2
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.front_end import FrontEnd
-from rlml_slam.types import Motion, Status
+from rlml_slam.types import ANONYMOUS, Motion, Status
 
 LOOP = drive((0.5, 0.0, 4.0), (0.5, 1.2, 5.2), (0.5, 0.0, 6.0), (0.5, 1.2, 5.2), (0.5, 0.0, 3.0))
 BLIND = slice(60, 110)
@@ -74,6 +74,30 @@ def test_with_ids_nothing_is_ever_asked():
     frames, back_end = run(observed)
     assert not any((f.statuses == Status.DOUBTFUL).any() for f in frames)
     assert back_end.deferred.pending == frozenset()
+
+
+def test_reflectors_with_ids_among_anonymous_ones_keep_their_names():
+    rng = np.random.default_rng(5)
+    named = observations(ROOM, LOOP, scan=False, ids=True)
+    observed = []
+    for o, n in zip(blinded(rng), named, strict=True):
+        if o.detections is not None:
+            ids = np.where(n.detections.ids < 103, n.detections.ids, ANONYMOUS)
+            o = replace(o, detections=replace(o.detections, ids=ids))
+        observed.append(o)
+    _, back_end = run(observed)
+    mapped = back_end.reflectors()
+    assert sorted(mapped.ids) == [ANONYMOUS] * 3 + [100, 101, 102]
+    gap = np.linalg.norm(mapped.points[:, None] - ROOM.reflectors[None], axis=-1)
+    assert gap.min(axis=1).max() < 0.05
+
+
+def test_different_ids_are_never_joined():
+    observed = observations(ROOM, LOOP[:60], scan=False, ids=True)
+    _, back_end = run(observed)
+    before = back_end.reflectors()
+    back_end.reflector_graph.join(int(before.keys[0]), int(before.keys[1]))
+    np.testing.assert_array_equal(back_end.reflectors().ids, before.ids)
 
 
 # --- groups that cannot be told apart ----------------------------------------------------------
