@@ -34,6 +34,7 @@ class DeformableSlamNode(Node):
         super().__init__('deformable_slam', **options)
         p: DeformableParameters = declare(self, DeformableParameters)
         self.slam = DeformableSlam(p)
+        self._map_frame = p.node.map_frame
         self._cost = np.zeros((KEPT, 2))  # wall and CPU time of an update [s]
         self._updates = 0
         warm_up.compile_loaded()
@@ -61,7 +62,7 @@ class DeformableSlamNode(Node):
 
     def start_at(self, msg: PoseWithCovarianceStamped) -> None:
         """Begin anew at a pose of the map."""
-        start = convert.pose_estimate(msg, 'initialpose')
+        start = convert.start_pose(msg, self._map_frame)
         self.slam.begin_at(start.pose, start.cov)
         self.get_logger().info(f'begins at {np.round(start.pose, 3).tolist()}')
 

@@ -58,7 +58,7 @@ class EkfSlamNode(Node):
 
     def start_at(self, msg: PoseWithCovarianceStamped) -> None:
         """Begin anew at a pose of the map."""
-        start = convert.pose_estimate(msg, 'initialpose')
+        start = convert.start_pose(msg, self.params.node.map_frame)
         self._begin(start.pose, start.cov, self.map_services.saved)
 
     def restart(self) -> None:

@@ -60,7 +60,7 @@ class BagReader:
         self._todays: dict[str, bool] = {}
         if not self.path.exists():
             raise BagError(f'{path}: no such bag')
-        self.is_ros1 = self.path.suffix == '.bag'
+        self.is_ros1 = self.path.suffix == '.bag' and not self.path.is_dir()
         self._reader = self._open()
         self.topics = {
             name: Topic(name, info.msgtype or '', info.msgcount)

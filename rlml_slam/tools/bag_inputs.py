@@ -66,8 +66,9 @@ class BagInputs:
         """Static transforms wherever they are in the bag, and those that /tf begins with."""
         for topic, most in (('/tf', _TF_SAMPLE), ('/tf_static', None)):
             for message in self._all(topic, most):
-                with contextlib.suppress(InputError):
-                    self.extrinsics.add(convert.transforms(message, topic))
+                for transform in message.transforms:  # each by itself, as live
+                    with contextlib.suppress(InputError):
+                        self.extrinsics.add(convert.transforms(transform, topic))
 
     def truth(self) -> Truth | None:
         """The ground truth of the bag, None without any. What cannot be believed is left out."""

@@ -24,7 +24,8 @@ MATCH_RADIUS = 0.5  # [m] an anonymous reflector farther from every true one is 
 class Judged:
     """Errors of a run against its truth: optimised and live, and the live poses' NEES.
 
-    ``nees`` (n,) is NaN where a covariance is singular or the truth has no heading.
+    ``nees`` (n,) is NaN where a covariance is singular or the truth has no heading, and all of
+    it where the truth was aligned: the covariance is about the first pose, the fit is not.
     """
 
     optimized: TrajectoryErrors
@@ -44,7 +45,8 @@ def judge(run: Run) -> Judged | None:
         return None
     optimized = trajectory_errors(run.trajectory, truth, aligned)
     live = trajectory_errors(run.frames.trajectory(), truth, aligned)
-    return Judged(optimized, live, nees(live, np.array(run.frames.covs)))
+    unknown = np.full(len(live.errors), np.nan)
+    return Judged(optimized, live, unknown if aligned else nees(live, np.array(run.frames.covs)))
 
 
 def nees(errors: TrajectoryErrors, covs: Array) -> Array:

@@ -13,6 +13,7 @@ from rclpy.qos import QoSProfile
 
 from rlml_slam.deformable.scoring import chi2_bounds
 from rlml_slam.deformable.window import CarrierVelocity
+from rlml_slam.errors import InputError
 from rlml_slam.nodes.deformable_slam import DeformableSlamNode
 from rlml_slam.params import Carrier, CarrierParameters
 from rlml_slam.ros import build, convert
@@ -204,6 +205,8 @@ def test_initial_pose_begins_anew_there(live):
     feed_more = [m for topic, m in messages(11) if topic in ('odom', 'reflectors')][-2:]
     for topic, msg in zip(('odom', 'reflectors'), feed_more, strict=True):
         node.sensors.add(topic, msg)
+    with pytest.raises(InputError, match="frame_id is 'odom' instead"):
+        node.start_at(build.pose_with_covariance(make, SECOND, 'odom', -there, 0.04 * np.eye(3)))
     # the next observation is the first of the new beginning: its motion is not used
     np.testing.assert_allclose(node.slam.estimate.pose, there, atol=1e-9)
     np.testing.assert_allclose(np.diag(node.slam.estimate.cov), 0.04, rtol=0.01)

@@ -10,8 +10,11 @@ from nav_msgs.srv import LoadMap
 from numpy.testing import assert_allclose
 from std_srvs.srv import Trigger
 
+from rlml_slam.errors import InputError
 from rlml_slam.nodes.ekf_slam import EkfSlamNode
+from rlml_slam.ros import build
 from rlml_slam.ros.associated import read_reflector_map
+from rlml_slam.ros.messages import make_rclpy as make
 
 
 @pytest.fixture
@@ -41,6 +44,18 @@ def test_every_scan_is_answered_and_the_landmarks_are_published(live, node, tmp_
     services.reset(None, Trigger.Response())
     assert node.estimator.filter.num_landmarks == 0
     assert not services.save_map(None, Trigger.Response()).success
+
+
+def test_start_pose_of_another_frame_changes_nothing(live, node):
+    there, cov = np.array([5.0, -2.0, 1.0]), 0.04 * np.eye(3)
+    node.start_at(build.pose_with_covariance(make, 0, 'map', there, cov))
+    assert_allclose(node.estimator.filter.pose, there)
+    with pytest.raises(InputError, match="frame_id is 'odom' instead"):
+        node.start_at(build.pose_with_covariance(make, 0, 'odom', np.zeros(3), cov))
+    wrong = np.array([[0.1, 0.5, 0.0], [0.5, 0.1, 0.0], [0.0, 0.0, 0.1]])
+    with pytest.raises(InputError, match='eigenvalue'):
+        node.start_at(build.pose_with_covariance(make, 0, 'map', np.zeros(3), wrong))
+    assert_allclose(node.estimator.filter.pose, there)
 
 
 def test_a_loaded_map_is_localised_in_and_not_extended(live, node, tmp_path):

@@ -97,6 +97,12 @@ def test_what_is_no_bag_is_named_in_one_line(tmp_path, name, content):
     assert '\n' not in str(error.value)
 
 
+def test_folder_named_like_a_ros1_bag_is_read(tmp_path):
+    with BagReader(write(tmp_path / 'drive.bag')) as bag:
+        assert not bag.is_ros1
+        assert bag.count(['/odom']) == 20
+
+
 def test_missing_bag_is_named(tmp_path):
     with pytest.raises(BagError, match='absent: no such bag'):
         BagReader(tmp_path / 'absent')
