@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import params
-from rlml_slam.compiled import kernel
+from rlml_slam.compiled import kernel, part
 from rlml_slam.errors import InputError
 from rlml_slam.matching import surfaces
 from rlml_slam.se2 import Array
@@ -28,6 +28,10 @@ MARGIN = 64  # cells of slack when a grid grows, and of free border that kernels
 BORDER = 4
 TOUCHED = np.uint16(0x8000)
 WHOLE_RAY = 2.0**40  # a ray's length as an integer
+FEWEST = 64  # of so many rays, one is followed from the sensor on
+CLOSE = 0.99  # [cells] between two rays, so that a cell does not fit in between
+DIAGONAL = 1.5  # [cells] that one cell covers of a ray at most
+ENDS = 3.0 * DIAGONAL  # [cells] of the last cells of a ray, which it does not miss, and one more
 EMPTY = np.zeros(0, dtype=np.int64)
 
 
@@ -162,19 +166,23 @@ def carve(
 ) -> int:
     """Apply one scan to ``values``; number of cells touched, or -1 if ``touched`` is too short.
 
-    ``points`` (n, 3) are those of surfaces.fill(): end point, and share of the ray left out.
-    Every touched cell is marked with the top bit and listed, and unmarked at the end; the length
-    of the list is checked before anything is changed.
+    ``points`` (n, 2) are end points in scan order. Every touched cell is marked with the top bit
+    and listed, and unmarked at the end; the length of the list is checked before anything is
+    changed.
     """
     columns = values.shape[1]
     flat = values.reshape(-1)
     x0, y0 = origin[0] * scale - corner_j, origin[1] * scale - corner_i
+    rays = np.empty((len(points), 2))
+    for k in range(len(points)):
+        rays[k, 0] = points[k, 0] * scale - corner_j - x0
+        rays[k, 1] = points[k, 1] * scale - corner_i - y0
+    starts = uncovered(rays)
     # upper bound on touched cells: each ray crosses |di| + |dj| + 1 cells
     bound = 0
     for k in range(len(points)):
-        x1, y1 = points[k, 0] * scale - corner_j, points[k, 1] * scale - corner_i
-        share = 1.0 - points[k, 2]
-        bound += int(abs(x1 - x0) * share) + int(abs(y1 - y0) * share) + 4
+        share = 1.0 - starts[k]
+        bound += int(abs(rays[k, 0]) * share) + int(abs(rays[k, 1]) * share) + 4
     if min(bound, flat.size) > touched.size:
         return -1
     n = 0
@@ -189,14 +197,45 @@ def carve(
     hits = n
     for k in range(len(points)):
         x1, y1 = points[k, 0] * scale - corner_j, points[k, 1] * scale - corner_i
-        f = points[k, 2]
-        sx, sy = x0 + f * (x1 - x0), y0 + f * (y1 - y0)
+        sx, sy = x0 + starts[k] * (x1 - x0), y0 + starts[k] * (y1 - y0)
         n = touch_ray(flat, columns, sx, sy, x1, y1, touched, n)
     for m in range(hits):
         flat[touched[m]] ^= TOUCHED
     for m in range(hits, n):
         flat[touched[m]] = miss[flat[touched[m]] ^ TOUCHED]
     return n
+
+
+@part
+def uncovered(rays: Array) -> Array:
+    """Share (n,) of each ray up to which the cells that it crosses are crossed by others as well.
+
+    ``rays`` (n, 2) [cells] from one origin, in the order of their angles or nearly so. A cell
+    that a ray crosses between two others is crossed by one of these, too, wherever they are less
+    than the side of a cell apart: it would not fit in between. So of rays 0, 8, 16 ... all is
+    needed, of 4, 12 ... what lies beyond where their neighbours 4 away are that close, of 2, 6
+    ... beyond where those 2 away are, and so on: near the sensor, few rays do for all.
+    """
+    n = len(rays)
+    length, share = np.empty(n), np.zeros(n)
+    for k in range(n):
+        length[k] = math.hypot(rays[k, 0], rays[k, 1])
+    stride = 1
+    while stride <= FEWEST // 2:
+        for k in range(stride, n - stride, 2 * stride):
+            a, b = k - stride, k + stride
+            ax, ay, bx, by = rays[a, 0], rays[a, 1], rays[b, 0], rays[b, 1]
+            dot, cross = ax * bx + ay * by, ax * by - ay * bx
+            before = ax * rays[k, 1] - ay * rays[k, 0]
+            after = rays[k, 0] * by - rays[k, 1] * bx
+            if dot <= 0.0 or before * after < 0.0 or length[k] == 0.0:
+                continue
+            reach = min(length[a], length[b]) - ENDS
+            if abs(cross) * reach > CLOSE * dot:  # twice the tangent of half the angle is less
+                reach = CLOSE * dot / abs(cross)
+            share[k] = max(reach - DIAGONAL, 0.0) / length[k]
+        stride *= 2
+    return share
 
 
 @kernel

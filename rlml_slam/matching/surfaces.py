@@ -24,12 +24,10 @@ FLAT = 0.02  # variance across per variance along, below which neighbours are a 
 
 @kernel
 def fill(points: Array, spacing: float) -> Array:
-    """End points (m, 3) with the gaps of straight surfaces filled: x, y, start.
+    """End points (m, 2) with the gaps of straight surfaces filled, in scan order.
 
     ``points`` (n, 2) in scan order. A gap of more than ``spacing`` between two neighbours is
-    filled with points between them if the neighbours beyond lie on the same line. ``start`` is
-    the share of the way from the sensor from which the ray is farther than spacing from its
-    neighbours; 0 for the measured points.
+    filled with points between them if the neighbours beyond lie on the same line.
     """
     n = len(points)
     counts = np.zeros(n, dtype=np.int64)
@@ -50,17 +48,16 @@ def fill(points: Array, spacing: float) -> Array:
         ):
             counts[k] = int(np.ceil(length / spacing))
             total += counts[k]
-    out = np.empty((total, 3))
+    out = np.empty((total, 2))
     m = 0
     for k in range(n):
-        out[m, 0], out[m, 1], out[m, 2] = points[k, 0], points[k, 1], 0.0
+        out[m, 0], out[m, 1] = points[k, 0], points[k, 1]
         m += 1
         parts = counts[k] + 1
         for q in range(1, parts):
             f = q / parts
             out[m, 0] = points[k, 0] + f * (points[k + 1, 0] - points[k, 0])
             out[m, 1] = points[k, 1] + f * (points[k + 1, 1] - points[k, 1])
-            out[m, 2] = 1.0 / parts
             m += 1
     return out
 

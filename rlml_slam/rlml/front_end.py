@@ -24,6 +24,7 @@ from rlml_slam.rlml.doubt import Doubt, consents
 from rlml_slam.rlml.grid_fix import Fix, SavedGrid
 from rlml_slam.rlml.health import Evidence, HealthMonitor
 from rlml_slam.rlml.joint_state import BIAS, JointState
+from rlml_slam.rlml.reflector_update import use_reflectors
 from rlml_slam.rlml.relocalize import is_mapped
 from rlml_slam.rlml.scan_update import fuse, prior_of
 from rlml_slam.rlml.second_look import second_look
@@ -42,8 +43,6 @@ from rlml_slam.types import (
     Status,
 )
 
-REFLECTOR_ITERATIONS = 4
-CONVERGED = np.array([1e-5, 1e-5, 1e-6])
 START_SIGMA = np.array([0.5, 0.5, 0.26])  # [m, m, rad] what RViz says of a pose set by hand
 
 
@@ -250,7 +249,7 @@ class FrontEnd:
                 self.tracks.spread2,
             ),
         )
-        taken = np.isin(result.match, matched.index[matched.index >= 0]) & (result.match >= 0)
+        taken = (result.match >= 0) & (result.match[:, None] == matched.index).any(axis=1)
         used = (result.match >= 0) & ~taken
         matched.status[rows] = np.where(taken, Status.AMBIGUOUS, result.status)
         if not used.any():
@@ -259,7 +258,10 @@ class FrontEnd:
         matched.index[k] = index
         matched.distance2[k] = result.distance2[used]
         R = detections.cov[k] + self.tracks.spread2[index][:, None, None] * np.eye(2)
-        self._update_reflectors(detections.points[k], R, index, matched, k)
+        # Huber on the innovation: beyond the scale a detection pulls no harder than at it
+        excess = matched.distance2[k] / self._p.reflector.robust_scale**2
+        R *= np.maximum(excess, 1.0)[:, None, None]
+        use_reflectors(self.state.x, self.state.P, index, detections.points[k], R)
         self.tracks.see(index, observation.stamp, detections.ids[k])
 
     def _with_spread(self, observation: Observation, matched: _Matched) -> Observation:
@@ -290,41 +292,6 @@ class FrontEnd:
             return None
         return stamp - self.tracks.last_seen < self._p.reflector.track_timeout * 1e9
 
-    def _update_reflectors(
-        self,
-        z: Array,
-        R: Array,
-        index: NDArray[np.int64],
-        matched: _Matched,
-        rows: NDArray[np.int64],
-    ) -> None:
-        """Iterated update: Gauss-Newton on the prior and the reflector terms of eq. 3."""
-        q = len(index)
-        columns = self.state.active(index)
-        x0 = self.state.x[columns]
-        P = self.state.P[np.ix_(columns, columns)]
-        # Huber on the innovation: beyond the scale a detection pulls no harder than at it
-        excess = matched.distance2[rows] / self._p.reflector.robust_scale**2
-        noise = np.zeros((2 * q, 2 * q))
-        k = np.arange(q)
-        noise.reshape(q, 2, q, 2)[k, :, k, :] = R * np.maximum(excess, 1.0)[:, None, None]
-        x = x0.copy()
-        for _ in range(REFLECTOR_ITERATIONS):
-            expected, J, Rt = association.predict(x[:3], x[6:].reshape(-1, 2))
-            blocks = np.zeros((q, 2, len(columns)))
-            blocks[:, :, :3] = J
-            blocks[k, :, 6 + 2 * k] = Rt[:, 0]
-            blocks[k, :, 7 + 2 * k] = Rt[:, 1]
-            H = blocks.reshape(2 * q, -1)
-            v = (z - expected).ravel() + H @ (x - x0)
-            PH = P @ H.T
-            new = x0 + PH @ np.linalg.solve(H @ PH + noise, v)
-            done = bool(np.all(np.abs(new - x)[:3] < CONVERGED))
-            x = new
-            if done:
-                break
-        self.state.apply(columns, H, noise, v)
-
     def _map_reflectors(self, observation: Observation, matched: _Matched, doubtful: bool) -> None:
         """New reflectors enter as candidates, candidates not seen again leave."""
         p, detections = self._p.reflector, observation.detections
@@ -332,7 +299,8 @@ class FrontEnd:
             # a map that never changes has all reflectors that there are
             matched.status[matched.status == Status.NEW] = Status.GHOST
         elif detections is not None and not doubtful:
-            for k in np.flatnonzero(np.isin(matched.status, (Status.NEW, Status.DOUBTFUL))):
+            fresh = (matched.status == Status.NEW) | (matched.status == Status.DOUBTFUL)
+            for k in np.flatnonzero(fresh):
                 matched.index[k] = self.state.add_landmark(detections.points[k], detections.cov[k])
                 self.tracks.append(
                     observation.stamp, int(detections.ids[k]), float(detections.diameters[k])

@@ -63,8 +63,9 @@ class JointState:
 
     def pose_and_landmarks_cov(self) -> Array:
         """Joint covariance (3 + 2m, 3 + 2m) without the anchors."""
-        keep = np.r_[0:3, LANDMARKS : len(self.x)]
-        P: Array = self.P[np.ix_(keep, keep)]
+        P = np.empty((len(self.x) - LANDMARKS + 3,) * 2)
+        P[:3, :3], P[:3, 3:] = self.P[:3, :3], self.P[:3, LANDMARKS:]
+        P[3:, :3], P[3:, 3:] = self.P[LANDMARKS:, :3], self.P[LANDMARKS:, LANDMARKS:]
         return P
 
     def predict(self, motion: Motion, walk: float) -> None:

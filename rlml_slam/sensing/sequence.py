@@ -343,8 +343,12 @@ def believable(cov: Array) -> tuple[Array, bool]:
 
     A driver that fills in 0 or the largest float for "unknown" must not make the state singular.
     """
-    values, axes = np.linalg.eigh(0.5 * (cov + np.swapaxes(cov, 1, 2)))
-    bounded = np.clip(values, SIGMA[0] ** 2, SIGMA[1] ** 2)
-    if np.array_equal(bounded, values):
+    least, most = SIGMA[0] ** 2, SIGMA[1] ** 2
+    mean = 0.5 * (cov[:, 0, 0] + cov[:, 1, 1])
+    across = 0.5 * (cov[:, 0, 1] + cov[:, 1, 0])
+    spread = np.hypot(0.5 * (cov[:, 0, 0] - cov[:, 1, 1]), across)
+    if (mean - spread >= least).all() and (mean + spread <= most).all():
         return cov, False
+    values, axes = np.linalg.eigh(0.5 * (cov + np.swapaxes(cov, 1, 2)))
+    bounded = np.clip(values, least, most)
     return (axes * bounded[:, None, :]) @ np.swapaxes(axes, 1, 2), True

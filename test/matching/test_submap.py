@@ -3,13 +3,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from made_rooms import ROOM, scan
 
 from rlml_slam import params
 from rlml_slam.errors import InputError
 from rlml_slam.matching.submap import P_MAX, P_MIN, STEP, Submap, probability_of, value_of
+from rlml_slam.matching.surfaces import fill
 
 P = params.Submap(resolution=0.1, p_hit=0.7, p_miss=0.4)
 ORIGIN = np.array([0.05, 0.05])
+OFF_CENTRE = np.array([0.053, 0.041])  # no diagonal meets the corners of cells
 
 
 def at(submap: Submap, x: float, y: float) -> float:
@@ -111,6 +114,34 @@ def test_gap_between_neighbours_on_a_wall_is_filled():
     lonely = Submap(P)
     lonely.insert(wall * np.array([1.0, 2.0]), ORIGIN)  # one metre apart: may be a door
     assert int((lonely.probability() > 0.5).sum()) == 5
+
+
+def rays_of(kind, rng):
+    """End points (n, 2) as seen from OFF_CENTRE."""
+    angles = np.linspace(-np.pi, np.pi, 700)
+    if kind == 'room':
+        return scan(ROOM, np.zeros(3), beams=700, sigma=0.01) + OFF_CENTRE
+    if kind == 'near and far':
+        ranges = rng.uniform(0.0, 8.0, 700)
+    elif kind == 'any order':
+        ranges, angles = rng.uniform(0.0, 8.0, 700), rng.permutation(angles)
+    else:  # a few directions of many rays each, along the axes and diagonals of the grid as well
+        ranges, angles = rng.uniform(0.0, 8.0, 700), np.round(angles * 8 / np.pi) * np.pi / 8
+    return OFF_CENTRE + ranges[:, None] * np.stack([np.cos(angles), np.sin(angles)], -1)
+
+
+@pytest.mark.parametrize('kind', ['room', 'near and far', 'any order', 'alike'])
+def test_scan_touches_what_its_rays_touch_one_by_one(kind):
+    points = rays_of(kind, np.random.default_rng(7))
+    whole = Submap(P)
+    whole.insert(points, OFF_CENTRE)
+    touched = np.zeros(whole.values.shape, dtype=bool)
+    for point in fill(points, P.resolution):
+        one = Submap(P)
+        one.insert(point[None], OFF_CENTRE)
+        (rows, columns), (j, i) = one.values.shape, np.subtract(one.corner, whole.corner)
+        touched[i : i + rows, j : j + columns] |= one.values > 0
+    np.testing.assert_array_equal(whole.values > 0, touched)
 
 
 def test_same_insertions_give_the_same_bytes():
