@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.compiled import kernel
+from rlml_slam.compiled import kernel, part
 from rlml_slam.params import MotionNoise
 from rlml_slam.se2 import Array
 from rlml_slam.types import Imu, Motion, Odometry
 
 SECOND = 1_000_000_000
+Stamps = NDArray[np.int64]
 
 
 @kernel
@@ -95,18 +97,116 @@ def compose_motion(first: Motion, second: Motion) -> Motion:
 STILL = Motion(np.zeros(3), np.zeros((3, 3)))
 
 
-@dataclass
-class _Control:
-    """Speed and turn rate of one interval; ``gyro`` is 1 where the turn rate is the IMU's."""
+class _Noise(NamedTuple):
+    """MotionNoise as kernels take it."""
 
-    v: float
-    w: float
-    sigma_v: float
-    sigma_w: float
-    known: bool
-    gyro: float = 0.0
-    bias: float = 0.0
-    bias_sigma: float = math.inf
+    a: float
+    b: float
+    c: float
+    d: float
+    lateral: float
+    imu_c: float
+    imu_d: float
+    interval: float
+    guess: float
+    max_gap: float
+    max_speed: float
+    max_turn_rate: float
+
+
+@kernel
+def _drive(
+    start: int,
+    end: int,
+    stamps: Stamps,
+    v: Array,
+    w: Array,
+    imu_stamps: Stamps,
+    rates: Array,
+    n: _Noise,
+) -> tuple[Array, bool, float, float]:
+    """Motion between two stamps: that of integrate(), known, bias and its variance.
+
+    ``v``, ``w`` (k,) are the velocities of the intervals that end at the odometry's ``stamps``,
+    ``rates`` those measured by the IMU at its own. Between two stamps of either, the control is
+    that of the middle (eq. 6).
+    """
+    cuts = np.empty(len(stamps) + len(imu_stamps) + 2, np.int64)
+    cuts[0], m, i, j = start, 1, 0, 0
+    while i < len(stamps) or j < len(imu_stamps):
+        if j == len(imu_stamps) or (i < len(stamps) and stamps[i] <= imu_stamps[j]):
+            stamp = stamps[i]
+            i += 1
+        else:
+            stamp = imu_stamps[j]
+            j += 1
+        if cuts[m - 1] < stamp < end:
+            cuts[m] = stamp
+            m += 1
+    cuts[m] = end
+    rows = np.empty((7, m))
+    all_known = True
+    weight = weighted = 0.0
+    for k in range(m):
+        dt = (cuts[k + 1] - cuts[k]) / SECOND
+        middle = (cuts[k] + cuts[k + 1]) // 2
+        at = np.searchsorted(stamps, middle)
+        known = 0 < at < len(stamps) and not math.isnan(v[at])
+        gap = (stamps[at] - stamps[at - 1]) / SECOND if known else 0.0
+        known = known and gap <= n.max_gap
+        speed = turn = 0.0
+        sigma_v, sigma_w = n.max_speed / 5.0, n.max_turn_rate / 5.0
+        if known:
+            speed, turn = v[at], w[at]
+            # when inside a long interval the motion happened is a guess
+            guess = n.guess if gap > 2.0 * n.interval else 0.0
+            sigma_v = (n.a + guess) * abs(speed) + n.b
+            sigma_w = (n.c + guess) * abs(turn) + n.d
+        # the wheels do not turn: so does the robot not, and the IMU shows its bias
+        stands = known and speed == 0.0 and turn == 0.0
+        if stands:
+            sigma_v, sigma_w = 0.1 * n.b, 0.1 * n.d
+        rate = _rate(middle, imu_stamps, rates, n.max_gap)
+        sigma_rate = n.imu_c * abs(rate) + n.imu_d
+        bias, bias_sigma = rate - turn, math.hypot(sigma_rate, sigma_w)
+        says_bias = known and not math.isnan(rate)
+        gyro = 0.0
+        if not stands and not math.isnan(rate):
+            turn, sigma_w, gyro = rate, sigma_rate, 1.0
+        # the figures hold for n.interval: a shorter one has the same accumulated noise; where
+        # the motion is too fast for its interval, the stamps are wrong, not the noise larger
+        lasted = max(dt, abs(speed) * dt / n.max_speed, abs(turn) * dt / n.max_turn_rate)
+        scale = n.interval / lasted
+        lateral = n.lateral * abs(speed) if known else n.max_speed / 5.0
+        rows[0, k], rows[1, k], rows[2, k], rows[6, k] = speed, turn, dt, gyro
+        rows[3, k], rows[4, k] = sigma_v**2 * scale, sigma_w**2 * scale
+        rows[5, k] = lateral**2 * scale
+        all_known = all_known and known
+        if says_bias:
+            weight += 1.0 / (bias_sigma**2 * scale)
+            weighted += bias / (bias_sigma**2 * scale)
+    out = integrate(rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6])
+    if weight > 0.0:
+        return out, all_known, weighted / weight, 1.0 / weight
+    return out, all_known, 0.0, np.inf
+
+
+@part
+def _rate(stamp: int, stamps: Stamps, rates: Array, max_gap: float) -> float:
+    """The IMU's yaw rate, linear between its samples; NaN outside or across a gap."""
+    k = np.searchsorted(stamps, stamp)
+    if not 0 < k < len(stamps):
+        return np.nan
+    t0, t1 = stamps[k - 1], stamps[k]
+    if t1 - t0 > max_gap * SECOND:
+        return np.nan
+    f = (stamp - t0) / (t1 - t0)
+    return rates[k - 1] * (1.0 - f) + rates[k] * f
+
+
+def _around(stamps: list[int], start: int, end: int) -> slice:
+    """The samples between two stamps, and one on each side."""
+    return slice(max(bisect_right(stamps, start) - 1, 0), bisect_left(stamps, end) + 1)
 
 
 class MotionBuffer:
@@ -114,6 +214,7 @@ class MotionBuffer:
 
     def __init__(self, noise: MotionNoise, memory: float) -> None:
         self._noise = noise
+        self._noise_values = _Noise(*(float(getattr(noise, name)) for name in _Noise._fields))
         self._memory = int(memory * SECOND)
         self._stamps: list[int] = []
         self._poses: list[Array] = []
@@ -215,77 +316,23 @@ class MotionBuffer:
         """
         if end <= start:
             return STILL
-        cuts = [start]
-        cuts += self._stamps[bisect_right(self._stamps, start) : bisect_left(self._stamps, end)]
-        i0 = bisect_right(self._imu_stamps, start)
-        i1 = bisect_left(self._imu_stamps, end)
-        if i1 > i0:
-            cuts = sorted({*cuts, *self._imu_stamps[i0:i1]})
-        cuts.append(end)
-        n = self._noise
-        rows = np.empty((7, len(cuts) - 1))
-        known = True
-        weight = weighted = 0.0
-        for k in range(len(cuts) - 1):
-            dt = (cuts[k + 1] - cuts[k]) / SECOND
-            c = self._control((cuts[k] + cuts[k + 1]) // 2)
-            known = known and c.known
-            # the figures hold for n.interval: a shorter one has the same accumulated noise; where
-            # the motion is too fast for its interval, the stamps are wrong, not the noise larger
-            lasted = max(dt, abs(c.v) * dt / n.max_speed, abs(c.w) * dt / n.max_turn_rate)
-            scale = n.interval / lasted
-            lateral = n.lateral * abs(c.v) if c.known else n.max_speed / 5.0
-            rows[:, k] = (
-                c.v, c.w, dt, c.sigma_v**2 * scale, c.sigma_w**2 * scale, lateral**2 * scale,
-                c.gyro,
-            )  # fmt: skip
-            if c.bias_sigma < np.inf:
-                weight += 1.0 / (c.bias_sigma**2 * scale)
-                weighted += c.bias / (c.bias_sigma**2 * scale)
-        out = integrate(*rows)
+        odometry = _around(self._stamps, start, end)
+        imu = _around(self._imu_stamps, start, end)
+        out, known, bias, variance = _drive(
+            start, end,
+            np.array(self._stamps[odometry], dtype=np.int64),
+            np.array(self._v[odometry], dtype=np.float64),
+            np.array(self._w[odometry], dtype=np.float64),
+            np.array(self._imu_stamps[imu], dtype=np.int64),
+            np.array(self._rates[imu], dtype=np.float64),
+            self._noise_values,
+        )  # fmt: skip
         out[0, 2] = se2.wrapped(out[0, 2])
-        bias = weighted / weight if weight > 0.0 else 0.0
-        variance = 1.0 / weight if weight > 0.0 else np.inf
         return Motion(out[0], out[1:4], known, out[4], bias, variance)
-
-    def _control(self, stamp: int) -> _Control:
-        """The control at a stamp with its sigmas (eq. 6)."""
-        n = self._noise
-        k = bisect_left(self._stamps, stamp)
-        known = 0 < k < len(self._stamps)
-        gap = (self._stamps[k] - self._stamps[k - 1]) / SECOND if known else 0.0
-        rate = self._rate(stamp)
-        if not known or gap > n.max_gap or math.isnan(self._v[k]):
-            c = _Control(0.0, 0.0, n.max_speed / 5.0, n.max_turn_rate / 5.0, False)
-        else:
-            v, w = self._v[k], self._w[k]
-            # when inside a long interval the motion happened is a guess
-            guess = n.guess if gap > 2.0 * n.interval else 0.0
-            c = _Control(v, w, (n.a + guess) * abs(v) + n.b, (n.c + guess) * abs(w) + n.d, True)
-            if v == 0.0 and w == 0.0:
-                # the wheels do not turn: so does the robot not, and the IMU shows its bias
-                c.sigma_v, c.sigma_w = 0.1 * n.b, 0.1 * n.d
-        if rate is not None:
-            if c.known:
-                c.bias = rate - c.w
-                c.bias_sigma = math.hypot(n.imu_c * abs(rate) + n.imu_d, c.sigma_w)
-            if not (c.known and c.v == 0.0 and c.w == 0.0):
-                c.w, c.gyro = rate, 1.0
-                c.sigma_w = n.imu_c * abs(rate) + n.imu_d
-        return c
-
-    def _rate(self, stamp: int) -> float | None:
-        """The IMU's yaw rate, linear between its samples; None outside or across a gap."""
-        k = bisect_left(self._imu_stamps, stamp)
-        if not 0 < k < len(self._imu_stamps):
-            return None
-        t0, t1 = self._imu_stamps[k - 1], self._imu_stamps[k]
-        if t1 - t0 > self._noise.max_gap * SECOND:
-            return None
-        f = (stamp - t0) / (t1 - t0)
-        return self._rates[k - 1] * (1.0 - f) + self._rates[k] * f
 
 
 def warm_up() -> None:
-    """Compile the kernel."""
+    """Compile the kernels."""
     integrate(*np.ones((7, 1)))
+    buffer = MotionBuffer(MotionNoise(), 1.0)
+    buffer.motion(1, 2)
