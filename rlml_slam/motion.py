@@ -201,7 +201,7 @@ def _rate(stamp: int, stamps: Stamps, rates: Array, max_gap: float) -> float:
     if t1 - t0 > max_gap * SECOND:
         return np.nan
     f = (stamp - t0) / (t1 - t0)
-    return rates[k - 1] * (1.0 - f) + rates[k] * f
+    return float(rates[k - 1] * (1.0 - f) + rates[k] * f)
 
 
 def _around(stamps: list[int], start: int, end: int) -> slice:
