@@ -73,6 +73,28 @@ def compose(T_a_b: ArrayLike, T_b_c: ArrayLike) -> Array:
     return out
 
 
+@kernel
+def compose_belief(T_a_b: Array, T_b_c: Array, cov: Array) -> tuple[Array, Array]:
+    """One T_a_c (3,), with the covariance (3, 3) of T_b_c turned from b's axes to a's."""
+    c, s = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    x, y, turn = T_b_c[0], T_b_c[1], T_a_b[2] + T_b_c[2]
+    pose = np.array(
+        [
+            T_a_b[0] + c * x - s * y,
+            T_a_b[1] + s * x + c * y,
+            np.pi - (np.pi - turn) % (2.0 * np.pi),
+        ]
+    )
+    out = cov.copy()
+    for k in range(3):
+        u, v = out[0, k], out[1, k]
+        out[0, k], out[1, k] = c * u - s * v, s * u + c * v
+    for k in range(3):
+        u, v = out[k, 0], out[k, 1]
+        out[k, 0], out[k, 1] = c * u - s * v, s * u + c * v
+    return pose, out
+
+
 def inverse(T_a_b: ArrayLike) -> Array:
     """T_b_a = T_a_b^-1."""
     a = np.asarray(T_a_b, dtype=np.float64)
@@ -234,5 +256,6 @@ def interpolate(T_a_b: ArrayLike, T_a_c: ArrayLike, fraction: ArrayLike) -> Arra
 
 
 def warm_up() -> None:
-    """Compile the kernel."""
+    """Compile the kernels."""
     transform(np.zeros(3), np.zeros((1, 2)))
+    compose_belief(np.zeros(3), np.zeros(3), np.eye(3))

@@ -30,6 +30,18 @@ def assert_same_pose(a, b, atol=1e-12):
     np.testing.assert_allclose(turn, 0.0, atol=atol)
 
 
+@pytest.mark.parametrize('turn', ANGLES)
+def test_belief_goes_on_with_its_pose_and_turns_with_the_frame(turn):
+    T_a_b, T_b_c = np.array([0.3, -1.2, turn]), np.array([2.0, 0.7, -2.9])
+    half = np.random.default_rng(1).normal(size=(3, 3))
+    pose, cov = se2.compose_belief(T_a_b, T_b_c, half @ half.T)
+    assert_same_pose(pose, se2.compose(T_a_b, T_b_c))
+    assert -np.pi < pose[2] <= np.pi
+    R = np.eye(3)
+    R[:2, :2] = se2.rotation(turn)
+    np.testing.assert_allclose(cov, R @ half @ half.T @ R.T, atol=1e-12)
+
+
 def hat(t):
     return np.array([[0.0, -t[2], t[0]], [t[2], 0.0, t[1]], [0.0, 0.0, 0.0]])
 

@@ -22,7 +22,7 @@ from rlml_slam.matching.scan_match import match
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.doubt import Doubt, consents
 from rlml_slam.rlml.grid_fix import Fix, SavedGrid
-from rlml_slam.rlml.health import Evidence, HealthMonitor
+from rlml_slam.rlml.health import Evidence, HealthMonitor, weak_direction
 from rlml_slam.rlml.joint_state import BIAS, JointState
 from rlml_slam.rlml.reflector_update import use_reflectors
 from rlml_slam.rlml.relocalize import is_mapped
@@ -199,9 +199,9 @@ class FrontEnd:
         self._map_scan(observation, evidence, doubtful and evidence.misfit)
         self._remember_velocity(before, observation.stamp)
         health = self._judge(observation, matched, evidence)
-        frame = self._frame(observation, matched, evidence, health, began)
-        jumped, self._jumped = self._jumped, False
-        return replace(frame, doubtful=doubtful or self._unconfirmed, jumped=jumped)
+        frame = self._frame(observation, matched, evidence, health, doubtful, began)
+        self._jumped = False
+        return frame
 
     # --- prior -----------------------------------------------------------------------------
 
@@ -343,14 +343,14 @@ class FrontEnd:
         self.doubt.learn(found.score)
         information = observability.information(submap, points, found.pose, p)
         fuse(self.state.x, self.state.P, found.pose, information, p.prior_scale)
+        heading = float(self.state.anchor(0)[2])
         return Evidence(
             scan=True,
             used=True,
             misfit=misfit,
             beams=len(points),
             score=found.score,
-            information=information,
-            heading=float(self.state.anchor(0)[2]),
+            weak=weak_direction(information, heading, self._p.health.weak_sigma),
             prior_weight=found.prior_weight,
             iterations=found.iterations,
         )
@@ -392,7 +392,7 @@ class FrontEnd:
         contradicted = self.doubt.judge(
             observation.stamp,
             evidence.misfit,
-            evidence.used and self.health.weak_direction(evidence) is None,
+            evidence.used and evidence.weak is None,
             len(matched.status) - told,
             matched.num_used,
             bool(self.tracks.surveyed.any()),
@@ -441,10 +441,11 @@ class FrontEnd:
         matched: _Matched,
         evidence: Evidence,
         health: Health,
+        doubtful: bool,
         began: float,
     ) -> Frame:
         pose, cov = self.state.pose, self.state.pose_cov
-        T_map_base, cov_map = in_map(self._T_map_local, pose, cov)
+        T_map_base, cov_map = se2.compose_belief(self._T_map_local, pose, cov)
         used = matched.status == Status.USED
         return Frame(
             stamp=observation.stamp,
@@ -461,6 +462,8 @@ class FrontEnd:
             chi2=float(np.nansum(matched.distance2[used])) if used.any() else 0.0,
             iterations=evidence.iterations,
             wall_ms=(time.perf_counter() - began) * 1e3,
+            doubtful=doubtful or self._unconfirmed,
+            jumped=self._jumped,
         )
 
     def reflectors(self) -> Reflectors:
@@ -475,13 +478,6 @@ class FrontEnd:
             self.tracks.sightings[keep],
             self.tracks.diameters[keep],
         )
-
-
-def in_map(T_map_local: Array, pose: Array, cov: Array) -> tuple[Array, Array]:
-    """A pose (3,) of the local frame and its covariance (3, 3), both in the map frame."""
-    R = np.eye(3)
-    R[:2, :2] = se2.rotation(T_map_local[2])
-    return se2.compose(T_map_local, pose), R @ cov @ R.T
 
 
 class _Matched:

@@ -6,8 +6,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from rlml_slam.params import HealthLimits
 from rlml_slam.se2 import Array
 from rlml_slam.types import Health, Level
@@ -17,8 +15,8 @@ from rlml_slam.types import Health, Level
 class Evidence:
     """What the scan said in one step.
 
-    ``misfit``: it fits far worse than scans did lately. ``information`` (3, 3) is in the axes of
-    the submap, which is turned by ``heading`` [rad].
+    ``misfit``: it fits far worse than scans did lately. ``weak`` is the direction [deg, 0..180) of
+    the map in which the scan leaves the position open, None where there is none.
     """
 
     scan: bool = False
@@ -26,8 +24,7 @@ class Evidence:
     misfit: bool = False
     beams: int = 0
     score: float = float('nan')
-    information: Array | None = None
-    heading: float = 0.0
+    weak: float | None = None
     prior_weight: float = 1.0
     iterations: int = 0
 
@@ -91,7 +88,7 @@ class HealthMonitor:
         misfit = failing(self._scan_fits)
         if misfit:
             reasons.append(f'scan fits the submap by {evidence.score:.2f} only')
-        weak = self.weak_direction(evidence)
+        weak = evidence.weak
         if evidence.used and weak is None:
             self._held_by_scan = stamp
         held = max(self._held_by_scan, self._held_by_reflectors)
@@ -109,19 +106,21 @@ class HealthMonitor:
             return Health(Level.LOST, tuple(reasons))
         return Health(Level.DEGRADED if reasons else Level.OK, tuple(reasons))
 
-    def weak_direction(self, evidence: Evidence) -> float | None:
-        """Direction [deg, 0..180) in which the scan leaves the position open, if there is one."""
-        if evidence.information is None:
-            return None
-        info = evidence.information
-        # marginal of the position: the heading is estimated along with it
-        marginal = info[:2, :2] - np.outer(info[:2, 2], info[:2, 2]) / max(info[2, 2], 1e-12)
-        if ends_of(marginal)[0] >= self._limits.weak_sigma**-2:
-            return None
-        (a, b), (_, d) = marginal.tolist()
-        # the axis of the smaller eigenvalue, from the double angle of the larger one's
-        weak = 0.5 * math.atan2(2.0 * b, a - d) + 0.5 * math.pi
-        return math.degrees(weak + evidence.heading) % 180.0
+
+def weak_direction(information: Array, heading: float, weak_sigma: float) -> float | None:
+    """Direction [deg, 0..180) in which the position has a larger sigma, if there is one.
+
+    ``information`` (3, 3) of a pose is in axes that are turned by ``heading`` [rad].
+    """
+    (xx, xy, xt), (_, yy, yt), (_, _, tt) = information.tolist()
+    # marginal of the position: the heading is estimated along with it
+    tt = max(tt, 1e-12)
+    a, b, d = xx - xt * xt / tt, xy - xt * yt / tt, yy - yt * yt / tt
+    if 0.5 * (a + d) - math.hypot(0.5 * (a - d), b) >= weak_sigma**-2:
+        return None
+    # the axis of the smaller eigenvalue, from the double angle of the larger one's
+    weak = 0.5 * math.atan2(2.0 * b, a - d) + 0.5 * math.pi
+    return math.degrees(weak + heading) % 180.0
 
 
 def ends_of(A: Array) -> tuple[float, float]:

@@ -12,11 +12,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rlml_slam import se2
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved import SavedMap
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.back_end import BackEnd, Update
-from rlml_slam.rlml.front_end import FrontEnd, in_map
+from rlml_slam.rlml.front_end import FrontEnd
 from rlml_slam.rlml.recovery import Recovery
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.sequence import Sequencer
@@ -53,7 +54,7 @@ class Slam:
         self._saved: SavedMap | None = None
         self._path: list[tuple[int, Array]] = []
         self._thread = ThreadPoolExecutor(1, 'back end') if parallel else None
-        self._pending: deque[tuple[Frame, Future[Update | None]]] = deque()
+        self._pending: deque[tuple[Frame, float, Future[Update | None]]] = deque()
 
     def use_map(self, saved: SavedMap) -> None:
         """Localise in a map that never changes, instead of making one."""
@@ -103,8 +104,8 @@ class Slam:
                 self._path.append((frame.stamp, frame.T_map_base))
                 frames.append(frame)
             elif self._thread is not None:
-                frame = replace(frame, wall_ms=1e3 * (time.thread_time() - began))
-                self._pending.append((frame, self._thread.submit(self._add, frame)))
+                spent = 1e3 * (time.thread_time() - began)
+                self._pending.append((frame, spent, self._thread.submit(self._add, frame)))
                 is_lost = frame.health.level is Level.LOST or frame.doubtful
                 frames += self._settle(0 if is_lost else AHEAD)
             else:
@@ -136,11 +137,11 @@ class Slam:
         """The oldest of the frames that wait for the back end, so that ``most`` are left."""
         frames = []
         while len(self._pending) > most:
-            frame, update = self._pending.popleft()
-            T_map_base, cov_map = in_map(
+            frame, spent, update = self._pending.popleft()
+            T_map_base, cov_map = se2.compose_belief(
                 self.front_end.T_map_local, frame.T_local_base, frame.cov_local
             )
-            frames.append(replace(frame, T_map_base=T_map_base, cov_map=cov_map))
+            frames.append(replace(frame, T_map_base=T_map_base, cov_map=cov_map, wall_ms=spent))
             self._take_over(update.result())
         return frames
 

@@ -47,7 +47,9 @@ class Inputs:
 
     def count(self, stream: str, what: str, error: str = '') -> None:
         """One more input of ``stream`` that was ``what``."""
-        self.counts.setdefault(stream, Counter())[what] += 1
+        if stream not in self.counts:
+            self.counts[stream] = Counter()
+        self.counts[stream][what] += 1
         if error:
             self.last_error = error
 
