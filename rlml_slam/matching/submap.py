@@ -202,7 +202,8 @@ def carve(
     for m in range(hits):
         flat[touched[m]] ^= TOUCHED
     for m in range(hits, n):
-        flat[touched[m]] = miss[flat[touched[m]] ^ TOUCHED]
+        at = np.uint64(touched[m])
+        flat[at] = miss[np.uint64(flat[at] ^ TOUCHED)]
     return n
 
 
@@ -268,16 +269,17 @@ def touch_ray(
     # where along the ray the next column (row) begins; how far beyond its end does not matter
     next_j, next_i = int(min(first_j, 2.0) * WHOLE_RAY), int(min(first_i, 2.0) * WHOLE_RAY)
     width, height = int(min(per_j, 2.0) * WHOLE_RAY), int(min(per_i, 2.0) * WHOLE_RAY)
-    cell = i * columns + j
+    cell, turn, both, ahead = i * columns + j, step_j - step_i, width + height, next_j - next_i
     for _ in range(left - 1):
-        touched[n] = cell
-        v = flat[cell]
-        flat[cell] = v | TOUCHED
-        n += v < TOUCHED
-        sideways = -int(next_j < next_i)  # all bits or none
-        cell += (sideways & step_j) | (~sideways & step_i)
-        next_j += sideways & width
-        next_i += ~sideways & height
+        # unsigned: an index that may be negative is looked at twice
+        at = np.uint64(cell)
+        touched[np.uint64(n)] = cell
+        v = flat[at]
+        flat[at] = v | TOUCHED
+        n += int(v < TOUCHED)
+        sideways = ahead >> 63  # all bits where the next column begins first, or none
+        cell = cell + step_i + (sideways & turn)
+        ahead = (ahead - height) + (sideways & both)
     return n
 
 
