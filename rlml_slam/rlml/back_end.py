@@ -17,6 +17,7 @@ from rlml_slam.graph.robust import Loss, Losses, LossKind
 from rlml_slam.graph.solver import optimize
 from rlml_slam.maps.occupancy import OccupancyGrid, render
 from rlml_slam.params import Parameters
+from rlml_slam.rlml.correction import Correction, Known, either
 from rlml_slam.rlml.deferred import DeferredMatches
 from rlml_slam.rlml.keyframes import Interval, Keyframe
 from rlml_slam.rlml.loop_closure import Closure, ScanGraph
@@ -27,13 +28,17 @@ from rlml_slam.types import Belief, EdgeKind, Frame, Reflectors
 
 @dataclass(frozen=True)
 class Update:
-    """What one keyframe did; ``T_map_local`` (3,) corrects the front end where ``optimized``."""
+    """What one keyframe did; ``T_map_local`` (3,) corrects the front end where ``optimized``.
+
+    ``known``: how well the keyframe's pose is known with it, None where no one asked the graph.
+    """
 
     keyframe: int
     T_map_local: Array
     optimized: bool
     closures: tuple[Closure, ...]
     wall_ms: float
+    known: Known | None = None
 
 
 class BackEnd:
@@ -59,6 +64,7 @@ class BackEnd:
         self.reflector_graph = ReflectorGraph(p.reflector, self.graph)
         self.deferred = DeferredMatches(p.reflector, self.reflector_graph)
         self.T_map_local = np.zeros(3)
+        self.known: Known | None = None
         self._optimized = False
         self._interval: Interval | None = None
         self._since_optimized = 0
@@ -114,6 +120,7 @@ class BackEnd:
             self._optimized,
             closures,
             (time.perf_counter() - began) * 1e3,
+            self.known,
         )
 
     def _node(self, frame: Frame) -> Keyframe:
@@ -194,6 +201,24 @@ class BackEnd:
         self.scans.changed = self.reflector_graph.changed = False
         last = self.keyframes[-1]
         self.T_map_local = se2.compose(self.graph.poses[last.index], se2.inverse(last.T_local))
+        self.known = self._known()
+
+    def _known(self) -> Known:
+        """How well the newest keyframe is known in the map.
+
+        Nothing that was seen near it is in the graph yet: that is of the keyframe before, from
+        which the front end's covariance has grown. What both have seen neither judges better; the
+        graph alone knows of the loops that scans have closed.
+        """
+        before, last = self.keyframes[-2:]
+        cov = self.marginals().joint([before.index])
+        R = np.eye(3)
+        R[:2, :2] = se2.rotation(self.T_map_local[2])
+        if not any(closure.accepted for closure in self.scans.closures):
+            cov = either(cov, R @ before.cov_local @ R.T)
+        since = Correction(self.T_map_local, Known(before.T_local, before.cov_local, cov))
+        _, cov_map = since.apply(last.T_local, last.cov_local)
+        return Known(last.T_local, last.cov_local, cov_map)
 
     def belief(self) -> Belief | None:
         """The newest keyframe and the reflectors, with joint covariance; None without any."""

@@ -20,6 +20,7 @@ from rlml_slam.maps.saved import SavedMap
 from rlml_slam.matching import association, observability, thinning
 from rlml_slam.matching.scan_match import match
 from rlml_slam.params import Parameters
+from rlml_slam.rlml.correction import Correction, Known
 from rlml_slam.rlml.doubt import Doubt, consents
 from rlml_slam.rlml.grid_fix import Fix, SavedGrid
 from rlml_slam.rlml.health import Evidence, HealthMonitor, weak_direction
@@ -69,7 +70,7 @@ class FrontEnd:
         self._grid: SavedGrid | None = None
         self._fix = Fix(math.nan)
         self._jumped = False
-        self._T_map_local = np.zeros(3)
+        self._correction = Correction(np.zeros(3))
         self._velocity = np.zeros(3)
         self._velocity_known = False
         self._has_odometry = False
@@ -108,33 +109,44 @@ class FrontEnd:
 
         A submap begun where the robot was lies elsewhere; reflectors stay where they are.
         """
-        T_local_map = se2.inverse(self._T_map_local)
+        T_local_map = se2.inverse(self.T_map_local)
         pose, R = se2.compose(T_local_map, T_map_base), np.eye(3)
         R[:2, :2] = se2.rotation(T_local_map[2])
         cov = R @ cov @ R.T
         if self._map is not None:
             bias, variance = self.state.x[BIAS], self.state.P[BIAS, BIAS]
-            T_map_local, last = self._T_map_local, self._last_stamp
+            T_map_local, last = self.T_map_local, self._last_stamp
             known = self._map
             self.reset(pose, cov)
             self.use_map(known.reflectors, known.grid)
             self.state.x[BIAS], self.state.P[BIAS, BIAS] = bias, variance
-            self._T_map_local, self._last_stamp = T_map_local, last
+            self._last_stamp = last
         else:
             self.state.place(pose, cov)
             self.submaps = Submaps(self._p.submap)
             self.doubt = Doubt(self._p.health)
             self._velocity_known = False
+            T_map_local = self.T_map_local
+        # what the graph knows is of where the robot was
+        self._correction = Correction(T_map_local)
         self._jumped = True
 
-    def correct(self, T_map_local: Array) -> None:
-        """Take over the back end's newest correction of the local frame."""
-        self._T_map_local = np.array(T_map_local, dtype=np.float64)
+    def correct(self, T_map_local: Array, known: Known | None = None) -> None:
+        """Take over the back end's newest correction of the local frame.
+
+        Without what is ``known`` of a pose by the graph, what was known before goes on.
+        """
+        known = self._correction.known if known is None else known
+        self._correction = Correction(np.array(T_map_local, dtype=np.float64), known)
+
+    def in_map(self, pose: Array, cov: Array) -> tuple[Array, Array]:
+        """A pose (3,) of the local frame and its covariance (3, 3), both in the map frame."""
+        return self._correction.apply(pose, cov)
 
     @property
     def T_map_local(self) -> Array:
         """The local frame's pose (3,) in the map, as the back end corrected it last."""
-        return self._T_map_local
+        return self._correction.T_map_local
 
     @property
     def newest(self) -> int | None:
@@ -150,7 +162,7 @@ class FrontEnd:
         mine, theirs = self._common(belief)
         if not len(mine):
             return False
-        points = se2.transform(se2.inverse(self._T_map_local), belief.points[theirs])
+        points = se2.transform(se2.inverse(self.T_map_local), belief.points[theirs])
         d = points - self.state.landmarks()[mine]
         spread = self.state.landmark_covs()[mine]
         d2 = np.einsum('ni,ni->n', d, np.linalg.solve(spread, d[..., None])[..., 0])
@@ -173,7 +185,7 @@ class FrontEnd:
         keep[mine] = True
         order = theirs[np.argsort(mine, kind='stable')]
         self.tracks.keep(keep)
-        inverse = se2.inverse(self._T_map_local)
+        inverse = se2.inverse(self.T_map_local)
         columns = np.concatenate([[0, 1, 2], np.stack([3 + 2 * order, 4 + 2 * order], 1).ravel()])
         T = np.eye(len(columns))
         R = se2.rotation(inverse[2])
@@ -182,6 +194,8 @@ class FrontEnd:
             T[k : k + 2, k : k + 2] = R
         cov = T @ belief.cov[np.ix_(columns, columns)] @ T.T
         self.state.replace(se2.transform(inverse, belief.points[order]), cov, self.submaps.bias)
+        # the state has the covariance of the graph now
+        self._correction = Correction(self.T_map_local)
 
     def process(self, observation: Observation) -> Frame:
         """The pose at the observation's stamp; never raises for what was measured."""
@@ -415,7 +429,7 @@ class FrontEnd:
             odometry=observation.motion.known,
             detections=None if observation.detections is None else len(observation.detections),
             used=matched.num_used,
-            cov=self.state.P[:3, :3],
+            cov=self.in_map(self.state.pose, self.state.pose_cov)[1],
             unconfirmed=unconfirmed,
             contradicted=self._lasts(observation.stamp) and not unconfirmed,
         )
@@ -445,7 +459,7 @@ class FrontEnd:
         began: float,
     ) -> Frame:
         pose, cov = self.state.pose, self.state.pose_cov
-        T_map_base, cov_map = se2.compose_belief(self._T_map_local, pose, cov)
+        T_map_base, cov_map = self.in_map(pose, cov)
         used = matched.status == Status.USED
         return Frame(
             stamp=observation.stamp,
@@ -469,10 +483,10 @@ class FrontEnd:
     def reflectors(self) -> Reflectors:
         """The confirmed reflectors in the map frame."""
         keep = self.tracks.confirmed(self._p.reflector.min_sightings)
-        R = se2.rotation(self._T_map_local[2])
+        R = se2.rotation(self.T_map_local[2])
         return Reflectors(
             self.tracks.keys[keep],
-            se2.transform(self._T_map_local, self.state.landmarks()[keep]),
+            se2.transform(self.T_map_local, self.state.landmarks()[keep]),
             R @ self.state.landmark_covs()[keep] @ R.T,
             self.tracks.ids[keep],
             self.tracks.sightings[keep],

@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam import se2
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved import SavedMap
 from rlml_slam.params import Parameters
@@ -138,9 +137,7 @@ class Slam:
         frames = []
         while len(self._pending) > most:
             frame, spent, update = self._pending.popleft()
-            T_map_base, cov_map = se2.compose_belief(
-                self.front_end.T_map_local, frame.T_local_base, frame.cov_local
-            )
+            T_map_base, cov_map = self.front_end.in_map(frame.T_local_base, frame.cov_local)
             frames.append(replace(frame, T_map_base=T_map_base, cov_map=cov_map, wall_ms=spent))
             self._take_over(update.result())
         return frames
@@ -151,7 +148,7 @@ class Slam:
             return False
         self.updates.append(update)
         if update.optimized:
-            self.front_end.correct(update.T_map_local)
+            self.front_end.correct(update.T_map_local, update.known)
         return update.optimized
 
     def _believe(self) -> None:

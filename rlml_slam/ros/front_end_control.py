@@ -12,6 +12,7 @@ import numpy as np
 from rlml_slam import se2
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Parameters
+from rlml_slam.rlml.correction import Known
 from rlml_slam.rlml.front_end import FrontEnd
 from rlml_slam.ros import convert
 from rlml_slam.ros.answers import FramePublisher
@@ -42,7 +43,8 @@ class FrontEndControl:
         self.map: Reflectors | None = None
         self.grid: OccupancyGrid | None = None
         self.last: Frame | None = None
-        self._recent: deque[tuple[int, Array]] = deque(maxlen=RECENT)
+        # stamp, T_local_base (3,) and its covariance (3, 3)
+        self._recent: deque[tuple[int, Array, Array]] = deque(maxlen=RECENT)
         for kind, topic, callback, qos in (
             (POSE, 'initialpose', self.start_at, RELIABLE),
             (POSE, 'correction', self.correct, LATCHED),
@@ -56,7 +58,7 @@ class FrontEndControl:
     def process(self, observation: Observation) -> Frame:
         """One observation."""
         frame = self.last = self.front_end.process(observation)
-        self._recent.append((frame.stamp, frame.T_local_base))
+        self._recent.append((frame.stamp, frame.T_local_base, frame.cov_local))
         return frame
 
     def restart(self) -> None:
@@ -67,7 +69,7 @@ class FrontEndControl:
         """Begin anew at a pose of the map; one with the stamp of a frame is of that moment."""
         start = convert.start_pose(msg, self._p.node.map_frame)
         pose = start.pose
-        for stamp, T_local_base in self._recent:
+        for stamp, T_local_base, _ in self._recent:
             if stamp == start.stamp:
                 moved = se2.between(T_local_base, self.front_end.state.pose)
                 pose = se2.compose(pose, moved)
@@ -83,7 +85,7 @@ class FrontEndControl:
         front_end = self.front_end
         if not front_end.doubt.since:
             return
-        for stamp, T_local_base in self._recent:
+        for stamp, T_local_base, _ in self._recent:
             if stamp == found.stamp and stamp >= front_end.doubt.since:
                 moved = se2.between(T_local_base, front_end.state.pose)
                 front_end.relocate(se2.compose(found.pose, moved), found.cov)
@@ -133,5 +135,10 @@ class FrontEndControl:
         another local frame means nothing in this.
         """
         correction = convert.pose_estimate(msg, 'correction')
-        if any(stamp == correction.stamp for stamp, _ in self._recent):
-            self.front_end.correct(correction.pose)
+        for stamp, T_local_base, cov_local in self._recent:
+            if stamp == correction.stamp:
+                # zeros are those of a graph that says nothing, and of no pose
+                told = correction.cov.any()
+                known = Known(T_local_base, cov_local, correction.cov) if told else None
+                self.front_end.correct(correction.pose, known)
+                return

@@ -153,8 +153,11 @@ class Mapper:
         self._odom = (frame.stamp, se2.compose(T_map_base, se2.inverse(T_odom_base)))
 
     def _send_correction(self) -> None:
+        """The local frame in the map, with the covariance of the pose at this stamp in the map."""
         frame, T = self._p.node.map_frame, self.back_end.T_map_local
-        message = build.pose_with_covariance(make_rclpy, self.stamp, frame, T, CERTAIN)
+        known = self.back_end.known
+        cov = CERTAIN if known is None else known.cov_map
+        message = build.pose_with_covariance(make_rclpy, self.stamp, frame, T, cov)
         self._correction.publish(message)
 
     def _send_belief(self, record: Record) -> None:

@@ -113,6 +113,16 @@ def test_correction_moves_the_map_pose_only(live, node):
     )
 
 
+def test_correction_tells_how_well_its_frame_is_known_in_the_map(live, node):
+    feed(node, 2.0)
+    cov = np.diag([0.04, 0.01, 0.02])
+    node.control.correct(
+        build.pose_with_covariance(make, node.last.stamp, 'map', np.zeros(3), cov)
+    )
+    _, cov_map = node.front_end.in_map(node.last.T_local_base, node.last.cov_local)
+    np.testing.assert_allclose(cov_map, cov, atol=1e-12)
+
+
 @pytest.mark.parametrize('again', [lambda c: c.restart(), lambda c: c.start_at(start_at_five())])
 def test_correction_of_an_old_session_means_nothing(live, node, again):
     feed(node, 2.0)
