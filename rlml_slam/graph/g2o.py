@@ -67,7 +67,8 @@ def read_graph(path: Path | str, losses: Losses | None = None) -> GraphFile:
     """Read a g2o or TORO file.
 
     Poses without a VERTEX line start from the spanning tree of the edges. An edge between
-    consecutive ids is odometry, any other a closure. Raises FileFormatError naming file and line.
+    poses that follow each other is odometry, any other a closure. Raises FileFormatError naming
+    file and line.
     """
     path = Path(path)
     lines, fixed, skipped = _parse(path)
@@ -200,10 +201,9 @@ def _add_edges(path: Path, graph: Graph, lines: dict[str, _Lines], poses: dict[i
         v = np.array(one.values, dtype=np.float64).reshape(-1, 9)
         info = _symmetric(v[:, 3:], order, 3)
         _check(path, one, info, nodes)
-        ids = np.array(one.ids, dtype=np.int64).reshape(-1, 2)
         kinds = [
             EdgeKind.ODOMETRY if near else EdgeKind.CLOSURE
-            for near in np.abs(ids[:, 0] - ids[:, 1]) == 1
+            for near in np.abs(nodes[:, 0] - nodes[:, 1]) == 1
         ]
         graph.add_edges(kinds, nodes, v[:, :3], info)
 

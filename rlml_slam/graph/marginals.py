@@ -61,6 +61,15 @@ class Marginals:
             out[:, free] = columns(self._system, p)[:, q[free]]
         return np.swapaxes(out.reshape(3, -1, 2), 0, 1)
 
+    def pose_columns(self, pose: int, others: ArrayLike) -> Array:
+        """Covariances (k, 3, 3) between one pose and the poses ``others`` (k,)."""
+        p, q = self._rows([pose], ()), self._rows(others, ())
+        out = np.zeros((3, len(q)))
+        if p[0] >= 0:
+            free = q >= 0
+            out[:, free] = columns(self._system, p)[:, q[free]]
+        return np.swapaxes(out.reshape(3, -1, 3), 0, 1)
+
     def joint(self, poses: ArrayLike, landmarks: ArrayLike = ()) -> Array:
         """Joint covariance (3k + 2l, 3k + 2l) of the poses (k,), then the landmarks (l,)."""
         at = self._rows(poses, landmarks)

@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which closures to believe: the surest first, the others by the graph that these have made.
+
+A wrong closure cannot be told by its residual once it has bent the map, and robust losses that
+start with all closures in the graph settle in whatever they are bent into. So the graph begins
+with odometry alone. A closure, or a group that agrees (agreement.py), enters when the evidence
+(evidence.py) of the graph so far is far above chance; each that enters sharpens the prediction for
+the others. The demands sink only when nothing meets them, down to a 5 % chance of being wrong.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from rlml_slam import params, se2
+from rlml_slam.graph import factors
+from rlml_slam.graph.agreement import Groups, group
+from rlml_slam.graph.backbone import Backbone, Ints
+from rlml_slam.graph.evidence import evidence, uniform
+from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.marginals import Marginals
+from rlml_slam.graph.robust import Loss
+from rlml_slam.graph.solver import optimize
+from rlml_slam.graph.table import FactorKind
+from rlml_slam.se2 import Array
+
+Flags = NDArray[np.bool_]
+SURE = 0.01  # chances that any of all closures is wrong, with which the first ones enter
+GROUPS = 0.1  # the same for the groups, whose members speak for each other already
+DOUBT = 0.05  # chance of being wrong with which the last one enters
+STEP = 2.0  # by which the demands sink
+TRIES = 2  # times that a closure may be thrown out again
+
+
+@dataclass(frozen=True)
+class Selection:
+    """``edges`` (k,) are the closures, ``accepted`` (k,) whether they are in the graph.
+
+    ``evidence`` (k,) is the log ratio of right to wrong when each was judged last, infinite for
+    one that alone holds two parts together. ``scale`` of the covariances, as found.
+    """
+
+    edges: Ints
+    accepted: Flags
+    evidence: Array
+    scale: float
+    solves: int
+
+
+def select_closures(graph: Graph, parameters: params.Solver | None = None) -> Selection:
+    """Enable the closures to believe and disable all others; the estimate is the optimum then.
+
+    All other factors are trusted. Raises SolverError like ``optimize``.
+    """
+    losses = graph.losses
+    graph.losses = replace(losses, closure=Loss())
+    try:
+        return _Selector(graph, parameters or params.Solver()).run()
+    finally:
+        graph.losses = losses
+
+
+class _Selector:
+    def __init__(self, graph: Graph, parameters: params.Solver) -> None:
+        e = graph.edges
+        self._graph, self._parameters = graph, parameters
+        is_closure = e.kinds == FactorKind.CLOSURE
+        self._edges = np.flatnonzero(is_closure)
+        self._nodes, self._z = e.nodes[self._edges], e.measured[self._edges]
+        self._cov = np.asarray(np.linalg.inv(e.information[self._edges]), dtype=np.float64)
+        trusted = np.flatnonzero(e.enabled & ~is_closure)
+        backbone = Backbone(graph, trusted)
+        area = _extent2(backbone.poses)
+        self._groups = group(backbone, self._nodes, self._z, self._cov, area)
+        self._held = _bridges(backbone, self._nodes, self._groups)
+        if self._held.any():
+            held = self._edges[self._held]
+            backbone = Backbone(graph, np.concatenate([trusted, held]))
+            area = _extent2(backbone.poses)
+        self._wrong = uniform(area)
+        free = ~graph.fixed_poses
+        graph.poses[free] = backbone.poses[free]
+        self._accepted = self._held.copy()
+        self._left = np.where(self._held, 0, TRIES)
+        self._evidence = np.where(self._held, np.inf, -np.inf)
+        self._backbone = backbone
+        self._solves = 0
+
+    def run(self) -> Selection:
+        """Let closures in until none of those outside is likelier right than wrong."""
+        self._solve()
+        self._judge_first()
+        sunk = 0.0
+        while True:
+            new = self._enough(sunk)
+            if new.any():
+                self._take(new)
+                self._judge()
+                sunk = 0.0
+            elif sunk >= self._lowest():
+                break
+            else:
+                sunk += STEP
+        return Selection(
+            self._edges, self._accepted, self._evidence, self._groups.scale, self._solves
+        )
+
+    def _lowest(self) -> float:
+        """How far the demands may sink: to where one that enters is wrong with the chance DOUBT.
+
+        The odds beforehand are those of the closures outside and inside.
+        """
+        inside = int(self._accepted.sum())
+        odds = (len(self._edges) - inside + 1.0) / (inside + 1.0)
+        return self._strict() - math.log(odds / DOUBT)
+
+    def _strict(self) -> float:
+        return math.log(max(len(self._edges), 1) / SURE)
+
+    def _enough(self, sunk: float) -> Flags:
+        """Closures outside whose evidence, or that of the best of their group, is enough."""
+        label, size, _ = self._groups
+        sunk = min(sunk, self._lowest())
+        outside = ~self._accepted & (self._left > 0)
+        value = np.where(outside, self._evidence, -np.inf)
+        best = np.full(len(size), -np.inf)
+        np.maximum.at(best, label, value)
+        several = size > 1
+        demand = max(math.log(max(int(several.sum()), 1) / GROUPS) - sunk, 0.0)
+        grouped: Flags = (several & (best > demand))[label]
+        return outside & ((value > self._strict() - sunk) | grouped)
+
+    def _take(self, new: Flags) -> None:
+        """Let closures in, and throw out what the graph cannot agree with."""
+        self._accepted |= new
+        self._solve()
+        poses = self._graph.poses
+        i, j = self._nodes.T
+        e = factors.relative_pose(poses[i], poses[j], self._z)[0]
+        bad = self._accepted & ~self._held & (self._weigh(e, self._cov) < 0.0)
+        if bad.any():
+            self._left[bad] -= 1
+            self._accepted &= ~bad
+            self._solve()
+
+    def _solve(self) -> None:
+        self._graph.edges.enabled[self._edges] = self._accepted
+        optimize(self._graph, self._parameters)
+        self._solves += 1
+
+    def _judge_first(self) -> None:
+        """Evidence by the backbone alone."""
+        outside = np.flatnonzero(~self._held)
+        i, j = self._nodes[outside].T
+        T, S = self._backbone.motion(i, j)
+        e = se2.between(self._z[outside], T)
+        self._evidence[outside] = self._weigh(e, S + self._cov[outside])
+
+    def _judge(self) -> None:
+        """Evidence of those outside by the graph as it is: roughly, and exactly where it counts.
+
+        The covariance of a difference is at most twice the sum of both, which no correlation
+        needs to be known for; what fails even so need not be looked at.
+        """
+        outside = np.flatnonzero(~self._accepted & (self._left > 0))
+        if not len(outside):
+            return
+        poses = self._graph.poses
+        i, j = self._nodes[outside].T
+        e = factors.relative_pose(poses[i], poses[j], self._z[outside])[0]
+        _, J_i, J_j = factors.relative_pose(poses[i], poses[j], se2.between(poses[i], poses[j]))
+        marginals = Marginals(self._graph)
+        S: Array = 2.0 * (_carried(J_i, marginals.poses(i)) + _carried(J_j, marginals.poses(j)))
+        rough = self._weigh(e, S + self._cov[outside])
+        # the true covariance is smaller: its density is lower at a large error, higher at none
+        open_ = np.flatnonzero((rough > -STEP) & (rough < self._strict() + STEP))
+        if len(open_):
+            S = _difference_covs(marginals, i[open_], j[open_], J_i[open_], J_j[open_])
+            rough[open_] = self._weigh(e[open_], S + self._cov[outside[open_]])
+        self._evidence[outside] = rough
+
+    def _weigh(self, e: Array, S: Array) -> Array:
+        return evidence(e, S, self._groups.scale, self._wrong)
+
+
+def _extent2(poses: Array) -> float:
+    """Square of the larger extent of the poses [m²], at least 1."""
+    return max(float(np.ptp(poses[:, :2], axis=0).max()) ** 2, 1.0)
+
+
+def _carried(J: Array, cov: Array) -> Array:
+    out: Array = J @ cov @ np.swapaxes(J, 1, 2)
+    return out
+
+
+def _difference_covs(marginals: Marginals, i: Ints, j: Ints, J_i: Array, J_j: Array) -> Array:
+    """Covariances (k, 3, 3) of the relative poses of i (k,) and j (k,)."""
+    out = np.empty((len(i), 3, 3))
+    for first in np.unique(i):
+        at = np.flatnonzero(i == first)
+        cross = marginals.pose_columns(int(first), j[at])
+        mixed = J_i[at] @ cross @ np.swapaxes(J_j[at], 1, 2)
+        out[at] = mixed + np.swapaxes(mixed, 1, 2)
+    return out + _carried(J_i, marginals.poses(i)) + _carried(J_j, marginals.poses(j))
+
+
+def _bridges(backbone: Backbone, nodes: Ints, groups: Groups) -> Flags:
+    """Closures that hold pieces of the backbone together: from the largest groups, no loops."""
+    held = np.zeros(len(nodes), dtype=np.bool_)
+    if backbone.pieces == 1:
+        return held
+    a, b = np.sort(backbone.piece[nodes], axis=1).T
+    order = np.lexsort((-groups.size[groups.label], b, a))
+    order = order[a[order] != b[order]]
+    pairs, first = np.unique(np.stack([a[order], b[order]], -1), axis=0, return_index=True)
+    chosen = order[first]
+    cost = 1.0 / groups.size[groups.label[chosen]]
+    n = backbone.pieces
+    links = sparse.csr_matrix((cost, (pairs[:, 0], pairs[:, 1])), (n, n))
+    rows, cols = sparse.csgraph.minimum_spanning_tree(links).nonzero()
+    tree = set(zip(rows.tolist(), cols.tolist(), strict=True))
+    held[[k for k, pair in zip(chosen, pairs.tolist(), strict=True) if tuple(pair) in tree]] = True
+    return held
