@@ -22,7 +22,7 @@ import math
 import numpy as np
 
 from rlml_slam.compiled import kernel, part
-from rlml_slam.graph.fronts import factorise, lay_out, solve_lower, solve_upper
+from rlml_slam.graph.fronts import factorise, lay_out, room, solve_lower, solve_upper
 from rlml_slam.graph.structure import Records
 from rlml_slam.graph.system import System, place
 from rlml_slam.se2 import Array
@@ -30,7 +30,10 @@ from rlml_slam.se2 import Array
 
 @kernel
 def relax(system: System, poses: Array, landmarks: Array) -> bool:
-    """Overwrite the free nodes by the relaxed solution; False if it cannot be solved."""
+    """Overwrite the free nodes by the relaxed solution; False if it cannot be solved.
+
+    The panels of the system serve as memory: it has to be linearised anew.
+    """
     n = len(poses)
     state = np.empty((n, 4))  # r and t
     for i in range(n):
@@ -59,7 +62,7 @@ def _positions(system: System, poses: Array, landmarks: Array) -> bool:
         dims[a] = 1
     fronts, entries, size = lay_out(system.structure, dims)
     place(system.structure, fronts, entries, variables, edges, sightings)
-    v = np.empty(fronts[len(fronts) - 1]['panel'])
+    v = room(system.values, fronts[len(fronts) - 1]['panel'])
     for i in range(len(v)):
         v[i] = 0.0
     gx, gy = np.empty(num), np.empty(num)
@@ -101,11 +104,12 @@ def _positions(system: System, poses: Array, landmarks: Array) -> bool:
             gx[variables[a]['scalar']] += w * (x - p['x'])
             gy[variables[a]['scalar']] += w * (y - p['y'])
             v[variables[a]['address']] += w
-    if factorise(fronts, entries, v, np.empty(size[0]), np.empty(size[1])) >= 0:
+    left, right = room(system.left, size[0]), room(system.right, size[1])
+    if factorise(fronts, entries, v, left, right, gx) >= 0:
         return False
-    for g in (gx, gy):
-        solve_lower(fronts, entries, v, g)
-        solve_upper(fronts, entries, v, g)
+    solve_lower(fronts, entries, v, gy)
+    solve_upper(fronts, entries, v, gx)
+    solve_upper(fronts, entries, v, gy)
     for a in range(num):
         i, k = variables[a]['node'], variables[a]['scalar']
         if i < n:
@@ -130,7 +134,7 @@ def _headings(system: System, state: Array, landmarks: Array, shift: bool) -> bo
         rows += dims[a]
     fronts, entries, size = lay_out(system.structure, dims)
     place(system.structure, fronts, entries, variables, edges, sightings)
-    values = np.empty(fronts[len(fronts) - 1]['panel'])
+    values = room(system.values, fronts[len(fronts) - 1]['panel'])
     for i in range(len(values)):
         values[i] = 0.0
     g = np.empty(rows)
@@ -140,9 +144,9 @@ def _headings(system: System, state: Array, landmarks: Array, shift: bool) -> bo
     if shift:
         _sightings(sightings, variables, state, landmarks, values, g)
     _priors(system.priors, variables, state, landmarks, values, g, shift)
-    if factorise(fronts, entries, values, np.empty(size[0]), np.empty(size[1])) >= 0:
+    left, right = room(system.left, size[0]), room(system.right, size[1])
+    if factorise(fronts, entries, values, left, right, g) >= 0:
         return False
-    solve_lower(fronts, entries, values, g)
     solve_upper(fronts, entries, values, g)
     for a in range(len(variables)):
         i, k = variables[a]['node'], variables[a]['scalar']

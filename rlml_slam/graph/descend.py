@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rlml_slam.compiled import kernel
-from rlml_slam.graph.fronts import factorise, highest
-from rlml_slam.graph.iterate import Progress, newton_step
+from rlml_slam.graph.fronts import highest
+from rlml_slam.graph.iterate import Progress, factor, newton_step
 from rlml_slam.graph.linearize import linearize, move
 from rlml_slam.graph.structure import Ints, Records
 from rlml_slam.graph.system import System
@@ -67,16 +67,7 @@ class _State:
         values = self.system.values
         for _ in range(30):
             values[self.diagonal] += damping * scale
-            if (
-                factorise(
-                    self.system.fronts,
-                    self.system.entries,
-                    values,
-                    self.system.left,
-                    self.system.right,
-                )
-                < 0
-            ):
+            if factor(self.system) < 0:
                 return damping
             damping = max(1e-8, 10.0 * damping)
             self.linearize()

@@ -20,7 +20,7 @@ def system_of(graph: Graph) -> System:
         if not np.isfinite(values).all():
             i = int(np.argmin(np.isfinite(values).all(-1)))
             raise SolverError(f'{name} {i}: {values[i].tolist()} is not finite')
-    loose, system = set_up(graph.tables())
+    loose, system = set_up(graph.tables(), np.empty(0))
     if loose >= 0:
         n = len(graph.poses)
         name = f'pose {loose}' if loose < n else f'landmark {loose - n}'

@@ -67,6 +67,12 @@ def lay_out(structure: Structure, dims: Ints) -> tuple[Records, Records, Ints]:
 
 
 @part
+def room(memory: Array, size: int) -> Array:
+    """``size`` numbers of the memory at hand, or new ones where that is too small."""
+    return memory[:size] if size <= len(memory) else np.empty(size)
+
+
+@part
 def highest(fronts: Records) -> int:
     """Rows of the largest front."""
     rows = 0
@@ -76,17 +82,20 @@ def highest(fronts: Records) -> int:
 
 
 @kernel
-def factorise(fronts: Records, entries: Records, values: Array, left: Array, right: Array) -> int:
+def factorise(
+    fronts: Records, entries: Records, values: Array, left: Array, right: Array, x: Array
+) -> int:
     """Cholesky factor in place of the matrix in ``values``; -1, or the supernode that failed.
 
-    ``left`` and ``right`` are memory of the sizes that lay_out tells.
+    ``left`` and ``right`` are memory of the sizes that lay_out tells. ``x`` becomes L^-1 x on the
+    way, each front at once while it is at hand.
     """
     num = len(fronts) - 1
     pending = np.empty((2, num + 1), np.int64)
     base = np.empty((2, num + 1), np.int64)
     count, top = np.zeros(2, np.int64), np.zeros(2, np.int64)
     most = highest(fronts)
-    floor = np.empty(most)
+    floor, work = np.empty(most), np.empty(most)
     runs = np.empty((2, most + 1), np.int64)
     for s in range(num):
         width, height, at = fronts[s]['width'], fronts[s]['height'], fronts[s]['panel']
@@ -103,6 +112,7 @@ def factorise(fronts: Records, entries: Records, values: Array, left: Array, rig
             child -= 1
         if not partial_cholesky(values, at, width, height, floor):
             return s
+        _lower_step(fronts, entries, values, s, x, work)
         schur_update(values, at, width, height, mine, u)
         for c in range(count[other] - 1, child, -1):
             num_runs = _runs(fronts, entries, pending[other, c], s, runs)
@@ -179,26 +189,34 @@ def solve_lower(fronts: Records, entries: Records, values: Array, x: Array) -> N
     """X becomes L^-1 x, by positions."""
     work = np.empty(highest(fronts))
     for s in range(len(fronts) - 1):
-        width, height, at = fronts[s]['width'], fronts[s]['height'], fronts[s]['panel']
-        start, end = fronts[s]['start'], fronts[s + 1]['start']
-        own = entries[start]['scalar']
-        for j in range(width):
-            work[j] = x[own + j]
-        for i in range(width, height):
-            work[i] = 0.0
-        for j in range(width):
-            a = at + j * height
-            y = work[j] / values[a + j]
-            x[own + j] = y
-            L0 = values[a + j + 1 : a + height]
-            w = work[j + 1 : height]
-            for i in range(height - j - 1):
-                w[i] -= y * L0[i]
-        for p in range(start + fronts[s + 1]['first'] - fronts[s]['first'], end):
-            k, i = entries[p]['scalar'], entries[p]['local']
-            after = entries[p + 1]['local'] if p + 1 < end else height
-            for r in range(after - i):
-                x[k + r] += work[i + r]
+        _lower_step(fronts, entries, values, s, x, work)
+
+
+@part
+def _lower_step(
+    fronts: Records, entries: Records, values: Array, s: int, x: Array, work: Array
+) -> None:
+    """Front s's part in the forward solve."""
+    width, height, at = fronts[s]['width'], fronts[s]['height'], fronts[s]['panel']
+    start, end = fronts[s]['start'], fronts[s + 1]['start']
+    own = entries[start]['scalar']
+    for j in range(width):
+        work[j] = x[own + j]
+    for i in range(width, height):
+        work[i] = 0.0
+    for j in range(width):
+        a = at + j * height
+        y = work[j] / values[a + j]
+        x[own + j] = y
+        L0 = values[a + j + 1 : a + height]
+        w = work[j + 1 : height]
+        for i in range(height - j - 1):
+            w[i] -= y * L0[i]
+    for p in range(start + fronts[s + 1]['first'] - fronts[s]['first'], end):
+        k, i = entries[p]['scalar'], entries[p]['local']
+        after = entries[p + 1]['local'] if p + 1 < end else height
+        for r in range(after - i):
+            x[k + r] += work[i + r]
 
 
 @part

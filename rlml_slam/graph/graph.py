@@ -145,11 +145,10 @@ class Graph:
 
     def tables(self) -> Tables:
         """The buffers themselves, as the kernels take them; valid until the next add."""
-        losses = np.array([(one.kind, one.scale) for one in self.losses.in_order()])
         return Tables(
             self.fixed_poses, self.fixed_landmarks, self.edges.factors(),
             self.sightings.factors(), self.pose_priors.factors(), self.landmark_priors.factors(),
-            losses,
+            self.losses.codes,
         )  # fmt: skip
 
     def residuals(self) -> Residuals:

@@ -2,17 +2,19 @@
 """Compiled Gauss-Newton.
 
 It may climb for a few steps, which is how it leaves the bad starts in which methods that must
-descend get stuck. After every step the old factor, at the price of a gradient and two triangular
-solves, tells how much a further step would still gain: mostly nothing, which saves the last
-factorisation; where it is little, that step is taken with the old factor.
+descend get stuck.
+
+When to stop costs no further factorisation. With q the error of the linear model r + J d, a step
+leaves the cost at |r + J d + q|^2 where |r + J d|^2 was promised, and what the next step can gain
+is the part of |q|^2 that its model reaches: as long as the cost is what was promised, nothing is
+left to gain. Robust losses bring more than is promised; then the old factor, at the price of half
+a solve, bounds the gain of a further step.
 """
 
 from __future__ import annotations
 
 import math
 from typing import NamedTuple
-
-import numpy as np
 
 from rlml_slam.compiled import kernel, part
 from rlml_slam.graph.fronts import factorise, solve_lower, solve_upper
@@ -22,11 +24,6 @@ from rlml_slam.se2 import Array
 
 # Gauss-Newton gives up after this many steps in a row without a new lowest cost
 PATIENCE = 4
-# an old factor serves for steps that promise less than this share of the cost, if the step that
-# it was made for did not change the cost by more than the other share, and while it gains ground
-SMALL_STEP = 1e-3
-SMALL_CHANGE = 0.1
-GROUND = 0.2
 
 
 class Progress(NamedTuple):
@@ -46,70 +43,84 @@ def copy(source: Array, target: Array) -> None:
             target[i, k] = source[i, k]
 
 
+@part
+def _squares(x: Array) -> float:
+    total = 0.0
+    for i in range(len(x)):
+        total += x[i] * x[i]
+    return total
+
+
 @kernel
-def newton_step(system: System) -> float:
-    """Step = -H^-1 g with the factor at hand; returns the decrease that it promises, -g step."""
+def factor(system: System) -> int:
+    """Cholesky factor of H with step = -L^-1 g; -1, or the supernode that failed."""
     g, step = system.g, system.step
     for i in range(len(g)):
         step[i] = -g[i]
-    solve_lower(system.fronts, system.entries, system.values, step)
-    decrease = 0.0
-    for i in range(len(g)):
-        decrease += step[i] * step[i]
-    solve_upper(system.fronts, system.entries, system.values, step)
+    return factorise(system.fronts, system.entries, system.values, system.left, system.right, step)
+
+
+@kernel
+def newton_step(system: System) -> float:
+    """Step = -H^-1 g after ``factor``; returns the decrease that it promises, -g step."""
+    decrease = _squares(system.step)
+    solve_upper(system.fronts, system.entries, system.values, system.step)
     return decrease
 
 
 @kernel
 def gauss_newton(
-    system: System, poses: Array, landmarks: Array,
+    system: System, poses: Array, landmarks: Array, cost: float, chi2: float,
     max_iterations: int, tolerance: float, floor: float,
 ) -> Progress:  # fmt: skip
     """Gauss-Newton with patience; ends at the best estimate that it met.
 
-    Converged means that a further step promises to lower the cost by less than ``tolerance`` of
-    it plus ``floor``.
+    The system is to be linearised at the start, where it has ``cost`` and ``chi2``. Converged
+    means that a further step would lower the cost by less than ``tolerance`` of it plus
+    ``floor``.
     """
-    kept, kept_landmarks = np.empty_like(poses), np.empty_like(landmarks)
-    best, best_chi2, cost, chi2 = math.inf, math.inf, math.inf, math.inf
-    promised, before = 0.0, 0.0
-    iterations, misses = 0, 0
-    fresh, reuse, moved, converged = True, False, True, False
-    while True:
-        cost, chi2 = linearize(system, poses, landmarks, fresh)
-        if moved:
-            if cost < best:
-                best, best_chi2, misses = cost, chi2, 0
-                copy(poses, kept)
-                copy(landmarks, kept_landmarks)
-            else:
-                misses += 1
-        if misses > PATIENCE or not math.isfinite(cost):
-            break
-        if (
-            fresh
-            and factorise(system.fronts, system.entries, system.values, system.left, system.right)
-            >= 0
-        ):
-            break
-        before = promised
-        promised = newton_step(system)
+    kept, kept_landmarks = poses.copy(), landmarks.copy()
+    best, best_chi2 = cost, chi2
+    robust = False
+    for k in range(len(system.losses)):
+        robust = robust or system.losses[k, 0] != 0
+    iterations, misses, converged = 0, 0, False
+    while misses <= PATIENCE and math.isfinite(cost) and factor(system) < 0:
+        promised = _squares(system.step)
         converged = promised <= tolerance * cost + floor
-        if converged or iterations >= max_iterations:
+        if converged or iterations == max_iterations:
             break
-        if not fresh and not (reuse and promised < min(SMALL_STEP * cost, GROUND * before)):
-            fresh, moved = True, False
-            continue
+        solve_upper(system.fronts, system.entries, system.values, system.step)
         move(system.variables, system.step, poses, landmarks)
-        if fresh:
-            reuse = promised < SMALL_CHANGE * cost
-        # a first step is rarely the last, and then the old factor need not be asked
-        fresh = iterations == 0 and not reuse
         iterations += 1
-        moved = True
+        model = cost - promised
+        # the panels hold the old factor until it has been asked
+        cost, chi2 = linearize(system, poses, landmarks, not robust)
+        if cost < best:
+            best, best_chi2, misses = cost, chi2, 0
+            copy(poses, kept)
+            copy(landmarks, kept_landmarks)
+        else:
+            misses += 1
+        small = tolerance * cost + floor
+        converged = _promise(system) <= small if robust else abs(cost - model) <= small
+        if converged:
+            break
+        if robust:
+            linearize(system, poses, landmarks, True)
     if not cost <= best:
         copy(kept, poses)
         copy(kept_landmarks, landmarks)
         converged = converged and cost <= best * (1.0 + 1e-9) + floor
         cost, chi2 = best, best_chi2
     return Progress(cost, chi2, iterations, converged)
+
+
+@part
+def _promise(system: System) -> float:
+    """What a step with the factor at hand would bring at the gradient at hand."""
+    g, step = system.g, system.step
+    for i in range(len(g)):
+        step[i] = -g[i]
+    solve_lower(system.fronts, system.entries, system.values, step)
+    return _squares(step)

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from rlml_slam.errors import SolverError
 from rlml_slam.graph.equations import system_of
-from rlml_slam.graph.fronts import factorise
 from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.inverse import columns, diagonal_blocks
+from rlml_slam.graph.iterate import factor
 from rlml_slam.graph.linearize import linearize
 from rlml_slam.se2 import Array
 from rlml_slam.types import EdgeKind
@@ -28,7 +28,7 @@ class Marginals:
     def __init__(self, graph: Graph) -> None:
         self._system = system = system_of(graph)
         linearize(system, graph.poses, graph.landmarks, True)
-        failed = factorise(system.fronts, system.entries, system.values, system.left, system.right)
+        failed = factor(system)
         num_poses = len(graph.poses)
         if failed >= 0:
             node = int(system.variables[system.structure.order[system.fronts[failed]['first']]][0])

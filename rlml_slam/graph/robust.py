@@ -19,9 +19,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
+
+import numpy as np
 
 from rlml_slam.compiled import kernel
 from rlml_slam.errors import SolverError
+from rlml_slam.se2 import Array
 
 
 class LossKind(IntEnum):
@@ -58,6 +62,11 @@ class Losses:
     reflector: Loss = Loss()
     pose_prior: Loss = Loss()
     landmark_prior: Loss = Loss()
+
+    @cached_property
+    def codes(self) -> Array:
+        """(kind, scale) by FactorKind (6, 2), as the kernels take them."""
+        return np.array([(one.kind, one.scale) for one in self.in_order()])
 
     def in_order(self) -> tuple[Loss, ...]:
         """The losses by FactorKind."""

@@ -3,20 +3,23 @@
 
 from __future__ import annotations
 
+import math
+import threading
 import time
 from dataclasses import dataclass
 
 import numpy as np
 
 from rlml_slam import params
+from rlml_slam.compiled import kernel, part
 from rlml_slam.graph.chordal import relax
 from rlml_slam.graph.descend import dog_leg, levenberg_marquardt
 from rlml_slam.graph.equations import system_of
 from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.initialize import initialize
-from rlml_slam.graph.iterate import Progress, gauss_newton
+from rlml_slam.graph.iterate import Progress, copy, gauss_newton
 from rlml_slam.graph.linearize import linearize
-from rlml_slam.graph.system import System
+from rlml_slam.graph.system import System, Tables, set_up
 from rlml_slam.se2 import Array
 from rlml_slam.types import EdgeKind
 
@@ -24,6 +27,11 @@ from rlml_slam.types import EdgeKind
 BAD_START = 4.0
 # costs below this per residual are rounding
 NOTHING = 1e-18
+# the memory that the last solves of a thread needed: taking it anew from the operating system, a
+# page at a time, would cost as much as a factorisation of a small graph
+_KEPT = threading.local()
+# when headings are relaxed first
+NEVER, IF_BAD, ALWAYS = 0, 1, 2
 
 
 @dataclass(frozen=True)
@@ -49,62 +57,113 @@ def optimize(graph: Graph, parameters: params.Solver | None = None) -> Solution:
     Nodes that no enabled factor touches stay. Raises SolverError if a value is not finite or a
     part of the graph is not tied to the map.
     """
-    start = time.perf_counter()
-    parameters = parameters or params.Solver()
-    system = system_of(graph)
-    poses, landmarks = graph.poses, graph.landmarks
-    cost, chi2 = linearize(system, poses, landmarks, False)
-    if not len(system.variables):
-        return Solution(chi2, chi2, cost, cost, 0, True, _since(start))
-    end = None
-    method = parameters.initialization
-    if method in ('odometry', 'spanning_tree'):
-        initialize(graph, method)
-    elif method == 'chordal' or (method == 'auto' and cost > BAD_START * _residuals(system)):
-        end = _from_relaxation(system, poses, landmarks, parameters, cost)
-    if end is None:
-        end = _minimise(system, poses, landmarks, parameters)
+    began = time.perf_counter()
+    p = parameters or params.Solver()
+    relaxing = {'auto': IF_BAD, 'chordal': ALWAYS}.get(p.initialization, NEVER)
+    start = None
+    if p.initialization in ('odometry', 'spanning_tree'):
+        start = _evaluate(graph)
+        initialize(graph, p.initialization)
+    if p.method in ('auto', 'gauss_newton'):
+        memory = getattr(_KEPT, 'memory', np.empty(0))
+        used, at, end = _gauss_newton(
+            graph.tables(), graph.poses, graph.landmarks, memory, relaxing, p.max_iterations,
+            p.relative_tolerance,
+        )  # fmt: skip
+        if used < 0:
+            system_of(graph)  # tells what is wrong
+        elif used > len(memory):
+            _KEPT.memory = np.empty(used + used // 4)
+        if p.method == 'auto' and not end.converged:
+            more = _descend(graph, at, p, NEVER)
+            end = more._replace(iterations=end.iterations + more.iterations)
+    else:
+        at = _evaluate(graph)
+        end = _descend(graph, at, p, relaxing)
+    start = start or at
     return Solution(
-        chi2, end.chi2, cost, end.cost, end.iterations, end.converged, _since(start)
+        start.chi2, end.chi2, start.cost, end.cost, end.iterations, end.converged,
+        (time.perf_counter() - began) * 1e3,
     )  # fmt: skip
 
 
-def _since(start: float) -> float:
-    return (time.perf_counter() - start) * 1e3
+def _descend(graph: Graph, start: Progress, p: params.Solver, relaxing: int) -> Progress:
+    """Minimise by a method that never climbs."""
+    system, poses, landmarks = system_of(graph), graph.poses, graph.landmarks
+    if not len(system.variables):
+        return start._replace(converged=True)
+    method = levenberg_marquardt if p.method == 'levenberg_marquardt' else dog_leg
+    num = num_residuals(system)
+    limits = p.max_iterations, p.relative_tolerance, NOTHING * num
+    if relaxing == ALWAYS or (relaxing == IF_BAD and start.cost > BAD_START * num):
+        before = poses.copy(), landmarks.copy()
+        initialize(graph, 'chordal')
+        end = method(system, poses, landmarks, *limits)
+        if end.cost < start.cost:
+            return end
+        poses[:], landmarks[:] = before
+    return method(system, poses, landmarks, *limits)
 
 
-def _residuals(system: System) -> int:
+def _evaluate(graph: Graph) -> Progress:
+    """Cost and chi2 of the estimate at hand."""
+    cost, chi2 = linearize(system_of(graph), graph.poses, graph.landmarks, False)
+    return Progress(cost, chi2, 0, False)
+
+
+@kernel
+def _gauss_newton(
+    tables: Tables, poses: Array, landmarks: Array, memory: Array, relaxing: int,
+    max_iterations: int, tolerance: float,
+) -> tuple[int, Progress, Progress]:  # fmt: skip
+    """(memory used or -1 if the graph cannot be solved, start, end) by Gauss-Newton.
+
+    All in one call, which saves the wrapping and unwrapping of what lies between. Relaxed
+    headings that lead nowhere better are taken back.
+    """
+    nothing = Progress(0.0, 0.0, 0, False)
+    if not (finite(poses) and finite(landmarks)):
+        return -1, nothing, nothing
+    loose, system = set_up(tables, memory)
+    if loose >= 0:
+        return -1, nothing, nothing
+    used = len(system.values) + len(system.left) + len(system.right)
+    num = num_residuals(system)
+    floor = NOTHING * num
+    cost, chi2 = linearize(system, poses, landmarks, True)
+    start = Progress(cost, chi2, 0, len(system.variables) == 0)
+    if start.converged:
+        return used, start, start
+    if relaxing == ALWAYS or (relaxing == IF_BAD and cost > BAD_START * num):
+        kept, kept_landmarks = poses.copy(), landmarks.copy()
+        if relax(system, poses, landmarks):
+            at = linearize(system, poses, landmarks, True)
+            end = gauss_newton(
+                system, poses, landmarks, at[0], at[1], max_iterations, tolerance, floor
+            )
+            if end.cost < cost:
+                return used, start, end
+        copy(kept, poses)
+        copy(kept_landmarks, landmarks)
+        linearize(system, poses, landmarks, True)
+    end = gauss_newton(system, poses, landmarks, cost, chi2, max_iterations, tolerance, floor)
+    return used, start, end
+
+
+@kernel
+def num_residuals(system: System) -> int:
     """Number of scalar residuals, the expected chi2 of a good start."""
     return 3 * len(system.edges) + 2 * len(system.sightings) + 3 * len(system.priors)
 
 
-def _from_relaxation(
-    system: System, poses: Array, landmarks: Array, parameters: params.Solver, cost: float
-) -> Progress | None:
-    """Minimise from relaxed headings; None, with the estimate as it was, if that is no better."""
-    before = poses.copy(), landmarks.copy()
-    if relax(system, poses, landmarks):
-        end = _minimise(system, poses, landmarks, parameters)
-        if end.cost < cost:
-            return end
-    poses[:], landmarks[:] = before
-    return None
-
-
-def _minimise(
-    system: System, poses: Array, landmarks: Array, parameters: params.Solver
-) -> Progress:
-    limit, tolerance = parameters.max_iterations, parameters.relative_tolerance
-    floor = NOTHING * _residuals(system)
-    if parameters.method == 'levenberg_marquardt':
-        return levenberg_marquardt(system, poses, landmarks, limit, tolerance, floor)
-    if parameters.method == 'dog_leg':
-        return dog_leg(system, poses, landmarks, limit, tolerance, floor)
-    end = gauss_newton(system, poses, landmarks, limit, tolerance, floor)
-    if end.converged or parameters.method == 'gauss_newton':
-        return end
-    more = dog_leg(system, poses, landmarks, limit, tolerance, floor)
-    return more._replace(iterations=end.iterations + more.iterations)
+@part
+def finite(values: Array) -> bool:
+    """Whether all values are finite."""
+    good = True
+    for i in range(len(values)):
+        for k in range(values.shape[1]):
+            good &= math.isfinite(values[i, k])
+    return good
 
 
 def warm_up() -> None:

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.compiled import kernel, part
-from rlml_slam.graph.fronts import lay_out
-from rlml_slam.graph.ordering import minimum_degree
+from rlml_slam.graph.chains import elimination_order
+from rlml_slam.graph.fronts import lay_out, room
 from rlml_slam.graph.structure import (
     Ints,
     Records,
@@ -98,8 +98,10 @@ class System(NamedTuple):
 
 
 @kernel
-def set_up(tables: Tables) -> tuple[int, System]:
+def set_up(tables: Tables, memory: Array) -> tuple[int, System]:
     """(-1, system) of a graph; or (node, ...), a node that nothing ties to the map.
+
+    ``memory`` is where the panels and update matrices go if it holds them.
 
     Solved for are the nodes that are not fixed and that an enabled factor touches. A connected
     part is tied to the map by a fixed pose, a pose prior, or two landmarks that are fixed or have
@@ -134,7 +136,7 @@ def set_up(tables: Tables) -> tuple[int, System]:
     for f in range(len(priors)):
         priors[f]['a'] = index[priors[f]['i']]
     start, neighbours = adjacency(pairs, num)
-    order = minimum_degree(start, neighbours, dims)
+    order = elimination_order(start, neighbours, dims)
     order, parent, count = elimination_tree(start, neighbours, order)
     structure = supernodes(start, neighbours, order, parent, count, pairs, dims)
     fronts, entries, stack = lay_out(structure, dims)
@@ -142,8 +144,10 @@ def set_up(tables: Tables) -> tuple[int, System]:
     rows = 0
     for a in range(num):
         rows += dims[a]
-    values = np.empty(fronts[len(fronts) - 1]['panel'])
-    left, right = np.empty(stack[0]), np.empty(stack[1])
+    size = fronts[len(fronts) - 1]['panel']
+    memory = room(memory, size + stack[0] + stack[1])
+    values, left = memory[:size], memory[size : size + stack[0]]
+    right = memory[size + stack[0] : size + stack[0] + stack[1]]
     return loose, System(
         variables, edges, sightings, priors, tables.losses, structure, fronts, entries,
         values, left, right, np.empty(rows), np.empty(rows),

@@ -31,26 +31,27 @@ class Column:
 
     def __init__(self, shape: tuple[int, ...], dtype: Any = np.float64) -> None:
         self._buffer = np.zeros((16, *shape), dtype=dtype)
-        self._size = 0
+        self.view: NDArray[Any] = self._buffer[:0]
 
     def __len__(self) -> int:
-        return self._size
+        return len(self.view)
 
-    @property
-    def view(self) -> NDArray[Any]:
-        """The rows so far."""
-        return self._buffer[: self._size]
+    def read_only(self) -> NDArray[Any]:
+        """The rows so far, not to be written to."""
+        view = self.view[:]
+        view.flags.writeable = False
+        return view
 
     def append(self, rows: NDArray[Any]) -> None:
         """Add ``rows`` (k, *shape); doubles the buffer when it is full."""
-        size = self._size + len(rows)
+        first, size = len(self.view), len(self.view) + len(rows)
         if size > len(self._buffer):
             grown = np.zeros((max(size, 2 * len(self._buffer)), *self._buffer.shape[1:]),
                              dtype=self._buffer.dtype)  # fmt: skip
-            grown[: self._size] = self.view
+            grown[:first] = self.view
             self._buffer = grown
-        self._buffer[self._size : size] = rows
-        self._size = size
+        self._buffer[first:size] = rows
+        self.view = self._buffer[:size]
 
 
 class FactorTable:
@@ -74,30 +75,22 @@ class FactorTable:
     @property
     def nodes(self) -> NDArray[np.int64]:
         """Indices of the poses and landmarks of each factor; read only."""
-        view = self._nodes.view
-        view.flags.writeable = False
-        return view
+        return self._nodes.read_only()
 
     @property
     def measured(self) -> Array:
         """Measured values, read only."""
-        view = self._measured.view
-        view.flags.writeable = False
-        return view
+        return self._measured.read_only()
 
     @property
     def information(self) -> Array:
         """Information matrices, read only."""
-        view = self._information.view
-        view.flags.writeable = False
-        return view
+        return self._information.read_only()
 
     @property
     def kinds(self) -> NDArray[np.int64]:
         """FactorKind of each factor, read only."""
-        view = self._kinds.view
-        view.flags.writeable = False
-        return view
+        return self._kinds.read_only()
 
     @property
     def enabled(self) -> NDArray[np.bool_]:

@@ -218,6 +218,18 @@ def test_shared_graph_reaches_its_known_optimum(name, optimum):
     assert graph.chi2() == pytest.approx(solution.chi2_final, rel=1e-9)
 
 
+@pytest.mark.parametrize('start', ['none', 'odometry', 'auto'])
+@pytest.mark.parametrize('name', ['intel/sesync-intel.g2o', 'small/ring-noisy.g2o'])
+def test_what_is_called_converged_has_nothing_left_to_gain(name, start):
+    limits = params.Solver(initialization=start)
+    graph = read_graph(shared_graph(name)).graph
+    solution = optimize(graph, limits)
+    assert solution.converged
+    rest = optimize(graph, TIGHT)
+    # the tolerance is on the last step's estimate of what is left: allow it to be wrong by half
+    assert solution.chi2_final <= rest.chi2_final * (1.0 + 1.5 * limits.relative_tolerance)
+
+
 def test_victoria_park_is_no_worse_than_its_known_minimum():
     graph = read_graph(shared_graph('victoria-park/victoriaPark-full.g2o.gz')).graph
     assert optimize(graph).chi2_final < 18_887 * 1.001
