@@ -358,6 +358,17 @@ class BackEnd(Group):
         2.0, 'Huber scale of loop closures, in sigmas', '', 0.5, 1e3
     )
     resolution: float = param(0.05, 'cell size of the published map', 'm', 0.01, 1.0)
+    keyframes_per_place: int = param(
+        6, 'keyframes that one place keeps: older ones take over what more of them tell; 0: all',
+        '', 0, 10000,
+    )  # fmt: skip
+    place_distance: float = param(0.5, 'keyframes nearer than this are of one place', 'm', 0.01,
+                                  100.0)  # fmt: skip
+    place_heading: float = param(0.6, 'and turned by less than this', 'rad', 0.01, 3.2)
+    path_frames: int = param(
+        1_000_000, 'frames of which the path is kept; beyond, every second one is let go', '',
+        1000, 100_000_000,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The graph: poses, landmarks and the factors between them, in growing arrays.
 
-Nodes and factors are named by their index, in the order they were added, and never removed: a
-factor that turned out wrong is disabled. Fixed nodes are the gauge. All poses and landmarks are
-in the map frame.
+Nodes and factors are named by their index, in the order they were added: a factor that turned out
+wrong is disabled, and only ``keep`` lets go of nodes and factors, and numbers the others anew.
+Fixed nodes are the gauge. All poses and landmarks are in the map frame.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rlml_slam.errors import SolverError
 from rlml_slam.graph import factors
 from rlml_slam.graph.robust import Losses
 from rlml_slam.graph.system import Tables
-from rlml_slam.graph.table import Column, FactorKind, FactorTable
+from rlml_slam.graph.table import Column, FactorKind, FactorTable, renumbered
 from rlml_slam.se2 import Array, wrap
 from rlml_slam.types import EdgeKind
 
@@ -37,6 +37,16 @@ class Residuals:
     sightings: Array
     pose_priors: Array
     landmark_priors: Array
+
+
+@dataclass(frozen=True)
+class Renumbering:
+    """Where nodes and factors are after ``Graph.keep`` (n,), -1 for those that are gone."""
+
+    poses: NDArray[np.int64]
+    landmarks: NDArray[np.int64]
+    edges: NDArray[np.int64]
+    sightings: NDArray[np.int64]
 
 
 class Graph:
@@ -142,6 +152,30 @@ class Graph:
         """Add a prior on landmark k (a survey); information (2, 2) in the map's axes."""
         kind, sizes = FactorKind.LANDMARK_PRIOR, (len(self._landmarks),)
         return int(self.landmark_priors.append(kind, [[k]], point, information, sizes)[0])
+
+    def keep(self, poses: NDArray[np.bool_], landmarks: NDArray[np.bool_]) -> Renumbering:
+        """Let go of all other poses and landmarks with their factors, and of disabled sightings.
+
+        Disabled edges stay, for they may be enabled again. What was made of the graph, such as an
+        Incremental, has to be made anew.
+        """
+        new_poses, new_landmarks = renumbered(poses), renumbered(landmarks)
+        e, s = self.edges.nodes, self.sightings.nodes
+        seen = self.sightings.enabled & poses[s[:, 0]] & landmarks[s[:, 1]]
+        out = Renumbering(
+            new_poses, new_landmarks,
+            self.edges.keep(np.all(poses[e], axis=-1), (new_poses, new_poses)),
+            self.sightings.keep(seen, (new_poses, new_landmarks)),
+        )  # fmt: skip
+        self.pose_priors.keep(poses[self.pose_priors.nodes[:, 0]], (new_poses,))
+        known = self.landmark_priors.nodes[:, 0]
+        self.landmark_priors.keep(landmarks[known], (new_landmarks,))
+        for column, kept in (
+            (self._poses, poses), (self._fixed_poses, poses),
+            (self._landmarks, landmarks), (self._fixed_landmarks, landmarks),
+        ):  # fmt: skip
+            column.keep(kept)
+        return out
 
     def tables(self) -> Tables:
         """The buffers themselves, as the kernels take them; valid until the next add."""

@@ -53,6 +53,13 @@ class Column:
         self._buffer[first:size] = rows
         self.view = self._buffer[:size]
 
+    def keep(self, kept: NDArray[np.bool_]) -> None:
+        """Let go of the other rows, and of room that would be empty for long."""
+        rows = self.view[kept]
+        self._buffer = np.zeros((max(16, 2 * len(rows)), *rows.shape[1:]), dtype=rows.dtype)
+        self._buffer[: len(rows)] = rows
+        self._size = len(rows)
+
 
 class FactorTable:
     """Factors of one form: nodes (n, a), measured (n, d), information (n, d, d), kinds, enabled.
@@ -103,6 +110,19 @@ class FactorTable:
             self._nodes.view, self._measured.view, self._information.view, self._kinds.view,
             self._enabled.view,
         )  # fmt: skip
+
+    def keep(self, kept: NDArray[np.bool_], new: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+        """Let go of the other factors; where each one is then (n,), -1 for those that are gone.
+
+        ``new`` has the indices of the nodes from then on, per column.
+        """
+        for column in (
+            self._nodes, self._measured, self._information, self._kinds, self._enabled,
+        ):  # fmt: skip
+            column.keep(kept)
+        for k, indices in enumerate(new):
+            self._nodes.view[:, k] = indices[self._nodes.view[:, k]]
+        return renumbered(kept)
 
     def describe(self, index: int) -> str:
         """Like 'factor 17 (closure, pose 3 to pose 9)', for messages."""
@@ -172,6 +192,11 @@ class FactorTable:
         raise SolverError(
             f'{where}: information {information[i].tolist()} is not symmetric positive definite'
         )
+
+
+def renumbered(kept: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Where each of the kept ones is, when the others are gone; -1 for those (n,)."""
+    return np.where(kept, np.cumsum(kept) - 1, -1)
 
 
 def is_positive_definite(matrices: Array) -> NDArray[np.bool_]:

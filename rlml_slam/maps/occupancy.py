@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -41,7 +42,7 @@ class OccupancyGrid:
 
 def render(
     poses: Array,
-    points: Sequence[Array],
+    points: Sequence[NDArray[np.floating[Any]]],
     origins: Sequence[Array],
     resolution: float = 0.05,
     occupied_share: float = 0.25,

@@ -11,6 +11,7 @@ changes none of its cells.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,7 @@ CLOSE = 0.99  # [cells] between two rays, so that a cell does not fit in between
 DIAGONAL = 1.5  # [cells] that one cell covers of a ray at most
 ENDS = 3.0 * DIAGONAL  # [cells] of the last cells of a ray, which it does not miss, and one more
 EMPTY = np.zeros(0, dtype=np.int64)
+FIRST_LIST = 4096
 
 
 def value_of(p: float | Array) -> NDArray[np.uint16]:
@@ -47,6 +49,7 @@ def probability_of(values: NDArray[np.uint16]) -> NDArray[np.float32]:
     return np.where(values == 0, np.float32(np.nan), p).astype(np.float32)
 
 
+@lru_cache(maxsize=8)
 def update_table(p_update: float) -> NDArray[np.uint16]:
     """New value (LEVELS + 1,) of every value after one observation of probability p_update."""
     p = P_MIN + np.arange(LEVELS) * STEP
@@ -70,7 +73,7 @@ class Submap:
         self.insertions = 0
         self._hit = update_table(self.parameters.p_hit)
         self._miss = update_table(self.parameters.p_miss)
-        self._list = np.zeros(4096, dtype=np.int64)
+        self._list = EMPTY
 
     @property
     def version(self) -> int:
@@ -110,8 +113,32 @@ class Submap:
             )  # fmt: skip
             if used >= 0:
                 break
-            self._list = np.zeros(2 * len(self._list), dtype=np.int64)
+            self._list = np.zeros(max(2 * len(self._list), FIRST_LIST), dtype=np.int64)
         self.insertions += 1
+
+    def complete(self) -> None:
+        """Let go of what only insertions need: the list of cells, and the margin to grow into."""
+        self._list = EMPTY
+        known = self.values != 0
+        rows, columns = np.flatnonzero(known.any(1)), np.flatnonzero(known.any(0))
+        if len(rows):
+            first, end = max(rows[0] - BORDER, 0), rows[-1] + BORDER + 1
+            left, right = max(columns[0] - BORDER, 0), columns[-1] + BORDER + 1
+            self.values = self.values[first:end, left:right].copy()
+            self.corner = (self.corner[0] + int(left), self.corner[1] + int(first))
+
+    def walls(self) -> Array:
+        """Middles (n, 2) of the cells that stop beams more often than not, submap frame."""
+        i, j = np.nonzero(self.values > value_of(0.5))
+        cells = np.stack([j, i], -1) + np.array(self.corner, dtype=np.float64)
+        return np.asarray((cells + 0.5) * self.resolution)
+
+    def knows(self, points: Array) -> float:
+        """Share of points (n, 2) that lie in cells that something is known of."""
+        j, i = (np.floor(points / self.resolution).astype(np.int64) - self.corner).T
+        rows, columns = self.values.shape
+        inside = (i >= 0) & (i < rows) & (j >= 0) & (j < columns)
+        return float(np.count_nonzero(self.values[i[inside], j[inside]])) / max(len(points), 1)
 
     def _cover(self, x_min: float, y_min: float, x_max: float, y_max: float) -> None:
         """Grow the grid until the box and a border around it are inside."""

@@ -70,13 +70,12 @@ class BackEndNode(Node):
 
     def figures(self) -> dict[str, object]:
         """Figures for /diagnostics."""
-        graph, tried = self.mapper.back_end.graph, self.mapper.back_end.scans.closures
-        accepted = sum(c.accepted for c in tried)
+        graph, tried = self.mapper.back_end.graph, self.mapper.back_end.scans.tried
         return {
             'keyframes': len(graph.poses),
             'edges': len(graph.edges),
-            'closures accepted': accepted,
-            'closures rejected': len(tried) - accepted,
+            'closures accepted': tried[True],
+            'closures rejected': tried[False],
             'frames waiting for the worker': self.mapper.worker.backlog,
             'frames without their points or detections': self.join.incomplete,
         }

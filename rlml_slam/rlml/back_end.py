@@ -21,7 +21,9 @@ from rlml_slam.rlml.correction import Correction, Known, either
 from rlml_slam.rlml.deferred import DeferredMatches
 from rlml_slam.rlml.keyframes import Interval, Keyframe
 from rlml_slam.rlml.loop_closure import Closure, ScanGraph
+from rlml_slam.rlml.path import Path
 from rlml_slam.rlml.reflector_graph import ReflectorGraph
+from rlml_slam.rlml.sparsify import Sparsifier
 from rlml_slam.se2 import Array
 from rlml_slam.types import Belief, EdgeKind, Frame, Reflectors
 
@@ -63,14 +65,13 @@ class BackEnd:
         self.scans = ScanGraph(p, self.graph)
         self.reflector_graph = ReflectorGraph(p.reflector, self.graph)
         self.deferred = DeferredMatches(p.reflector, self.reflector_graph)
+        self.sparsifier = Sparsifier(p, self.graph, self.scans, self.reflector_graph)
+        self.path = Path(p.back_end.path_frames)
         self.T_map_local = np.zeros(3)
         self.known: Known | None = None
         self._optimized = False
         self._interval: Interval | None = None
         self._since_optimized = 0
-        self._stamps: list[int] = []
-        self._local: list[Array] = []
-        self._key_of: list[int] = []
 
     def add(self, frame: Frame) -> Update | None:
         """Take one frame of the front end; an Update where it became a keyframe."""
@@ -86,9 +87,8 @@ class BackEnd:
         assert self._interval is not None
         if not frame.doubtful:
             self._interval.add_detections(frame)
-        self._stamps.append(frame.stamp)
-        self._local.append(frame.T_local_base)
-        self._key_of.append(len(self.keyframes) - 1)
+        newest = self.keyframes[-1]
+        self.path.add(frame.stamp, se2.between(newest.T_local, frame.T_local_base))
         return update
 
     def _is_key(self, frame: Frame) -> bool:
@@ -114,6 +114,7 @@ class BackEnd:
         due = self._since_optimized >= self._p.back_end.optimize_every
         if due and self._is_behind:
             self.optimize()
+            self.sparsifier.sparsify(self.keyframes, self.path)
         return Update(
             key.index,
             self.T_map_local,
@@ -129,7 +130,6 @@ class BackEnd:
         if interval is None:
             # the first keyframe is the gauge
             index = self.graph.add_pose(frame.T_local_base, fixed=True)
-            since, scanned = o.motion, False
         else:
             self._see_reflectors(interval)
             since, scanned = interval.motion, interval.scanned
@@ -138,7 +138,9 @@ class BackEnd:
             # reflectors already, which have their own factors; but where odometry knows nothing,
             # its covariance is so wide that this counts for little and the mean for much
             ours = scanned or not since.known
-            delta = se2.between(last.T_local, frame.T_local_base) if ours else since.delta
+            motion = se2.between(last.T_local, frame.T_local_base)
+            delta = motion if ours else since.delta
+            self.path.begin_keyframe(motion)
             pose = se2.compose(self.T_map_local, frame.T_local_base)
             index = self.graph.add_pose(pose)
             cov = since.cov + np.diag(np.array(self._p.back_end.edge_floor2))
@@ -153,9 +155,10 @@ class BackEnd:
             self.deferred.move(delta, cov)
         # a scan that the front end could not place has no place in the map either
         placed = frame.scan_used or not self.keyframes
+        points = o.points.astype(np.float32) if placed and o.points is not None else None
         key = Keyframe(
             index, frame.stamp, frame.T_local_base, frame.cov_local,
-            o.points if placed else None, o.origin if placed else None, since, scanned,
+            points, o.origin if placed else None, frame.stamp,
         )  # fmt: skip
         self.keyframes.append(key)
         self._interval = Interval(frame.T_local_base)
@@ -239,27 +242,9 @@ class BackEnd:
     # --- products ------------------------------------------------------------------------------
 
     def trajectory(self) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Array]:
-        """Stamps (n,) and poses (n, 3) in the map frame of every frame so far.
-
-        Between two keyframes the front end's path is kept, and the rest of the correction is
-        spread over it evenly by index.
-        """
-        stamps = np.array(self._stamps, dtype=np.int64)
-        if not self.keyframes:
-            return stamps, np.zeros((0, 3))
-        local, key_of = np.array(self._local), np.array(self._key_of)
-        keys = np.array([k.T_local for k in self.keyframes])
-        poses = self.graph.poses[[k.index for k in self.keyframes]]
-        out = se2.compose(poses[key_of], se2.between(keys[key_of], local))
-        first = np.searchsorted(key_of, np.arange(len(keys)))
-        for k in range(len(keys) - 1):
-            a, b = first[k], first[k + 1]
-            missing = se2.log(
-                se2.between(se2.compose(poses[k], se2.between(keys[k], keys[k + 1])), poses[k + 1])
-            )
-            share = np.arange(b - a) / (b - a)
-            out[a:b] = se2.compose(out[a:b], se2.exp(missing * share[:, None]))
-        return stamps, out
+        """Stamps (n,) and poses (n, 3) in the map frame of every frame so far."""
+        poses = self.graph.poses
+        return self.path.stamps(), self.path.poses(poses) if self.keyframes else np.zeros((0, 3))
 
     def marginals(self) -> Marginals:
         """Covariances at the current estimate."""

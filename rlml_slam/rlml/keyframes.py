@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlml_slam import se2
 from rlml_slam.motion import STILL, compose_motion
@@ -19,18 +20,28 @@ JUMP_SIGMA = np.array([0.5, 0.5, 0.2])
 AGREE = 9.2  # 99 % of a chi-square with 2 degrees of freedom
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Keyframe:
-    """A pose of the graph; ``points`` (n, 2) and ``origin`` (2,) are its scan in base, or None."""
+    """A pose of the graph; ``points`` (n, 2) and ``origin`` (2,) are its scan in base, or None.
+
+    ``index`` changes when keyframes before it go; ``points`` may be replaced by those of a scan
+    that was taken later at the same place, at ``scan_stamp``.
+    """
 
     index: int
     stamp: int
     T_local: Array
     cov_local: Array
-    points: Array | None
+    points: NDArray[np.float32] | None
     origin: Array | None
-    since: Motion
-    scanned: bool
+    scan_stamp: int
+
+    def take_scan(self, other: Keyframe, T: Array) -> None:
+        """Replace the scan by that of another keyframe, which stood at ``T`` (3,) from here."""
+        if other.points is not None and other.origin is not None:
+            self.points = se2.transform(T, other.points).astype(np.float32)
+            self.origin = se2.transform(T, other.origin[None])[0]
+            self.scan_stamp = other.scan_stamp
 
 
 @dataclass

@@ -8,13 +8,14 @@ and by the lead over the second-best place; what fails is recorded, not used.
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from rlml_slam import se2
 from rlml_slam.graph.factors import relative_information
-from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.graph import Graph, Renumbering
 from rlml_slam.matching import observability, search, thinning
 from rlml_slam.matching.scan_match import match
 from rlml_slam.matching.submap import Submap
@@ -25,9 +26,9 @@ from rlml_slam.se2 import Array
 from rlml_slam.types import EdgeKind
 
 TURN = np.array([0.0, 0.0, GRID_TURN])
-TURN_ROTATION = np.eye(3)
-TURN_ROTATION[:2, :2] = se2.rotation(GRID_TURN)
 OPEN = 1e-2  # [1/m², 1/rad²] an edge knows its directions to 10 m and 10 rad at the worst
+COVERED = 0.8  # share of a submap's walls that a newer one must know to take its place
+RECORDS = 2000  # of closures, kept at most
 PYRAMIDS = 16  # search pyramids kept: each is several times as large as its submap
 
 
@@ -51,27 +52,36 @@ class Closure:
         return self.edge >= 0
 
 
-@dataclass
-class _KeyMap:
-    """A submap of keyframes; its frame is that of keyframe ``anchor``, turned by GRID_TURN."""
+@dataclass(eq=False)
+class KeySubmap:
+    """A submap of ``size`` keyframes, at ``T_anchor_grid`` (3,) from keyframe ``anchor``.
+
+    While it is being built that is the first of them, and the submap is turned by GRID_TURN.
+    """
 
     anchor: Keyframe
     submap: Submap
-    members: set[int] = field(default_factory=set)
+    size: int = 0
     centre: Array = field(default_factory=lambda: np.zeros(2))
+    T_anchor_grid: Array = field(default_factory=lambda: TURN)
 
 
 class ScanGraph:
-    """Scan edges and loop closures of the back end."""
+    """Scan edges and loop closures of the back end.
+
+    ``closures`` are the records of those between keyframes that are still there; ``tried`` counts
+    all that were accepted (True) and rejected (False).
+    """
 
     def __init__(self, params: Parameters, graph: Graph) -> None:
         self._p = params
         self._graph = graph
-        self._active: list[_KeyMap] = []
-        self._finished: list[_KeyMap] = []
-        self._pyramids: OrderedDict[int, search.Pyramid] = OrderedDict()
+        self._active: list[KeySubmap] = []
+        self._finished: list[KeySubmap] = []
+        self._pyramids: OrderedDict[KeySubmap, search.Pyramid] = OrderedDict()
         self._count = 0
         self.closures: list[Closure] = []
+        self.tried = {True: 0, False: 0}
         self.changed = False
 
     def add(self, key: Keyframe) -> tuple[Closure, ...]:
@@ -80,11 +90,12 @@ class ScanGraph:
         assert key.origin is not None
         if len(key.points) < self._p.scan_match.min_points:
             return ()
-        points = thinning.thin(key.points, self._p.scan_match.voxel, self._p.scan_match.max_points)
+        whole = key.points.astype(np.float64)
+        points = thinning.thin(whole, self._p.scan_match.voxel, self._p.scan_match.max_points)
         p = self._p.submap
         for m in self._active:
             self._tie(m, key, points)
-        self._insert(key, thinning.thin(key.points, p.resolution, p.max_points))
+        self._insert(key, thinning.thin(whole, p.resolution, p.max_points))
         self._count += 1
         if not self._p.loop_closure.enabled or self._count % self._p.loop_closure.every:
             return ()
@@ -92,15 +103,26 @@ class ScanGraph:
 
     def begin_piece(self) -> None:
         """Complete the submaps that are being built: the robot goes on from elsewhere."""
-        self._finished += self._active
+        for m in self._active:
+            self._complete(m)
         self._active = []
+
+    @property
+    def num_submaps(self) -> int:
+        """How many there are, those that are being built among them."""
+        return len(self._finished) + len(self._active)
+
+    @property
+    def oldest_active(self) -> int | None:
+        """Index of the first keyframe that a submap being built needs, None without any."""
+        return min((m.anchor.index for m in self._active), default=None)
 
     def finish(self) -> None:
         """Nothing is held back for the end."""
 
-    def _tie(self, m: _KeyMap, key: Keyframe, points: Array) -> None:
+    def _tie(self, m: KeySubmap, key: Keyframe, points: Array) -> None:
         """A scan edge from the submap's anchor, where the scan fits."""
-        if not m.members:
+        if not m.size:
             return
         guess = se2.between(se2.compose(m.anchor.T_local, TURN), key.T_local)
         prior = np.diag(1.0 / np.array(self._p.back_end.match_sigma) ** 2)
@@ -109,42 +131,86 @@ class ScanGraph:
         if found.score < p.min_score or key.index == m.anchor.index:
             return
         information = observability.information(m.submap, points, found.pose, p)
-        self._edge(EdgeKind.SCAN, m.anchor.index, key.index, found.pose, information)
+        self._edge(EdgeKind.SCAN, m, key, found.pose, information)
 
-    def _edge(self, kind: EdgeKind, i: int, j: int, delta: Array, information: Array) -> int:
+    def _edge(
+        self, kind: EdgeKind, m: KeySubmap, key: Keyframe, T_grid_key: Array, information: Array
+    ) -> int:
         closure = kind is EdgeKind.CLOSURE
         # a direction that the scan leaves open still needs a covariance, and a regular one
         cov = np.linalg.inv(information + OPEN * np.eye(3))
-        cov = TURN_ROTATION @ cov @ TURN_ROTATION.T
-        delta = se2.compose(TURN, delta)
+        R = np.eye(3)
+        R[:2, :2] = se2.rotation(m.T_anchor_grid[2])
+        cov = R @ cov @ R.T
+        delta = se2.compose(m.T_anchor_grid, T_grid_key)
         floor2 = self._p.loop_closure.floor2 if closure else self._p.back_end.scan_floor2
         cov[[0, 1, 2], [0, 1, 2]] += floor2
         self.changed |= closure
-        return self._graph.add_edge(kind, i, j, delta, relative_information(delta, cov))
+        return self._graph.add_edge(
+            kind, m.anchor.index, key.index, delta, relative_information(delta, cov)
+        )
 
     def _insert(self, key: Keyframe, points: Array) -> None:
         size = self._p.back_end.submap_size
-        if self._active and len(self._active[0].members) >= size and len(self._active) > 1:
-            done = self._active.pop(0)
-            self._finished.append(done)
-        if not self._active or (
-            len(self._active) == 1 and len(self._active[0].members) >= size // 2
-        ):
-            self._active.append(_KeyMap(key, Submap(self._p.submap)))
+        if self._active and self._active[0].size >= size and len(self._active) > 1:
+            self._complete(self._active.pop(0))
+        if not self._active or (len(self._active) == 1 and self._active[0].size >= size // 2):
+            self._active.append(KeySubmap(key, Submap(self._p.submap)))
         for m in self._active:
             # inside one submap the front end's path is smoother than the graph's
             T = se2.between(se2.compose(m.anchor.T_local, TURN), key.T_local)
             assert key.origin is not None
             m.submap.insert(se2.transform(T, points), se2.transform(T, key.origin[None])[0])
-            m.members.add(key.index)
-            m.centre = m.centre + (T[:2] - m.centre) / len(m.members)
+            m.size += 1
+            m.centre = m.centre + (T[:2] - m.centre) / m.size
+
+    def _complete(self, new: KeySubmap) -> None:
+        """A submap is built: it takes the place of those that show nothing else."""
+        new.submap.complete()
+        if self._p.back_end.keyframes_per_place:
+            self._finished = [m for m in self._finished if not self._is_covered(m, new)]
+        self._finished.append(new)
+
+    def _is_covered(self, old: KeySubmap, new: KeySubmap) -> bool:
+        """Whether what one submap shows is known to another one as well."""
+        T = se2.between(self._grid(new), self._grid(old))
+        walls = old.submap.walls()
+        return len(walls) > 0 and new.submap.knows(se2.transform(T, walls)) >= COVERED
+
+    def take_over(self, pose: int, onto: Keyframe) -> None:
+        """Keyframe ``pose`` goes: let submaps that stand on it stand on another one."""
+        for m in self._finished:
+            if m.anchor.index == pose:
+                m.T_anchor_grid = se2.between(self._pose(onto), self._grid(m))
+                m.anchor = onto
+
+    def renumber(
+        self, new: Renumbering, edges: Mapping[int, int], poses: Mapping[int, int]
+    ) -> None:
+        """The graph has let go of keyframes: what of the closures' records speaks of now.
+
+        ``edges`` and ``poses`` map what went to what stands for it, by the numbers until now.
+        """
+        kept = []
+        for c in self.closures:
+            if not c.accepted and (c.i in poses or c.j in poses):
+                continue
+            i, j = poses.get(c.i, c.i), poses.get(c.j, c.j)
+            edge = edges.get(c.edge, c.edge)
+            if c.accepted and (i == j or edge < 0):
+                continue
+            i, j = int(new.poses[i]), int(new.poses[j])
+            edge = int(new.edges[edge]) if c.accepted else -1
+            same = (i, j, edge) == (c.i, c.j, c.edge)
+            kept.append(c if same else replace(c, i=i, j=j, edge=edge))
+        self.closures = kept[-RECORDS:]
 
     def _pose(self, key: Keyframe) -> Array:
         pose: Array = self._graph.poses[key.index]
         return pose
 
-    def _grid(self, m: _KeyMap) -> Array:
-        return se2.compose(self._pose(m.anchor), TURN)
+    def _grid(self, m: KeySubmap) -> Array:
+        return se2.compose(self._pose(m.anchor), m.T_anchor_grid)
 
     def _close(self, key: Keyframe, points: Array) -> tuple[Closure, ...]:
         """Try the finished submaps near the keyframe, the nearest first."""
@@ -158,13 +224,14 @@ class ScanGraph:
                 near.append((distance, k))
         out = []
         for _, k in sorted(near)[: p.candidates]:
-            closure = self._try(k, key, points)
+            closure = self._try(self._finished[k], key, points)
             self.closures.append(closure)
+            self.tried[closure.accepted] += 1
             out.append(closure)
         return tuple(out)
 
-    def _try(self, k: int, key: Keyframe, points: Array) -> Closure:
-        p, m = self._p.loop_closure, self._finished[k]
+    def _try(self, m: KeySubmap, key: Keyframe, points: Array) -> Closure:
+        p = self._p.loop_closure
         guess = se2.between(self._grid(m), self._pose(key))
         i, j = m.anchor.index, key.index
 
@@ -172,7 +239,7 @@ class ScanGraph:
             return Closure(i, j, guess, score, -1, why)
 
         result = search.wide(
-            self._pyramid(k), points, guess, p.search_window, p.search_angle, p.min_score,
+            self._pyramid(m), points, guess, p.search_window, p.search_angle, p.min_score,
             second_share=p.max_second,
         )  # fmt: skip
         if result.best is None:
@@ -184,13 +251,13 @@ class ScanGraph:
         if found.score < p.min_score:
             return rejected('the refined fit is too weak', found.score)
         information = observability.information(m.submap, points, found.pose, self._p.scan_match)
-        edge = self._edge(EdgeKind.CLOSURE, i, j, found.pose, information)
+        edge = self._edge(EdgeKind.CLOSURE, m, key, found.pose, information)
         return Closure(i, j, found.pose, found.score, edge, 'fits')
 
-    def _pyramid(self, k: int) -> search.Pyramid:
-        if k not in self._pyramids:
-            self._pyramids[k] = search.Pyramid(self._finished[k].submap)
+    def _pyramid(self, m: KeySubmap) -> search.Pyramid:
+        if m not in self._pyramids:
+            self._pyramids[m] = search.Pyramid(m.submap)
             if len(self._pyramids) > PYRAMIDS:
                 self._pyramids.popitem(last=False)
-        self._pyramids.move_to_end(k)
-        return self._pyramids[k]
+        self._pyramids.move_to_end(m)
+        return self._pyramids[m]

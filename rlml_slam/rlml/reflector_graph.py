@@ -4,32 +4,52 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.eliminate import Ties, limited
+from rlml_slam.graph.graph import Graph, Renumbering
 from rlml_slam.graph.marginals import Marginals
+from rlml_slam.graph.table import Column
 from rlml_slam.matching.association import gate
 from rlml_slam.params import Reflector
-from rlml_slam.rlml.keyframes import Interval
-from rlml_slam.se2 import Array, transform
+from rlml_slam.rlml.keyframes import AGREE, Interval
+from rlml_slam.se2 import Array, rotation, transform
 from rlml_slam.types import ANONYMOUS, Belief, Reflectors
 
+Records = NDArray[np.void]
+
 MERGE_DISTANCE = 1.5  # [m] pairs farther apart are not looked at
+# [m²] variance of what all sightings of a reflector from one side have in common: where on it the
+# sensor sees its middle, and how far the submaps are off there
+COMMON2 = np.array([1e-4, 1e-4])
+
+
+# Seen from keyframe ``pose`` at ``z`` (2,) there; ``factor`` of the graph, -1 without one.
+SIGHTING = np.dtype(
+    [
+        ('pose', np.int64),
+        ('factor', np.int64),
+        ('z', np.float64, (2,)),
+        ('information', np.float64, (2, 2)),
+    ]
+)
 
 
 @dataclass
 class _Landmark:
-    """One reflector of the graph; ``sightings`` are (pose, z, information, factor)."""
+    """One reflector of the graph; ``beside`` are the keys of those seen with it at one time."""
 
     key: int
     index: int = -1
     id: int = ANONYMOUS
     diameter: float = float('nan')
     count: int = 0
-    sightings: list[tuple[int, Array, Array, int]] = field(default_factory=list)
+    sightings: Column = field(default_factory=lambda: Column((), SIGHTING))
+    beside: set[int] = field(default_factory=set)
 
 
 class ReflectorGraph:
@@ -50,14 +70,19 @@ class ReflectorGraph:
 
     def add(self, pose: int, interval: Interval) -> None:
         """The reflectors seen near keyframe ``pose``."""
+        together = {self.resolve(key) for key in interval.sightings}
         for key, s in ((k, s) for k, groups in interval.sightings.items() for s in groups):
             landmark = self._landmarks.setdefault(self.resolve(key), _Landmark(self.resolve(key)))
             landmark.id = interval.ids.get(key, landmark.id)
             landmark.diameter = interval.diameters.get(key, landmark.diameter)
             landmark.count += s.count
+            landmark.beside |= together
             # errors of a sensor are alike from one message to the next: many do not average out
             worth = 1.0 / (1.0 + self._p.alike * (s.count - 1))
-            landmark.sightings.append((pose, s.z, worth * s.information, -1))
+            row = np.zeros(1, dtype=SIGHTING)
+            row['pose'], row['factor'] = pose, -1
+            row['z'], row['information'] = s.z, worth * s.information
+            landmark.sightings.append(row)
             if landmark.index < 0 and landmark.count >= self._p.min_sightings:
                 point = transform(self._graph.poses[pose], s.z[None])[0]
                 landmark.index = self._graph.add_landmark(point)
@@ -66,15 +91,19 @@ class ReflectorGraph:
     def _link_all(self, landmark: _Landmark) -> None:
         """Give a landmark of the graph the factors that it still lacks."""
         if landmark.index >= 0:
-            for k, (_, _, _, factor) in enumerate(landmark.sightings):
-                if factor < 0:
-                    self._link(landmark, k)
+            rows = landmark.sightings.view
+            new = np.flatnonzero(rows['factor'] < 0)
+            if len(new):
+                s = rows[new]
+                nodes = np.stack([s['pose'], np.full(len(s), landmark.index)], -1)
+                rows['factor'][new] = self._graph.add_sightings(nodes, s['z'], s['information'])
+                self.changed = True
 
-    def _link(self, landmark: _Landmark, k: int) -> None:
-        pose, z, information, _ = landmark.sightings[k]
-        factor = self._graph.add_sighting(pose, landmark.index, z, information)
-        landmark.sightings[k] = (pose, z, information, factor)
-        self.changed = True
+    def _unlink(self, sightings: Records) -> None:
+        """Switch the factors of sightings (k,) off."""
+        factors = sightings['factor']
+        self._graph.sightings.enabled[factors[factors >= 0]] = False
+        sightings['factor'] = -1
 
     @property
     def found(self) -> bool:
@@ -124,9 +153,7 @@ class ReflectorGraph:
     @staticmethod
     def _distinct(a: _Landmark, b: _Landmark) -> bool:
         """Whether the two were seen from one keyframe, or tell different ids."""
-        if _named_apart(a, b):
-            return True
-        return not {s[0] for s in a.sightings}.isdisjoint(s[0] for s in b.sightings)
+        return _named_apart(a, b) or b.key in a.beside
 
     def join(self, a: int, b: int) -> None:
         """The reflectors of two keys are one, if their ids do not say otherwise.
@@ -143,16 +170,64 @@ class ReflectorGraph:
         self._absorb(first, second)
 
     def _absorb(self, keep: _Landmark, gone: _Landmark) -> None:
-        for pose, z, information, factor in gone.sightings:
-            if factor >= 0:
-                self._graph.sightings.enabled[factor] = False
-            keep.sightings.append((pose, z, information, -1))
+        self._unlink(gone.sightings.view)
+        keep.sightings.append(gone.sightings.view)
         self._link_all(keep)
+        keep.beside |= gone.beside
+        for other in self._landmarks.values():
+            if gone.key in other.beside:
+                other.beside.add(keep.key)
         keep.count += gone.count
         keep.id = gone.id if keep.id == ANONYMOUS else keep.id
         keep.diameter = gone.diameter if math.isnan(keep.diameter) else keep.diameter
         self._alias[gone.key] = keep.key
         del self._landmarks[gone.key]
+
+    def move(self, ties: Mapping[int, tuple[int, Ties]]) -> None:
+        """See from other keyframes what was seen from some: pose to (other pose, tie from it).
+
+        What they saw of a reflector, the other one may have seen as well: then it is one sighting.
+        """
+        gone = np.array(list(ties), dtype=np.int64)
+        onto = np.array([other for other, _ in ties.values()], dtype=np.int64)
+        whole = Ties(
+            np.array([tie.T for _, tie in ties.values()]),
+            np.array([tie.cov for _, tie in ties.values()]),
+        )
+        of = np.full(len(self._graph.poses), -1)
+        of[gone] = np.arange(len(gone))
+        for landmark in self._landmarks.values():
+            rows = landmark.sightings.view
+            at = of[rows['pose']]
+            moved = at >= 0
+            if not moved.any():
+                continue
+            s, at = rows[moved], at[moved]
+            self._unlink(s)
+            z, cov = _seen_from(Ties(whole.T[at], whole.cov[at]), s)
+            s['pose'], s['z'], s['information'] = onto[at], z, np.linalg.inv(cov)
+            beside = np.isin(rows['pose'], s['pose'])
+            others = rows[beside]
+            self._unlink(others)
+            landmark.sightings.keep(~moved & ~beside)
+            landmark.sightings.append(_fused(np.concatenate([others, s])))
+            self._link_all(landmark)
+
+    def keep_alive(self) -> NDArray[np.bool_]:
+        """Which landmarks of the graph (m,) are a reflector's, not one's that another became."""
+        kept = np.zeros(len(self._graph.landmarks), dtype=np.bool_)
+        kept[[m.index for m in self._alive()]] = True
+        return kept
+
+    def renumber(self, new: Renumbering) -> None:
+        """The graph has let go of poses, landmarks and factors."""
+        for landmark in self._landmarks.values():
+            if landmark.index >= 0:
+                landmark.index = int(new.landmarks[landmark.index])
+            rows = landmark.sightings.view
+            rows['pose'] = new.poses[rows['pose']]
+            linked = rows['factor'] >= 0
+            rows['factor'][linked] = new.sightings[rows['factor'][linked]]
 
     def belief(self, pose: int) -> Belief:
         """Pose ``pose`` and all reflectors with their joint covariance."""
@@ -179,6 +254,40 @@ class ReflectorGraph:
             np.array([m.count for m in alive], dtype=np.int64),
             np.array([m.diameter for m in alive], dtype=np.float64),
         )
+
+
+def _seen_from(ties: Ties, s: Records) -> tuple[Array, Array]:
+    """Where sightings (k,) are, and covariances, seen from where ``ties`` (k,) begin."""
+    z = transform(ties.T, s['z'][:, None])[:, 0]
+    R = rotation(ties.T[:, 2])
+    J = np.zeros((len(s), 2, 3))
+    J[:, 0, 0] = J[:, 1, 1] = 1.0
+    J[:, 0, 2], J[:, 1, 2] = ties.T[:, 1] - z[:, 1], z[:, 0] - ties.T[:, 0]
+    cov = R @ np.linalg.inv(s['information']) @ np.swapaxes(R, 1, 2)
+    return z, cov + J @ ties.cov @ np.swapaxes(J, 1, 2)
+
+
+def _fused(s: Records) -> Records:
+    """Sightings (k,) of one reflector; those from one pose that agree with the first are one.
+
+    Of the others from that pose, the newest stays.
+    """
+    _, first, at = np.unique(s['pose'], return_index=True, return_inverse=True)
+    cov: Array = np.linalg.inv(s['information'])
+    d = s['z'] - s['z'][first][at]
+    spread = cov + cov[first][at]
+    away = np.einsum('ki,ki->k', d, np.linalg.solve(spread, d[..., None])[..., 0])
+    agree = away < AGREE
+    out = s[first]
+    W, b = np.zeros((len(first), 2, 2)), np.zeros((len(first), 2))
+    np.add.at(W, at[agree], s['information'][agree])
+    np.add.at(b, at[agree], (s['information'] @ s['z'][..., None])[agree, :, 0])
+    C = np.asarray(np.linalg.inv(W), dtype=np.float64)
+    out['z'] = (C @ b[..., None])[..., 0]
+    out['information'] = np.linalg.inv(limited(C, COMMON2, cov[agree], at[agree]))
+    others = s[~agree][::-1]
+    _, newest = np.unique(others['pose'], return_index=True)
+    return np.concatenate([out, others[newest]])
 
 
 def _named_apart(a: _Landmark, b: _Landmark) -> bool:

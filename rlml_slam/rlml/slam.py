@@ -40,8 +40,9 @@ class Slam:
     With ``parallel`` the back end works in a thread of its own, up to AHEAD frames behind, and
     frames come later by as many; they are the same to the last bit. The front end's local frame
     depends on nothing that the back end says, as long as there are no reflectors and the robot is
-    not lost: with the first reflector both take turns for good, and at a lost frame once. Their
-    times in milliseconds are then those of the processor, without the waits for one another.
+    not lost: with the first reflector both take turns for good, and at a lost frame once. The
+    front end's times in milliseconds are then those of the processor, without the waits for one
+    another, as the back end's are in any case.
     """
 
     def __init__(self, params: Parameters, parallel: bool = False) -> None:
@@ -108,7 +109,7 @@ class Slam:
                 is_lost = frame.health.level is Level.LOST or frame.doubtful
                 frames += self._settle(0 if is_lost else AHEAD)
             else:
-                if self._take_over(self.back_end.add(frame)):
+                if self._take_over(self._add(frame)):
                     self._believe()
                 frames.append(frame)
             found = self.recovery.look(frame, self.map, self._saved is not None)
@@ -117,7 +118,7 @@ class Slam:
         return frames
 
     def _add(self, frame: Frame) -> Update | None:
-        """In the back end's thread: one frame."""
+        """One frame to the back end, in whatever thread; with the time of the processor."""
         began = time.thread_time()
         update = self.back_end.add(frame)
         if update is None:

@@ -209,7 +209,7 @@ class MarkerSensor:
 
     def __init__(self, markers: Markers, reflectors: ReflectorSet, generators: Generators) -> None:
         self._n = markers
-        self._reflectors = reflectors
+        self.reflectors = reflectors
         self._noise = generators('markers')
         self._missing = generators('missing')
         self._ghosts = generators('ghosts')
@@ -218,19 +218,19 @@ class MarkerSensor:
         self, track: Track, laser: LaserSensor, stamp: int, geometry: Geometry, moment: int
     ) -> Detections:
         """The detections of the sweep that began at ``stamp``."""
-        n, m = self._n, len(self._reflectors)
+        n, m = self._n, len(self.reflectors)
         noise = self._noise.standard_normal((m, 2))
         missing = self._missing.random(m) < n.missing
         seen = np.flatnonzero(self._visible(track, laser, stamp, geometry, moment) & ~missing)
         T_world_laser = laser.poses(track, np.array([stamp]))[0]
-        p = se2.transform(se2.inverse(T_world_laser), self._reflectors.points[seen])
+        p = se2.transform(se2.inverse(T_world_laser), self.reflectors.points[seen])
         r = np.hypot(p[:, 0], p[:, 1]) + n.sigma_range * noise[seen, 0]
         bearing = np.arctan2(p[:, 1], p[:, 0]) + n.sigma_bearing * noise[seen, 1]
         ghost_r, ghost_bearing = self._false(laser)
         r, bearing = np.concatenate([r, ghost_r]), np.concatenate([bearing, ghost_bearing])
         g = len(ghost_r)
-        ids = self._reflectors.ids[seen] if n.ids else np.full(len(seen), ANONYMOUS)
-        diameters = np.where(np.isnan(self._reflectors.normals), self._reflectors.widths, np.nan)[
+        ids = self.reflectors.ids[seen] if n.ids else np.full(len(seen), ANONYMOUS)
+        diameters = np.where(np.isnan(self.reflectors.normals), self.reflectors.widths, np.nan)[
             seen
         ]
         return Detections(
@@ -253,7 +253,7 @@ class MarkerSensor:
         self, track: Track, laser: LaserSensor, stamp: int, geometry: Geometry, moment: int
     ) -> NDArray[np.bool_]:
         """Which reflectors (m,) the sweep met first."""
-        points, m = self._reflectors.points, len(self._reflectors)
+        points, m = self.reflectors.points, len(self.reflectors)
         span = laser.sweep / SECOND
         beams = span / laser.ray_time if laser.ray_time > 0.0 else 1.0
         at = np.full(m, stamp + laser.sweep // 2)
@@ -273,7 +273,7 @@ class MarkerSensor:
             self._n.max_range + 1.0,
         )
         met = np.concatenate([geometry.surface[:, REFLECTOR], [-1.0]])[objects]
-        flat = ~np.isnan(self._reflectors.normals)
+        flat = ~np.isnan(self.reflectors.normals)
         facing = ~flat | (cosines >= math.cos(self._n.max_incidence))
         seen: NDArray[np.bool_] = (met == np.arange(m)) & facing & inside & near
         return seen

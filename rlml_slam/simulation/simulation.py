@@ -138,6 +138,13 @@ class Simulation:
         self._command = (speed, turn_rate)
         self._commanded = self.time
 
+    def move_reflectors(self, points: Array) -> None:
+        """Put the reflectors to other places (m, 2) of the world, at once."""
+        moved = replace(self.world.reflectors, points=points)
+        self.world = replace(self.world, reflectors=moved)
+        self._markers.reflectors = moved
+        self._static = self.world.static.joined(moved.geometry())
+
     def kidnap(self, distance: float) -> None:
         """Carry the robot ``distance`` [m] along its route, at once; no sensor but sight tells."""
         if self._route.length > 0.0:

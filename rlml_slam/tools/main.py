@@ -56,6 +56,9 @@ COMMANDS: Table = {
                 'study_ablation', 'each sensor alone and together, faults, kidnapping'
             ),
             'worlds': Command('study_front_end', 'accuracy and consistency over seeds and worlds'),
+            'lifelong': Command(
+                'study_lifelong', 'hours in one hall: size of the map and cost of a keyframe'
+            ),
             'deformable': Command(
                 'study_deformable', 'deformable-feature SLAM: EKF against NLS over many seeds'
             ),

@@ -180,7 +180,7 @@ def collect(slam: Slam | EkfSlam, log: FrameLog, name: str, truth: Truth | None)
         grid,
         np.array(poses[indices]).reshape(-1, 3),
         np.array(ends).reshape(-1, 2, 2),
-        sum(not c.accepted for c in tried),
+        back_end.scans.tried[False],
         np.array([u.wall_ms for u in slam.updates]),
         truth=truth,
         problem=problem,

@@ -163,3 +163,20 @@ def test_scan_without_points_and_bad_values():
     with pytest.raises(InputError, match='not finite'):
         submap.insert(np.array([[1.0, 0.0]]), np.array([np.inf, 0.0]))
     assert submap.insertions == 1
+
+
+def test_complete_submap_shows_the_same_in_less_memory():
+    submap = Submap()
+    a = np.linspace(0.0, 6.0, 200)
+    submap.insert(np.stack([5.0 * np.cos(a), 3.0 * np.sin(a)], -1), np.zeros(2))
+    submap.insert(np.stack([5.5 * np.cos(a) + 0.3, 3.5 * np.sin(a)], -1), np.array([0.3, 0.0]))
+    before, walls = submap.bounds, submap.walls()
+    known, bytes_ = submap.values[submap.values != 0].copy(), submap.values.nbytes
+    submap.complete()
+    np.testing.assert_array_equal(submap.values[submap.values != 0], known)
+    np.testing.assert_allclose(submap.walls(), walls, atol=1e-12)
+    assert (submap.bounds[:2] >= before[:2]).all()
+    assert submap.values.nbytes < bytes_
+    assert submap.knows(walls) == 1.0
+    assert submap.knows(walls + 100.0) == 0.0
+    assert submap.knows(np.vstack([walls, walls + 100.0])) == 0.5

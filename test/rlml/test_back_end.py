@@ -21,12 +21,13 @@ from made_worlds import (
 from rlml_slam import se2
 from rlml_slam.graph.factors import relative_information
 from rlml_slam.graph.graph import Graph
+from rlml_slam.matching.submap import Submap
 from rlml_slam.params import BackEnd as BackEndParameters
 from rlml_slam.params import LoopClosure, Node, Parameters
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.front_end import FrontEnd
-from rlml_slam.rlml.keyframes import Interval, Sighting
-from rlml_slam.rlml.loop_closure import ScanGraph
+from rlml_slam.rlml.keyframes import Interval, Keyframe, Sighting
+from rlml_slam.rlml.loop_closure import KeySubmap, ScanGraph
 from rlml_slam.types import ANONYMOUS, EdgeKind, Frame, Motion, Observation, Status
 
 CURVE = drive((0.6, 0.0, 3.0), (0.6, 0.6, 4.0), (0.5, -0.7, 2.0))
@@ -433,12 +434,15 @@ def test_outlier_between_keyframes_is_kept_apart():
 def test_edge_of_a_scan_that_leaves_a_direction_open_enters_the_graph():
     graph = Graph()
     scans = ScanGraph(Parameters(), graph)
-    for pose in ([0.0, 0.0, 0.0], [1.0, 0.0, 0.2]):
-        graph.add_pose(np.array(pose))
+    keys = [
+        Keyframe(graph.add_pose(pose), FIRST, pose, EYE, None, None, FIRST)
+        for pose in (np.zeros(3), np.array([1.0, 0.0, 0.2]))
+    ]
+    submap = KeySubmap(keys[0], Submap())
     rng = np.random.default_rng(0)
     for k in range(300):
         # a corridor in any direction: nothing is known along it, much across it
         axis = rng.standard_normal(3)
         information = 10.0 ** rng.uniform(0.0, 7.0) * np.outer(axis, axis)
         delta = rng.uniform(-3.0, 3.0, 3)
-        assert scans._edge(EdgeKind.SCAN, 0, 1, delta, information) == k
+        assert scans._edge(EdgeKind.SCAN, submap, keys[1], delta, information) == k

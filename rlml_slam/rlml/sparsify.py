@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bounded growth: where a place has keyframes enough, older ones take over what a new one tells.
+
+What the new one knows of its neighbours goes on between these (graph/eliminate.py), its
+sightings are seen from the neighbour it was tied to best, and the place shows its scan instead of
+the oldest one, so that the map keeps up with a hall in which things are moved.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from rlml_slam import se2
+from rlml_slam.graph.eliminate import Ties, eliminate
+from rlml_slam.graph.graph import Graph
+from rlml_slam.params import Parameters
+from rlml_slam.rlml.keyframes import Keyframe
+from rlml_slam.rlml.loop_closure import ScanGraph
+from rlml_slam.rlml.path import Path
+from rlml_slam.rlml.reflector_graph import ReflectorGraph
+from rlml_slam.se2 import Array
+
+RECENT = 10  # keyframes that stay in any case: the next ones may be matched to them
+
+
+class Sparsifier:
+    """Judges every keyframe once, when no submap that is being built needs it any more."""
+
+    def __init__(
+        self, params: Parameters, graph: Graph, scans: ScanGraph, reflectors: ReflectorGraph
+    ) -> None:
+        self._p = params.back_end
+        self._graph = graph
+        self._scans = scans
+        self._reflectors = reflectors
+        self._judged = 0
+
+    def sparsify(self, keys: list[Keyframe], path: Path) -> bool:
+        """Let go of redundant keyframes, and number the others anew; whether there were any."""
+        if not self._p.keyframes_per_place:
+            return False
+        end = len(keys) - RECENT
+        needed = self._scans.oldest_active
+        end = end if needed is None else min(end, needed)
+        poses = self._graph.poses
+        covers = self._redundant(poses, [k.scan_stamp for k in keys], end)
+        if not covers:
+            return False
+        for gone, onto in covers.items():
+            keys[onto].take_scan(keys[gone], se2.between(poses[onto], poses[gone]))
+            self._scans.take_over(gone, keys[onto])
+        before = poses.copy()
+        edges, ties = self._eliminate(list(covers))
+        self._reflectors.move(ties)
+        kept = np.ones(len(keys), dtype=np.bool_)
+        kept[list(covers)] = False
+        new = self._graph.keep(kept, self._reflectors.keep_alive())
+        self._reflectors.renumber(new)
+        self._scans.renumber(new, edges, {k: onto for k, (onto, _) in ties.items()})
+        onto_of = np.full(len(keys), -1)
+        onto_of[list(covers)] = list(covers.values())
+        path.renumber(before, new.poses, onto_of)
+        keys[:] = [k for k in keys if kept[k.index]]
+        for index, key in enumerate(keys):
+            key.index = index
+        return True
+
+    def _eliminate(self, poses: list[int]) -> tuple[dict[int, int], dict[int, tuple[int, Ties]]]:
+        """What each edge of the poses went to, -1 if to none; and each pose, with its tie."""
+        edges: dict[int, int] = {}
+        ties: dict[int, tuple[int, Ties]] = {}
+        floor2 = np.array(self._p.scan_floor2)
+        e = self._graph.edges
+        left = np.array(poses)
+        while len(left):  # those with few neighbours first, which ties the fewest anew
+            degrees = np.bincount(e.nodes[e.enabled].ravel(), minlength=int(left.max()) + 1)[left]
+            gone = int(left[np.argmin(degrees)])
+            left = left[left != gone]
+            done = eliminate(self._graph, gone, floor2)
+            ties[gone] = done.onto, done.tie
+            edges.update(done.edges)
+        for gone in reversed(ties):  # what it went to may have gone as well, but later
+            onto, tie = ties[gone]
+            if onto in ties:
+                last, back = ties[onto]
+                ties[gone] = last, back.then(tie)
+        for first, last in reversed(edges.items()):
+            edges[first] = edges.get(last, last)
+        return edges, ties
+
+    def _redundant(self, poses: Array, scan_stamps: list[int], end: int) -> dict[int, int]:
+        """Keyframes before ``end`` that are not needed, each with the one whose scan it renews."""
+        p, fixed = self._p, self._graph.fixed_poses
+        out: dict[int, int] = {}
+        if end <= self._judged:
+            return out
+        near = cKDTree(poses[:end, :2]).query_ball_point(
+            poses[self._judged : end, :2], p.place_distance
+        )
+        for k, others in enumerate(near, self._judged):
+            if len(out) > p.optimize_every:  # more than come meanwhile, so that none waits long
+                break
+            turns = np.abs(se2.wrap(poses[others, 2] - poses[k, 2]))
+            same = [
+                i for i, turn in zip(others, turns, strict=True)
+                if i < k and i not in out and turn < p.place_heading
+            ]  # fmt: skip
+            if len(same) >= p.keyframes_per_place and not fixed[k]:
+                out[k] = min(same, key=scan_stamps.__getitem__)
+                scan_stamps[out[k]] = scan_stamps[k]
+            self._judged += k not in out  # by the number that it will have
+        return out

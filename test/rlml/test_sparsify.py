@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_worlds import ROOM, TinyWorld, drive, errors, observations, polygon
+
+from rlml_slam import se2
+from rlml_slam.params import BackEnd as BackEndParameters
+from rlml_slam.params import Parameters
+from rlml_slam.rlml.back_end import BackEnd
+from rlml_slam.rlml.front_end import FrontEnd
+from rlml_slam.rlml.path import Path
+
+LAPS = 5
+ROUND = [(0.8, 0.0, 3.0), (0.8, np.pi / 2, 1.0)] * 4
+START = (0.5, -1.0, 0.0)
+SQUARE = TinyWorld(
+    np.vstack(
+        [polygon((-2, -3), (6, -3), (6.5, 4), (-1.5, 3.5)), polygon((2, 0), (3, 0), (2, 1))]
+    ),
+    np.array([[-1.8, -2.5], [5.5, -2.4], [5.8, 3.2], [-1.2, 3.1], [2.0, 3.5], [3.5, -2.8]]),
+)
+
+
+def params(**values):
+    few = {'keyframes_per_place': 2, 'submap_size': 10} | values
+    return Parameters(back_end=BackEndParameters(**few))
+
+
+def mapped(observed, parameters):
+    """A front end and a back end, and the number of keyframes at the end of each lap."""
+    front_end, back_end = FrontEnd(parameters), BackEnd(parameters)
+    counts = []
+    for k, o in enumerate(observed):
+        update = back_end.add(front_end.process(o))
+        if update is not None and update.optimized:
+            front_end.correct(update.T_map_local)
+        if (k + 1) % (len(observed) // LAPS) == 0:
+            counts.append(len(back_end.keyframes))
+    back_end.finish()
+    return back_end, counts
+
+
+@pytest.fixture(scope='module', params=[(True, True), (True, False), (False, True)])
+def runs(request):
+    scan, reflectors = request.param
+    path = drive(*ROUND * LAPS, start=START)
+    rng = np.random.default_rng(0)
+    observed = observations(SQUARE, path, scan=scan, reflectors=reflectors, rng=rng)
+    start = {'node': replace(Parameters().node, map_start_pose=START)}
+    few, counts = mapped(observed, replace(params(), **start))
+    all_, many = mapped(observed, replace(params(keyframes_per_place=0), **start))
+    return path, few, counts, all_, many
+
+
+def test_map_stops_growing_where_all_is_mapped(runs):
+    _, few, counts, _, many = runs
+    assert many[-1] > 2.0 * counts[-1]
+    # those that wait to be judged are a few more or less
+    assert max(counts[1:]) - min(counts[1:]) <= 5
+    assert len(few.graph.poses) == len(few.keyframes)
+    assert len(few.graph.edges) < 12 * counts[-1]
+
+
+def test_every_frame_keeps_its_pose(runs):
+    path, few, _, all_, _ = runs
+    for back_end in (few, all_):
+        stamps, poses = back_end.trajectory()
+        assert len(stamps) == len(path)
+        assert (np.diff(stamps) > 0).all()
+        distance, turn = errors(poses, path)
+        assert distance.max() < 0.08
+        assert turn.max() < 0.03
+    # as good as with all keyframes, up to a tenth of a cell
+    rmse = [np.sqrt(np.mean(errors(b.trajectory()[1], path)[0] ** 2)) for b in (few, all_)]
+    assert rmse[0] < rmse[1] + 0.005
+
+
+def test_reflectors_stay_where_they_are(runs):
+    _, few, _, all_, _ = runs
+    a, b = few.reflectors(), all_.reflectors()
+    np.testing.assert_array_equal(a.keys, b.keys)
+    np.testing.assert_array_equal(a.sightings, b.sightings)
+    if len(a):
+        gap = np.linalg.norm(a.points - b.points, axis=-1)
+        assert gap.max() < 0.03
+
+
+def test_indices_point_at_what_they_did(runs):
+    _, few, _, _, _ = runs
+    graph = few.graph
+    assert [k.index for k in few.keyframes] == list(range(len(few.keyframes)))
+    for c in few.scans.closures:
+        if c.accepted:
+            assert set(graph.edges.nodes[c.edge]) == {c.i, c.j}
+    r = graph.residuals()
+    # nothing was attached to the wrong place: no residual is out of proportion
+    assert np.quantile(r.edges[graph.edges.enabled], 0.99, method='lower') < 30.0
+
+
+def test_place_shows_its_newest_scans():
+    path = drive(*ROUND * LAPS, start=START)
+    observed = observations(SQUARE, path, reflectors=False, rng=np.random.default_rng(1))
+    # in the last two laps a box stands in the corner
+    box = replace(SQUARE, walls=np.vstack([SQUARE.walls, polygon((4, 2), (5, 2), (5, 3), (4, 3))]))
+    with_box = observations(box, path, reflectors=False, rng=np.random.default_rng(1))
+    n = len(path) * 2 // LAPS
+    parameters = replace(params(), node=replace(Parameters().node, map_start_pose=START))
+    back_end, _ = mapped(observed[:-n] + with_box[-n:], parameters)
+    grid = back_end.occupancy_grid()
+    j, i = np.floor((np.array([4.5, 2.0]) - grid.origin) / grid.resolution).astype(int)
+    assert grid.cells[i - 2 : i + 3, j - 4 : j + 5].max() >= 65
+
+
+def test_path_is_thinned_beyond_its_limit():
+    path = Path(1000)
+    for k in range(3000):
+        if k and k % 10 == 0:
+            path.begin_keyframe(np.array([0.5, 0.0, 0.0]))
+        path.add(k, np.array([0.05 * (k % 10), 0.0, 0.0]))
+    stamps = path.stamps()
+    assert 400 < len(stamps) <= 1000
+    assert (np.diff(stamps) > 0).all()
+    keys = np.stack([0.5 * np.arange(300), np.zeros(300), np.zeros(300)], -1)
+    np.testing.assert_allclose(path.poses(keys)[:, 0], 0.05 * stamps, atol=1e-6)
+
+
+def test_frames_of_a_keyframe_that_goes_stay_where_they_are():
+    rng = np.random.default_rng(2)
+    path, keys, local = Path(1000), [], np.zeros(3)
+    for k in range(6):
+        if k:
+            motion = rng.uniform(-0.5, 0.5, 3)
+            local = se2.compose(local, motion)
+            path.begin_keyframe(motion)
+        keys.append(local + 0.05 * rng.standard_normal(3))
+        for n in range(4):
+            path.add(10 * k + n, 0.1 * n * np.ones(3))
+    keys = np.array(keys)
+    before = path.poses(keys)
+    new = np.array([0, 1, -1, 2, -1, 3])
+    path.renumber(keys, new, np.array([-1, -1, 0, -1, 3, -1]))
+    kept = keys[[0, 1, 3, 5]]
+    np.testing.assert_allclose(path.poses(kept), before, atol=1e-9)
+    # and they follow the keyframe that they hang on
+    moved = se2.compose(np.array([1.0, -2.0, 0.7]), kept)
+    np.testing.assert_allclose(
+        path.poses(moved), se2.compose(np.array([1.0, -2.0, 0.7]), before), atol=1e-9
+    )
+
+
+def test_room_is_mapped_the_same_where_no_place_is_full():
+    observed = observations(ROOM, drive((0.5, 0.2, 6.0)), rng=np.random.default_rng(3))
+    a, _ = mapped(observed, Parameters())
+    b, _ = mapped(observed, params(keyframes_per_place=0, submap_size=40))
+    assert a.trajectory()[1].tobytes() == b.trajectory()[1].tobytes()
