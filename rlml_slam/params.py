@@ -580,7 +580,7 @@ class Detector(Group):
         choices=('automatic', 'curve', 'bit'),
     )  # fmt: skip
     contrast: float = param(
-        4.5, 'automatic: intensity of a reflector per that of bright other surfaces as far away',
+        5.0, 'automatic: intensity of a reflector per that of bright other surfaces as far away',
         '', 1.1, 1000.0,
     )  # fmt: skip
     a: float = param(1000.0, 'curve: fading part of the threshold, at range 0', '', 0.0, 1e9)

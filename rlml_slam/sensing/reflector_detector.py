@@ -31,6 +31,7 @@ QUANTILE = 0.75  # of an octave's brightness; glare may take up to a quarter of 
 MIN_BEAMS = 16  # an octave with fewer beams tells nothing
 MAX_WINDOW = 400  # [beams] half a reflector at most, so that the cost is bounded
 SAME = 0.1  # [m] between two sightings of one reflector in one sweep
+BESIDE = 5  # beams on either side of a spot that tell what it lies in
 GAP = 0.02  # [m] a dark gap that does not part a reflector
 LIT = 0.8  # share of a cylinder's diameter that shines back at least
 TILT = 0.5  # cosine of the widest angle at which a flat reflector is still seen
@@ -41,6 +42,9 @@ ROUGH = 0.1  # share of its width by which a reflector's surface may be off its 
 SIGMAS = 4.0  # of the noise of a shape
 SPACED = 0.5  # reflectors' widths between beams that may well miss a gap beside one
 CURVED = 5  # beams that tell a shape
+WHOLE = 0.3  # share of its brightness down to which a thing of one depth is one thing
+FLATTER = 16.0  # chi^2 by which a thing is flat rather than round: 4 sigma
+SUNK = 0.5  # radius by which a cylinder is out of the line of what is beside it at least
 
 
 class Fate(IntEnum):
@@ -372,9 +376,13 @@ def _judge(
     if r < settings.min_range or r > settings.max_range:
         row[FATE] = Fate.RANGE.value
         return
+    depth = 0.5 * max(diameter, flat) + 3.0 * settings.sigma_range
+    # whatever is as far away and not much darker belongs to it
+    more = _beside(first, last, r, WHOLE * peak, depth, r * step, ranges, bright, circular)
+    whole = span + more * r * step
     hidden, fading = _edges(
         first, last, r, peak, ranges, bright, limit, step, circular,
-        0.5 * max(diameter, flat) + 3.0 * settings.sigma_range, settings,
+        depth, settings,
     )  # fmt: skip
     # glare that something cuts off looks like a reflector that something hides; where beams lie
     # far apart, what is nearer may also stand beside it
@@ -395,7 +403,7 @@ def _judge(
             continue
         least = (LIT if shape == 0 else TILT) * width - settings.size_tolerance
         is_narrow = span + 2.0 * spacing < least
-        is_wide = span - footprint > width + settings.size_tolerance
+        is_wide = whole - footprint > width + settings.size_tolerance
         narrow, wide = narrow and is_narrow, wide and is_wide
         if is_narrow or is_wide:
             continue
@@ -407,6 +415,11 @@ def _judge(
         share = 2.0 / (9.0 * max(beams - 1.0, 1.0))
         noise = settings.sigma_range**2 * (1.0 - share + SIGMAS * math.sqrt(share)) ** 3
         if beams >= CURVED and spread[shape] > noise + (ROUGH * width) ** 2:
+            continue
+        if shape == 0 and not hidden and _is_flat(
+            first, last, r, bearing, beams, spread[0], 0.5 * width, ranges, bright, limit,
+            angle_min, increment, circular, settings,
+        ):  # fmt: skip
             continue
         # a width that beams this far apart tell to half their spacing
         var_width = spacing**2 / 6.0 + (0.5 * settings.size_tolerance) ** 2 + 1e-12
@@ -427,6 +440,99 @@ def _judge(
         across += width**2 / 12.0
     row[VAR_BEARING] = across / mean**2 + settings.sigma_bearing**2
     row[DIAMETER] = diameter if weights[0] >= weights[1] else np.nan
+
+
+@part
+def _beside(
+    first: int,
+    last: int,
+    r: float,
+    least: float,
+    depth: float,
+    spacing: float,
+    ranges: Array,
+    bright: Array,
+    circular: bool,
+) -> int:
+    """Beams beside a bright spot that are as far away and brighter than ``least``."""
+    n = len(ranges)
+    ends = np.zeros(2, np.int64)  # beams more on either side
+    for side in range(2):
+        for k in range(1, n // 2):
+            j = (first - k) if side == 0 else (last + k)
+            missed = k - ends[side] - 1
+            is_parted = missed > 1 and missed * spacing > GAP
+            if is_parted or (not circular and not 0 <= j < n):
+                break
+            j %= n
+            if ranges[j] <= 0.0:
+                continue
+            if not bright[j] > least or abs(ranges[j] - r) > depth:
+                break
+            ends[side] = k
+    return int(ends[0] + ends[1])
+
+
+@part
+def _is_flat(
+    first: int,
+    last: int,
+    r: float,
+    bearing: float,
+    beams: int,
+    spread: float,
+    radius: float,
+    ranges: Array,
+    bright: Array,
+    limit: Array,
+    angle_min: float,
+    increment: float,
+    circular: bool,
+    settings: Settings,
+) -> bool:
+    """Whether what is bright is a part of a flat surface rather than a cylinder.
+
+    It is where its own ranges tell, ``spread`` being what a cylinder leaves of them; or where it
+    lies in a surface that goes on straight at both sides, as paint and glare do: a cylinder
+    stands out of what it is fixed to.
+    """
+    footprint = r * settings.divergence
+    _, flat = _centre(
+        0.0, first, last, r, bearing, ranges, bright, limit, angle_min, increment, footprint
+    )
+    variance = settings.sigma_range**2
+    better = spread - flat - (ROUGH * radius) ** 2
+    if beams >= CURVED and (beams - 1) * better > FLATTER * variance:
+        return True
+    n = len(ranges)
+    # the line through two returns on each side, far enough not to be of a post or a plate that
+    # the reflector is a part of
+    x, y = np.empty(4), np.empty(4)
+    m = 0
+    spacing = r * abs(increment)
+    clear = max(int(settings.separation / spacing - 0.5 * (last - first)) + 1, 2)
+    for side in (-1, 1):
+        outer = first if side < 0 else last
+        met = 0
+        for k in range(clear, clear + BESIDE):
+            j = outer + side * k
+            if not circular and not 0 <= j < n:
+                return False
+            if ranges[j % n] <= 0.0:
+                continue
+            off = _angle(j, n, angle_min, increment) - bearing
+            x[m], y[m] = ranges[j % n] * math.sin(off), ranges[j % n] * math.cos(off)
+            met, m = met + 1, m + 1
+            if met == 2:
+                break
+        if met < 2:
+            return False
+    mx, my = np.mean(x), np.mean(y)
+    slope = np.sum((x - mx) * (y - my)) / np.sum((x - mx) ** 2)
+    off_line = y - my - slope * (x - mx)
+    if np.sum(off_line**2) > FLATTER * variance:
+        return False
+    return bool(abs(my - slope * mx - r) < SUNK * radius)
 
 
 @part

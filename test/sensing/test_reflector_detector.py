@@ -261,6 +261,39 @@ def test_a_vest_is_too_wide(width):
     assert len(detect(scan, Detector())) == 0
 
 
+def test_a_bright_leg_is_too_wide_where_only_its_middle_passes_the_threshold():
+    scene = Scene()
+    scene.add_room(np.full(2, 3.5), [surface(0.17)] * 4)
+    scene.add_disc(np.array([3.0, 0.5]), 0.15, np.zeros(2), surface(0.9))
+    scan = still(scene.geometry())
+    assert (scan.intensities > threshold(scan, Detector())).any()
+    found = detect(scan, Detector())
+    assert len(found) == 0
+    assert found.rejected == {Fate.WIDE: 1}
+
+
+def test_paint_on_a_wall_is_no_cylinder_and_one_before_the_wall_is():
+    for stands_out, seen in ((0.0, 0), (0.05, 1)):
+        scan = made_scan([(2.0 - stands_out, 0.0, 0.08)])
+        on = scan.intensities > WALL
+        x = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
+        wall = (np.abs(x) < 0.5) & ~on
+        ranges = scan.ranges.copy()
+        ranges[wall] = 2.0 / np.cos(x[wall])
+        if not stands_out:
+            ranges[on] = 2.0 / np.cos(x[on])
+        assert len(detect(replace(scan, ranges=ranges), THIN)) == seen
+
+
+def test_a_plate_as_wide_as_a_cylinder_is_none():
+    scan = made_scan([(0.5, 0.0, 0.08)])
+    assert len(detect(scan, THIN)) == 1
+    on = scan.intensities > WALL
+    ranges = np.where(on, 0.5, scan.ranges).astype(np.float32)
+    found = detect(replace(scan, ranges=ranges), THIN)
+    assert found.rejected == {Fate.DEEP: 1}
+
+
 def test_a_saturated_wall_is_no_reflector():
     scan = made_scan([(2.0, 0.0, 0.08)], wall=3.0)
     bright = scan.intensities.copy()
