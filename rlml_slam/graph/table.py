@@ -57,8 +57,8 @@ class Column:
         """Let go of the other rows, and of room that would be empty for long."""
         rows = self.view[kept]
         self._buffer = np.zeros((max(16, 2 * len(rows)), *rows.shape[1:]), dtype=rows.dtype)
-        self._buffer[: len(rows)] = rows
-        self._size = len(rows)
+        self.view = self._buffer[: len(rows)]
+        self.view[:] = rows
 
 
 class FactorTable:

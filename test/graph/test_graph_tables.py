@@ -88,3 +88,15 @@ def test_positive_definite_agrees_with_eigenvalues():
     smallest = np.linalg.eigvalsh(matrices)[:, 0]
     clear = np.abs(smallest) > 1e-6  # away from the tolerance
     np.testing.assert_array_equal(is_positive_definite(matrices)[clear], (smallest > 0)[clear])
+
+
+def test_column_goes_on_after_it_has_let_rows_go():
+    column = Column((2,))
+    rows = np.arange(40.0).reshape(20, 2)
+    column.append(rows)
+    kept = np.arange(20) % 3 == 0
+    column.keep(kept)
+    np.testing.assert_array_equal(column.view, rows[kept])
+    column.append(rows)
+    assert len(column) == 27
+    np.testing.assert_array_equal(column.view, np.vstack([rows[kept], rows]))
