@@ -24,6 +24,7 @@ from rlml_slam.graph.equations import system_of
 from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.initialize import initialize
 from rlml_slam.graph.iterate import gauss_newton
+from rlml_slam.graph.linearize import linearize
 from rlml_slam.graph.robust import Loss
 from rlml_slam.graph.solver import NOTHING, optimize
 from rlml_slam.graph.table import FactorKind
@@ -87,8 +88,9 @@ def _anneal(
     for rounds in range(1, ROUNDS + 1):
         for name in INFORMATION:
             system.edges[name][row] = np.maximum(weights, LEAST) * full[name]
+        cost, chi2 = linearize(system, graph.poses, graph.landmarks, True)
         gauss_newton(
-            system, graph.poses, graph.landmarks, parameters.max_iterations,
+            system, graph.poses, graph.landmarks, cost, chi2, parameters.max_iterations,
             parameters.relative_tolerance, floor,
         )  # fmt: skip
         s = graph.residuals().edges[edges]
