@@ -21,6 +21,7 @@ from rlml_slam.tools.metrics import metrics
 
 ALSO_USED = ('waited_out', 'no_returns')  # counted beside `used`
 START = 10.0  # [s] at least: shorter tells nothing
+MOTION_HZ = 100.0  # of odometry and IMU: a scan waits for the odometry at its end
 
 
 def add_parser(subparsers: Any) -> None:
@@ -29,7 +30,7 @@ def add_parser(subparsers: Any) -> None:
         'live',
         help='whether the live nodes keep up with a fast laser',
         description='Simulator, front end and back end as three processes over DDS, in real time: '
-        'odometry at 50 Hz, IMU at 100 Hz, reflectors and scans at the rate of the laser.',
+        'odometry and IMU at 100 Hz, reflectors and scans at the rate of the laser.',
     )
     parser.add_argument('--minutes', type=float, default=1.0, help='default: %(default)s')
     parser.add_argument('--hz', type=float, default=40.0, help='scans (default: %(default)s)')
@@ -80,7 +81,8 @@ def source(args: argparse.Namespace, duration: float) -> Source:
         'simulator',
         {
             'world': args.world, 'rate': float(args.rate), 'duration': duration, 'repeat': True,
-            'laser.rate': float(args.hz), 'laser.beams': args.beams,
+            'laser.rate': float(args.hz), 'laser.beams': args.beams, 'wheels.rate': MOTION_HZ,
+            'gyro.rate': MOTION_HZ,
             'wait_for_subscribers': LISTENERS,
         },
         lambda recorder: recorder.elapsed() / duration,
