@@ -5,9 +5,12 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlml_slam import se2
 from rlml_slam.graph.factors import relative_information
@@ -238,6 +241,19 @@ class BackEnd:
             if self.deferred.decide(final=True):
                 self._rejoin()
             self.optimize()
+
+    def start_from(self, keys: list[Keyframe], arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Go on with a map whose graph is there already; the local frame is the map's from now on.
+
+        The next frame has to be one that ``jumped``: no motion leads to it.
+        """
+        last = keys[-1]
+        last.T_local = self.graph.poses[last.index].copy()
+        self.keyframes = keys
+        self.scans.restore(arrays, keys)
+        self.reflector_graph.restore(arrays)
+        self.path.restore(arrays)
+        self._interval = Interval(last.T_local)
 
     # --- products ------------------------------------------------------------------------------
 

@@ -8,10 +8,12 @@ and by the lead over the second-best place; what fails is recorded, not used.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlml_slam import se2
 from rlml_slam.graph.factors import relative_information
@@ -211,6 +213,51 @@ class ScanGraph:
 
     def _grid(self, m: KeySubmap) -> Array:
         return se2.compose(self._pose(m.anchor), m.T_anchor_grid)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The submaps and the records of closures, to be saved."""
+        maps = [m for m in self._finished + self._active if m.size]
+        cells = [m.submap.values.ravel() for m in maps]
+        c = self.closures
+        return {
+            'submap_anchor': np.array([m.anchor.index for m in maps], dtype=np.int64),
+            'submap_pose': np.array([m.T_anchor_grid for m in maps]).reshape(-1, 3),
+            'submap_size': np.array([(m.size, m.submap.insertions) for m in maps]).reshape(-1, 2),
+            'submap_centre': np.array([m.centre for m in maps]).reshape(-1, 2),
+            'submap_corner': np.array([m.submap.corner for m in maps]).reshape(-1, 2),
+            'submap_shape': np.array([m.submap.values.shape for m in maps]).reshape(-1, 2),
+            'submap_cells': np.concatenate([np.zeros(0, dtype=np.uint16), *cells]),
+            'closure': np.array([(r.i, r.j, r.edge) for r in c], dtype=np.int64).reshape(-1, 3),
+            'closure_fit': np.array([(*r.delta, r.score) for r in c]).reshape(-1, 4),
+            'closure_why': np.array([r.why for r in c], dtype=np.str_),
+            'closures_tried': np.array([self.tried[False], self.tried[True]], dtype=np.int64),
+        }
+
+    def restore(self, arrays: Mapping[str, NDArray[Any]], keys: Sequence[Keyframe]) -> None:
+        """Take over what was saved: all submaps are complete."""
+        a = arrays
+        ends = np.cumsum(a['submap_shape'].prod(-1))
+        for k, (rows, columns) in enumerate(a['submap_shape'].tolist()):
+            submap = Submap(self._p.submap)
+            cells = a['submap_cells'][ends[k] - rows * columns : ends[k]]
+            submap.values = cells.reshape(rows, columns).copy()
+            submap.corner = (int(a['submap_corner'][k, 0]), int(a['submap_corner'][k, 1]))
+            size, submap.insertions = a['submap_size'][k].tolist()
+            submap.complete()
+            self._finished.append(
+                KeySubmap(
+                    keys[int(a['submap_anchor'][k])], submap, size,
+                    a['submap_centre'][k].copy(), a['submap_pose'][k].copy(),
+                )
+            )  # fmt: skip
+        self.closures = [
+            Closure(i, j, fit[:3], float(fit[3]), edge, str(why))
+            for (i, j, edge), fit, why in zip(
+                a['closure'].tolist(), a['closure_fit'], a['closure_why'], strict=True
+            )
+        ]
+        rejected, accepted = a['closures_tried'].tolist()
+        self.tried = {True: accepted, False: rejected}
 
     def _close(self, key: Keyframe, points: Array) -> tuple[Closure, ...]:
         """Try the finished submaps near the keyframe, the nearest first."""

@@ -3,12 +3,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
 from rlml_slam.graph.table import Column
 from rlml_slam.se2 import Array
+
+Arrays = Mapping[str, NDArray[Any]]
 
 # A frame: its keyframe, its pose there, and its share of the correction up to the next keyframe.
 ROW = np.dtype(
@@ -51,25 +56,23 @@ class Path:
         self._rows = Column((), ROW)
         self._rows.append(rows[kept])
 
+    def arrays(self) -> Arrays:
+        """All that is known, to be saved."""
+        return {'path': self._rows.view, 'path_motion': self._motion.view}
+
+    def restore(self, arrays: Arrays) -> None:
+        """Go on after the keyframes that were saved; the frames of then stay with the file."""
+        self._rows, self._motion = Column((), ROW), Column((3,))
+        self._motion.append(arrays['path_motion'])
+        self._begin = 0
+
     def stamps(self) -> NDArray[np.int64]:
         """Stamps (n,)."""
         return np.array(self._rows.view['stamp'])
 
     def poses(self, keys: Array) -> Array:
         """Poses (n, 3) in the map frame, where the keyframes' are ``keys`` (k, 3)."""
-        return self._poses(self._rows.view, keys)
-
-    def _poses(self, rows: NDArray[np.void], keys: Array) -> Array:
-        key, share = rows['key'], rows['share'].astype(np.float64)
-        out = se2.compose(keys[key], rows['pose'])
-        spread = np.flatnonzero(share)
-        if len(spread):
-            first, at = np.unique(key[spread], return_inverse=True)  # once per keyframe
-            there = se2.compose(keys[first], self._motion.view[first])
-            missing = se2.log(se2.between(there, keys[first + 1]))
-            part = missing[at] * share[spread, None]
-            out[spread] = se2.compose(out[spread], se2.exp(part))
-        return out
+        return poses_of(self._rows.view, self._motion.view, keys)
 
     def renumber(self, keys: Array, new: NDArray[np.int64], onto: NDArray[np.int64]) -> None:
         """Keyframe k becomes ``new[k]``, or where that is -1, its frames hang on ``onto[k]``.
@@ -83,10 +86,23 @@ class Path:
         loose = gone[key] | ((rows['share'] > 0.0) & gone[np.minimum(key + 1, len(new) - 1)])
         moved = rows[loose]
         target = np.where(gone[moved['key']], onto[moved['key']], moved['key'])
-        moved['pose'] = se2.between(keys[target], self._poses(moved, keys))
+        moved['pose'] = se2.between(keys[target], poses_of(moved, self._motion.view, keys))
         moved['key'], moved['share'] = target, 0.0
         rows[loose] = moved
         rows['key'] = new[rows['key']]
         motion = self._motion.view[~gone[:-1]]
         self._motion = Column((3,))
         self._motion.append(motion)
+
+
+def poses_of(rows: NDArray[np.void], motion: Array, keys: Array) -> Array:
+    """Poses (n, 3) of frames in the map frame; ``motion`` (k, 3) is that between keyframes."""
+    key, share = rows['key'], rows['share'].astype(np.float64)
+    out = se2.compose(keys[key], rows['pose'])
+    spread = np.flatnonzero(share)
+    if len(spread):
+        first, at = np.unique(key[spread], return_inverse=True)  # once per keyframe
+        missing = se2.log(se2.between(se2.compose(keys[first], motion[first]), keys[first + 1]))
+        part = missing[at] * share[spread, None]
+        out[spread] = se2.compose(out[spread], se2.exp(part))
+    return out

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -228,6 +229,45 @@ class ReflectorGraph:
             rows['pose'] = new.poses[rows['pose']]
             linked = rows['factor'] >= 0
             rows['factor'][linked] = new.sightings[rows['factor'][linked]]
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All that is known, to be saved; ``reflector_beside`` has pairs of keys."""
+        marks = list(self._landmarks.values())
+        beside = [(m.key, other) for m in marks for other in sorted(m.beside)]
+        rows = [m.sightings.view for m in marks]
+        return {
+            'reflector_key': np.array([m.key for m in marks], dtype=np.int64),
+            'reflector_node': np.array([m.index for m in marks], dtype=np.int64),
+            'reflector_id': np.array([m.id for m in marks], dtype=np.int64),
+            'reflector_diameter': np.array([m.diameter for m in marks], dtype=np.float64),
+            'reflector_count': np.array([m.count for m in marks], dtype=np.int64),
+            'reflector_sightings': np.array([len(r) for r in rows], dtype=np.int64),
+            'reflector_beside': np.array(beside, dtype=np.int64).reshape(-1, 2),
+            'reflector_alias': np.array(list(self._alias.items()), dtype=np.int64).reshape(-1, 2),
+            'sighting': np.concatenate([np.zeros(0, dtype=SIGHTING), *rows]),
+        }
+
+    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Take over what was saved, with the graph that belongs to it."""
+        a = arrays
+        ends = np.cumsum(a['reflector_sightings'])
+        for k, key in enumerate(a['reflector_key'].tolist()):
+            landmark = _Landmark(
+                key, int(a['reflector_node'][k]), int(a['reflector_id'][k]),
+                float(a['reflector_diameter'][k]), int(a['reflector_count'][k]),
+            )  # fmt: skip
+            landmark.sightings.append(
+                a['sighting'][ends[k] - a['reflector_sightings'][k] : ends[k]]
+            )
+            self._landmarks[key] = landmark
+        for key, other in a['reflector_beside'].tolist():
+            self._landmarks[key].beside.add(other)
+        self._alias = dict(a['reflector_alias'].tolist())
+
+    @property
+    def next_key(self) -> int:
+        """The first key that was never used."""
+        return 1 + max([*self._landmarks, *self._alias], default=-1)
 
     def belief(self, pose: int) -> Belief:
         """Pose ``pose`` and all reflectors with their joint covariance."""

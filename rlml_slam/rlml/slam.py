@@ -12,10 +12,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rlml_slam.maps.container import Content
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved import SavedMap
 from rlml_slam.params import Parameters
+from rlml_slam.rlml import stored_map
 from rlml_slam.rlml.back_end import BackEnd, Update
+from rlml_slam.rlml.find_place import find_place
 from rlml_slam.rlml.front_end import FrontEnd
 from rlml_slam.rlml.recovery import Recovery
 from rlml_slam.se2 import Array
@@ -29,6 +32,7 @@ from rlml_slam.types import (
     Odometry,
     Reflectors,
     Scan,
+    Verdict,
 )
 
 AHEAD = 200  # frames that the front end may be ahead of the back end
@@ -51,7 +55,9 @@ class Slam:
         self.back_end = BackEnd(params)
         self.recovery = Recovery(params)
         self.updates: list[Update] = []
+        self._params = params
         self._saved: SavedMap | None = None
+        self._begin_in: SavedMap | None = None
         self._path: list[tuple[int, Array]] = []
         self._thread = ThreadPoolExecutor(1, 'back end') if parallel else None
         self._pending: deque[tuple[Frame, float, Future[Update | None]]] = deque()
@@ -60,6 +66,27 @@ class Slam:
         """Localise in a map that never changes, instead of making one."""
         self._saved = saved
         self.front_end.use_map(saved.reflectors, saved.grid)
+
+    def continue_map(self, content: Content) -> None:
+        """Go on with a map that was saved: the first frame looks for its place in it.
+
+        Where that is not told, it is taken to be at ``map_start_pose``. Raises FileFormatError if
+        the parts of the map do not fit together.
+        """
+        stored_map.restore(content, self.back_end)
+        self._begin_in = stored_map.saved_map(content)
+
+    def _enter(self, observation: Observation) -> None:
+        """Begin where an observation was made in the map to go on with."""
+        assert self._begin_in is not None
+        found = find_place(
+            self._begin_in.grid, self._begin_in.reflectors, observation, self._params
+        )
+        if found.verdict is Verdict.UNIQUE and found.pose is not None and found.cov is not None:
+            self.front_end.reset(found.pose, found.cov)
+        # keys of the front end and of the map must not mean different reflectors
+        self.front_end.tracks.next_key = self.back_end.reflector_graph.next_key
+        self._begin_in = None
 
     @property
     def counts(self) -> dict[str, dict[str, int]]:
@@ -99,7 +126,12 @@ class Slam:
             if self._saved is not None or observation.detections:
                 frames += self._take_turns()
             began = time.thread_time()
+            enters = self._begin_in is not None
+            if enters:
+                self._enter(observation)
             frame = self.front_end.process(observation)
+            if enters:  # no motion leads here from where the map was left
+                frame = replace(frame, jumped=True)
             if self._saved is not None:
                 self._path.append((frame.stamp, frame.T_map_base))
                 frames.append(frame)

@@ -11,9 +11,11 @@ import numpy as np
 
 from rlml_slam import se2
 from rlml_slam.errors import MapError
+from rlml_slam.maps import container
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved import SavedMap
 from rlml_slam.params import Parameters
+from rlml_slam.rlml import stored_map
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.find_place import find_place
 from rlml_slam.rlml.recovery import Recovery
@@ -215,7 +217,11 @@ class Mapper:
         if current.grid is None and len(current.reflectors) == 0:
             raise MapError(self.products.undrawn or 'there is no map yet')
         why = f', no grid: {self.products.undrawn}' if self.products.undrawn else ''
-        return f'{self.folder.save(name, current)}: {_content(current)}{why}'
+        path = self.folder.save(name, current)
+        if self.back_end.keyframes:
+            whole = stored_map.content_of(self.back_end, self._p, current.grid)
+            container.write(path.with_name(path.name + '.rlml'), whole)
+        return f'{path}: {_content(current)}{why}'
 
     def current(self) -> SavedMap:
         """In the worker: the map as it is now."""

@@ -48,6 +48,13 @@ COMMANDS: Table = {
     'convert': Command('convert', 'recorded data sets become bags'),
     'evaluate': Command('evaluate', 'errors of a trajectory against relations or ground truth'),
     'simulate': Command('simulate', 'write a bag of a drive through a synthetic world'),
+    'map': Group(
+        'saved maps',
+        {
+            'info': Command('map_info', 'check a saved map and say what is in it'),
+            'export': Command('map_export', 'a saved map as text: CSV, g2o, TUM, PGM and YAML'),
+        },
+    ),
     'optimize': Command('optimize', 'optimise a pose graph file (g2o, TORO)'),
     'study': Group(
         'experiments that answer one question each',

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rlml_slam.errors import MapError
-from rlml_slam.maps import reflector_file
+from rlml_slam.maps import container, reflector_file
 from rlml_slam.maps.occupancy import UNKNOWN, OccupancyGrid, save, write_atomically
 from rlml_slam.tools.metrics import judge, metrics
 from rlml_slam.tools.record import Run
@@ -21,14 +21,16 @@ from rlml_slam.tools.tum import Trajectory, write_tum
 def write_outputs(run: Run, folder: str | Path) -> dict[str, Any]:
     """Write all results and pictures of a run into a folder; the figures of metrics.json.
 
-    trajectory.tum, front_end.tum, map.pgm, map.yaml and reflectors.csv depend on the data alone:
-    two replays give the same bytes. Raises MapError if the folder cannot be written.
+    trajectory.tum, front_end.tum, map.rlml, map.pgm, map.yaml and reflectors.csv depend on the
+    data alone: two replays give the same bytes. Raises MapError if the folder cannot be written.
     """
     folder = make_folder(folder)
     write_tum(folder / 'trajectory.tum', run.trajectory)
     write_tum(folder / 'front_end.tum', run.frames.trajectory())
     save(run.grid if run.grid is not None else unknown_grid(run.trajectory), folder / 'map')
     reflector_file.save(run.reflectors, folder / 'reflectors.csv')
+    if run.stored is not None:
+        container.write(folder / 'map.rlml', run.stored)
     judged = judge(run)
     figures = metrics(run, judged)
     write_atomically(folder / 'metrics.json', (json.dumps(figures, indent=2) + '\n').encode())

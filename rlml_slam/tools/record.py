@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlml_slam.maps.container import Content
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.se2 import Array
 from rlml_slam.tools.tum import Trajectory
@@ -77,7 +78,8 @@ class Run:
     ``trajectory`` is the optimised one; ``keyframes`` (k, 3) are poses in the map and
     ``closures`` (c, 2, 2) the ends of the accepted loop closures there. ``back_end_ms`` (k,)
     has the cost per keyframe. ``problem`` says in one line what ended the run early or what of it
-    is missing, empty without either. ``extra`` goes into metrics.json as it is.
+    is missing, empty without either. ``stored`` is the whole map. ``extra`` goes into metrics.json
+    as it is.
     """
 
     name: str
@@ -93,6 +95,7 @@ class Run:
     truth: Truth | None = None
     wall_s: float = 0.0
     problem: str = ''
+    stored: Content | None = None
     extra: Mapping[str, Any] = field(default_factory=dict)
 
     @property

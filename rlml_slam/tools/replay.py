@@ -19,8 +19,10 @@ from rlml_slam import warm_up
 from rlml_slam.ekf.slam import EkfSlam
 from rlml_slam.errors import BagError, InputError, MapError, ParameterError
 from rlml_slam.maps import saved
+from rlml_slam.maps.container import Content
 from rlml_slam.maps.saved import SavedMap
 from rlml_slam.params import EkfParameters, Parameters, from_mapping, read_yaml
+from rlml_slam.rlml import stored_map
 from rlml_slam.rlml.slam import Slam
 from rlml_slam.ros.bag import BagReader
 from rlml_slam.ros.feed import Feed
@@ -56,7 +58,12 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument(
         '--map', metavar='DIR', type=Path,
-        help='localize in the map of this folder, which a replay wrote or save_map as `map`',
+        help='localize in this map: a .rlml file, or a folder that a replay wrote or save_map as '
+        '`map`',
+    )  # fmt: skip
+    parser.add_argument(
+        '--continue', metavar='MAP', type=Path, dest='go_on',
+        help='go on mapping with this .rlml file',
     )  # fmt: skip
     parser.add_argument('--json', action='store_true', help='print metrics.json and no more')
 
@@ -67,8 +74,13 @@ def run(args: argparse.Namespace) -> int:
     params = from_mapping(read_yaml(args.config), kind) if args.config else kind()
     make_folder(args.out)  # before the work, not after it
     truth = Truth(read_tum(args.truth), is_map=False) if args.truth else None
-    known = saved.load(args.map) if args.map else None
-    result = replay(args.bag, params, truth, args.system, quiet=args.json, known=known)
+    if args.map and args.go_on:
+        raise ParameterError('replay: --map and --continue exclude each other')
+    known = load_known(args.map) if args.map else None
+    begun = stored_map.load(args.go_on) if args.go_on else None
+    result = replay(
+        args.bag, params, truth, args.system, quiet=args.json, known=known, begun=begun
+    )
     figures = write_outputs(result, args.out)
     if args.json:
         print(json.dumps(figures))
@@ -81,6 +93,11 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def load_known(path: Path) -> SavedMap:
+    """A map to localize in, of a file or a folder."""
+    return stored_map.saved_map(stored_map.load(path)) if path.is_file() else saved.load(path)
+
+
 def replay(
     path: str | Path,
     params: Parameters,
@@ -88,13 +105,14 @@ def replay(
     system: str = 'rlml',
     quiet: bool = True,
     known: SavedMap | None = None,
+    begun: Content | None = None,
 ) -> Run:
     """Drive the system with a bag's messages in the order of the log.
 
     ``truth`` replaces that of the bag; ``known`` is a map to localize in, from the pose
-    ``map_start_pose`` or from where the robot finds itself. A damaged bag, or one whose clock
-    jumps back, gives what came before, and ``Run.problem`` says so. Raises BagError if there is
-    nothing to use at all.
+    ``map_start_pose`` or from where the robot finds itself, ``begun`` one to go on with. A damaged
+    bag, or one whose clock jumps back, gives what came before, and ``Run.problem`` says so. Raises
+    BagError if there is nothing to use at all.
     """
     warm_up.compile_loaded()
     with BagReader(path) as bag:
@@ -106,6 +124,10 @@ def replay(
                 raise ParameterError('replay: --map is for --system rlml')
             slam = Slam(replace(params, node=replace(params.node, mode='localization')))
             slam.use_map(known)
+        if begun is not None:
+            if not isinstance(slam, Slam):
+                raise ParameterError('replay: --continue is for --system rlml')
+            slam.continue_map(begun)
         log, problem = FrameLog(), ''
         began = time.perf_counter()
         try:
@@ -121,6 +143,8 @@ def replay(
             why = problem or slam.sequencer.inputs.last_error or 'no scan and no reflectors'
             raise BagError(f'{path}: nothing in it could be used: {why}')
         result = collect(slam, log, Path(path).resolve().name, truth or inputs.truth())
+        if isinstance(slam, Slam) and known is None:
+            result.stored = stored_map.content_of(slam.back_end, params, result.grid)
         result.inputs = fates(slam.counts, bag.skipped, inputs.topics)
     result.wall_s = wall
     ended = f'{problem}; the results hold what came before' if problem else ''

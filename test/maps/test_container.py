@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import zipfile
+
+import numpy as np
+import pytest
+
+from rlml_slam.errors import FileFormatError, MapError
+from rlml_slam.maps import container
+from rlml_slam.maps.container import Content
+
+OLD, NEW = (
+    Content(
+        {
+            'poses': np.full((20, 3), float(which)),
+            'grid': np.full((300, 300), which, dtype=np.uint16),
+            'none': np.zeros((0, 2)),
+        },
+        {'which': which, 'name': 'hall ä'},
+    )
+    for which in (1, 2)
+)
+
+
+def same(a, b):
+    assert a.description == b.description
+    assert a.arrays.keys() == b.arrays.keys()
+    for name, array in a.arrays.items():
+        assert array.dtype == b.arrays[name].dtype
+        np.testing.assert_array_equal(array, b.arrays[name])
+
+
+def test_what_was_written_is_read(tmp_path):
+    path = container.write(tmp_path / 'deep' / 'a.rlml', NEW)
+    same(container.read(path), NEW)
+    assert sorted(p.name for p in path.parent.iterdir()) == ['a.rlml']
+    # other tools open it
+    with zipfile.ZipFile(path) as archive:
+        assert archive.testzip() is None
+        assert 'poses.npy' in archive.namelist()
+
+
+def test_equal_maps_are_equal_files(tmp_path):
+    a, b = (container.write(tmp_path / name, NEW).read_bytes() for name in 'ab')
+    assert a == b
+
+
+def test_map_before_stays(tmp_path):
+    path = container.write(tmp_path / 'a.rlml', OLD)
+    container.write(path, NEW)
+    same(container.read(path), NEW)
+    same(container.read(f'{path}.previous'), OLD)
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_damage_anywhere_is_refused_and_the_map_before_named(tmp_path, seed):
+    path = container.write(tmp_path / 'a.rlml', OLD)
+    container.write(path, NEW)
+    good, rng = path.read_bytes(), np.random.default_rng(seed)
+    for k in range(250):
+        bad = bytearray(good)
+        if k % 3 == 0:
+            del bad[rng.integers(len(bad)) :]
+        elif k % 3 == 1:
+            # the header as often as all the rest
+            at = rng.integers(container.SIZE if k % 2 else len(bad))
+            bad[at] ^= 1 << int(rng.integers(8))
+        else:
+            at = int(rng.integers(len(bad)))
+            bad[at : at + 512] = rng.bytes(min(512, len(bad) - at))
+        path.write_bytes(bad)
+        with pytest.raises(FileFormatError, match=r'a\.rlml.*before it is whole.*previous'):
+            container.read(path)
+    same(container.read(f'{path}.previous'), OLD)
+
+
+def test_every_bit_of_the_header_counts(tmp_path):
+    path = container.write(tmp_path / 'a.rlml', NEW)
+    good = path.read_bytes()
+    for bit in range(8 * container.SIZE):
+        bad = bytearray(good)
+        bad[bit // 8] ^= 1 << (bit % 8)
+        path.write_bytes(bad)
+        with pytest.raises(FileFormatError):
+            container.read(path)
+
+
+def test_damaged_map_does_not_replace_the_one_before(tmp_path):
+    path = container.write(tmp_path / 'a.rlml', OLD)
+    container.write(path, NEW)
+    path.write_bytes(path.read_bytes()[:-1])
+    container.write(path, NEW)
+    same(container.read(path), NEW)
+    same(container.read(f'{path}.previous'), OLD)
+
+
+WRITER = textwrap.dedent("""
+    import sys
+    import numpy as np
+    from rlml_slam.maps import container
+    which = 3
+    while True:
+        arrays = {'poses': np.full((20, 3), float(which)), 'grid': np.full((600, 600), which)}
+        container.write(sys.argv[1], container.Content(arrays, {'which': which}))
+        print(which, flush=True)
+        which += 1
+""")
+
+
+def test_kill_while_saving_never_loses_a_map(tmp_path):
+    path = container.write(tmp_path / 'a.rlml', OLD)
+    rng = np.random.default_rng(0)
+    for _ in range(6):
+        with subprocess.Popen(
+            [sys.executable, '-c', WRITER, str(path)], stdout=subprocess.PIPE, text=True
+        ) as child:
+            for _ in range(int(rng.integers(1, 4))):
+                child.stdout.readline()
+            # into the middle of the next one
+            try:
+                child.wait(float(rng.uniform(0.0, 0.02)))
+            except subprocess.TimeoutExpired:
+                os.kill(child.pid, signal.SIGKILL)
+        found = container.read(path)
+        which = found.description['which']
+        assert (found.arrays['poses'] == which).all()
+        assert (found.arrays['grid'] == which).all()
+        container.read(f'{path}.previous')
+
+
+def test_unwritable_folder_leaves_the_map(tmp_path, monkeypatch):
+    path = container.write(tmp_path / 'a.rlml', OLD)
+
+    def full(*_):
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr(os, 'fsync', full)
+    with pytest.raises(MapError, match='No space left'):
+        container.write(path, NEW)
+    monkeypatch.undo()
+    same(container.read(path), OLD)
+    assert [p.name for p in tmp_path.iterdir()] == ['a.rlml']
+
+
+def test_file_of_another_kind_is_refused(tmp_path):
+    with pytest.raises(MapError, match='cannot be read'):
+        container.read(tmp_path / 'none.rlml')
+    other = tmp_path / 'other.rlml'
+    for data in (b'', b'PK\x03\x04 and so on' * 20, b'RLMLMAP'):
+        other.write_bytes(data)
+        with pytest.raises(FileFormatError, match='not a map'):
+            container.read(other)
+
+
+def test_object_is_never_unpickled(tmp_path):
+    objects = Content({'bad': np.array([{}], dtype=object)}, {})
+    with pytest.raises(ValueError, match=r'[Oo]bject'):
+        container.write(tmp_path / 'a.rlml', objects)
+    assert list(tmp_path.iterdir()) == []

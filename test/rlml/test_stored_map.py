@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_worlds import ROOM, drive, errors, messages, observations
+
+from rlml_slam.errors import FileFormatError, MapError
+from rlml_slam.maps import container
+from rlml_slam.maps.container import Content
+from rlml_slam.params import Parameters
+from rlml_slam.rlml import stored_map
+from rlml_slam.rlml.back_end import BackEnd
+from rlml_slam.rlml.front_end import FrontEnd
+from rlml_slam.rlml.slam import Slam
+from rlml_slam.tools import map_export, map_info
+from rlml_slam.types import Odometry, Scan
+
+PARAMS = Parameters()
+CURVE = drive((0.6, 0.0, 3.0), (0.6, 0.6, 4.0), (0.5, -0.7, 2.0))
+# the room once more, from elsewhere
+AGAIN = drive((0.4, 0.4, 6.0), (0.5, -0.5, 3.0), start=(0.6, -1.2, 0.4))
+
+
+def feed(slam, observed):
+    slam.set_sensor_pose('laser', np.zeros(3))
+    frames = []
+    for m in observed:
+        if isinstance(m, Odometry):
+            frames += slam.add_odometry(m)
+        elif isinstance(m, Scan):
+            frames += slam.add_scan(m)
+        else:
+            frames += slam.add_detections(m)
+    return frames + slam.finish()
+
+
+@pytest.fixture(scope='module')
+def mapped():
+    slam = Slam(PARAMS)
+    feed(slam, messages(ROOM, CURVE, rng=np.random.default_rng(0)))
+    return slam
+
+
+@pytest.fixture
+def saved(mapped, tmp_path):
+    return stored_map.save(tmp_path / 'room.rlml', mapped.back_end, PARAMS)
+
+
+def test_map_is_read_as_it_was_saved(mapped, saved):
+    content = stored_map.load(saved)
+    again = BackEnd(PARAMS)
+    stored_map.restore(content, again)
+    a, b = mapped.back_end, again
+    np.testing.assert_array_equal(b.graph.poses, a.graph.poses)
+    np.testing.assert_array_equal(b.graph.fixed_poses, a.graph.fixed_poses)
+    assert b.graph.chi2() == a.graph.chi2()
+    np.testing.assert_array_equal(b.reflectors().points, a.reflectors().points)
+    np.testing.assert_array_equal(b.reflectors().keys, a.reflectors().keys)
+    np.testing.assert_array_equal(b.occupancy_grid().cells, a.occupancy_grid().cells)
+    assert [k.stamp for k in b.keyframes] == [k.stamp for k in a.keyframes]
+    assert b.scans.num_submaps == a.scans.num_submaps
+    # saved once more, only what belongs to the session that ended is another
+    twice = stored_map.content_of(b, PARAMS, b.occupancy_grid())
+    assert json.loads(json.dumps(twice.description)) == content.description
+    for name, array in content.arrays.items():
+        if name not in ('path', 'key_local', 'submap_cells', 'submap_corner', 'submap_shape'):
+            np.testing.assert_array_equal(twice.arrays[name], array, err_msg=name)
+
+
+def test_two_saves_are_equal_files(mapped, saved, tmp_path):
+    other = stored_map.save(tmp_path / 'other.rlml', mapped.back_end, PARAMS)
+    assert other.read_bytes() == saved.read_bytes()
+
+
+def test_mapping_goes_on_in_a_saved_map(mapped, saved):
+    before = len(mapped.back_end.keyframes)
+    slam = Slam(PARAMS)
+    slam.continue_map(stored_map.load(saved))
+    feed(slam, messages(ROOM, AGAIN, rng=np.random.default_rng(1)))
+    back_end = slam.back_end
+    assert len(back_end.keyframes) > before + 5
+    # the reflectors are those of the map, under the keys that they had
+    found = back_end.reflectors()
+    np.testing.assert_array_equal(found.keys, mapped.back_end.reflectors().keys)
+    gap = np.linalg.norm(found.points[:, None] - ROOM.reflectors, axis=-1)
+    assert gap.min(axis=1).max() < 0.03
+    distance, turn = errors(slam.trajectory()[1], AGAIN)
+    assert distance.max() < 0.06
+    assert turn.max() < 0.03
+    # and the poses of the first session stayed where they were
+    moved, _ = errors(back_end.graph.poses[:before], mapped.back_end.graph.poses)
+    assert moved.max() < 0.02
+
+
+def test_robot_localizes_in_the_file(saved):
+    known = stored_map.saved_map(stored_map.load(saved))
+    assert len(known.reflectors) == len(ROOM.reflectors)
+    params = replace(PARAMS, node=replace(PARAMS.node, map_start_pose=tuple(AGAIN[0])))
+    front_end = FrontEnd(params)
+    front_end.use_map(known.reflectors, known.grid)
+    frames = [
+        front_end.process(o) for o in observations(ROOM, AGAIN, rng=np.random.default_rng(2))
+    ]
+    assert errors(np.array([f.T_map_base for f in frames[5:]]), AGAIN[5:])[0].max() < 0.06
+
+
+def test_empty_map_is_not_saved(tmp_path):
+    with pytest.raises(MapError, match='no map yet'):
+        stored_map.save(tmp_path / 'a.rlml', BackEnd(PARAMS), PARAMS)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_other_and_inconsistent_files_are_refused(saved, tmp_path):
+    content = stored_map.load(saved)
+    newer = Content(content.arrays, {**content.description, 'version': 99})
+    with pytest.raises(FileFormatError, match='99, this program reads'):
+        stored_map.load(container.write(tmp_path / 'newer.rlml', newer))
+    for name, bad in (
+        ('edge_nodes', content.arrays['edge_nodes'] + 1000),
+        ('key_points', content.arrays['key_points'][:-1]),
+        ('pose', np.full_like(content.arrays['pose'], np.nan)),
+    ):
+        broken = Content({**content.arrays, name: bad}, content.description)
+        with pytest.raises(FileFormatError, match='do not fit together'):
+            stored_map.restore(broken, BackEnd(PARAMS))
+    without = {k: v for k, v in content.arrays.items() if k != 'submap_cells'}
+    with pytest.raises(FileFormatError, match='submap_cells'):
+        stored_map.restore(Content(without, content.description), BackEnd(PARAMS))
+
+
+def test_export_is_what_the_map_says(mapped, saved, tmp_path):
+    content = stored_map.load(saved)
+    (tmp_path / 'out').mkdir()
+    names = map_export.export(content, tmp_path / 'out')
+    assert sorted(p.name for p in (tmp_path / 'out').iterdir()) == sorted(names)
+    figures = map_info.contents(content)
+    assert figures['keyframes'] == len(mapped.back_end.keyframes)
+    assert figures['reflectors'] == len(ROOM.reflectors)
+    rows = (tmp_path / 'out' / 'trajectory.tum').read_text().splitlines()
+    assert len([r for r in rows if not r.startswith('#')]) == len(mapped.trajectory()[0])
+    graph = (tmp_path / 'out' / 'graph.g2o').read_text()
+    assert graph.count('VERTEX_SE2 ') == figures['keyframes']
