@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.special import gammaincinv
 
-from rlml_slam import se2
 from rlml_slam.matching import verdicts
 from rlml_slam.matching.innovations import joint_distance2, pairwise
 from rlml_slam.params import Reflector
@@ -53,20 +52,6 @@ class Association:
     match: NDArray[np.int64]
     status: NDArray[np.int64]
     distance2: Array
-
-
-def predict(pose: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Expected detections z = R(theta)^T (m - p) of eq. 1 and their Jacobians.
-
-    Returns z (m, 2), dz/dpose (m, 2, 3) and dz/dm (2, 2), which is the same for all.
-    """
-    Rt = se2.rotation(pose[2]).T
-    z = (points - pose[:2]) @ Rt.T
-    J = np.empty((len(points), 2, 3))
-    J[:, :, :2] = -Rt
-    J[:, 0, 2] = z[:, 1]
-    J[:, 1, 2] = -z[:, 0]
-    return z, J, Rt
 
 
 def gate(probability: float, dof: int = 2) -> float:

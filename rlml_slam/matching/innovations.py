@@ -12,7 +12,7 @@ from rlml_slam.compiled import kernel, part
 from rlml_slam.se2 import Array
 
 
-@part
+@kernel
 def expected(pose: Array, x: float, y: float, z: Array, J: Array) -> None:
     """R(theta)^T (m - p) of a reflector m = (x, y) into z (2,), and its Jacobian into J (2, 5).
 
@@ -143,6 +143,7 @@ def backward(L: Array, v: Array) -> None:
 def warm_up() -> None:
     """Compile the kernels with the signatures that are used at run time."""
     pose, points, one = np.zeros(3), np.ones((1, 2)), np.zeros(1, dtype=np.int64)
+    expected(pose, 1.0, 1.0, np.empty(2), np.empty((2, 5)))
     noise = np.eye(2)[None]
     nu, _, _ = pairwise(pose, points, np.eye(5), np.zeros(1), points, noise)
     joint_distance2(pose, points, np.eye(5), nu, noise, one, one)

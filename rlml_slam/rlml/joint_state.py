@@ -175,12 +175,6 @@ class JointState:
         self.x = self.x[rows]
         self.P = np.ascontiguousarray(self.P[np.ix_(rows, rows)])
 
-    def active(self, landmarks: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Columns of pose, anchor 0 and the given reflectors: all that a measurement can touch."""
-        first = np.array([0, 1, 2, *range(ANCHORS[0], ANCHORS[0] + 3)], dtype=np.int64)
-        base = LANDMARKS + 2 * landmarks
-        return np.concatenate([first, np.stack([base, base + 1], axis=-1).ravel()])
-
     def apply(self, columns: NDArray[np.int64], H: Array, R: Array, v: Array) -> None:
         """Kalman update of everything: v = H dx[columns] + noise of covariance R."""
         update(self.x, self.P, columns, H, R, v)

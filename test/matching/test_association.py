@@ -7,7 +7,8 @@ from differences import central_differences
 from scipy.stats import chi2
 
 from rlml_slam import se2
-from rlml_slam.matching.association import Associator, Believed, gate, predict
+from rlml_slam.matching.association import Associator, Believed, gate
+from rlml_slam.matching.innovations import expected, joint_distance2, pairwise
 from rlml_slam.params import Reflector
 from rlml_slam.types import ANONYMOUS, Detections, Status
 
@@ -56,13 +57,54 @@ def dense(b, d, i, j):
 @pytest.mark.parametrize('theta', [0.0, 0.7, 3.1, -3.14159])
 def test_prediction_and_jacobians_are_those_of_equation_1(theta):
     pose = np.array([0.3, -1.2, theta])
-    z, J, Rt = predict(pose, POINTS)
-    np.testing.assert_allclose(z, se2.transform(se2.inverse(pose), POINTS), atol=1e-14)
-    for k in range(len(POINTS)):
-        J_pose = central_differences(lambda x, k=k: predict(x, POINTS[k][None])[0][0], pose)
-        J_point = central_differences(lambda m: predict(pose, m[None])[0][0], POINTS[k])
-        np.testing.assert_allclose(J[k], J_pose, atol=1e-8)
-        np.testing.assert_allclose(Rt, J_point, atol=1e-8)
+    z, J = np.empty(2), np.empty((2, 5))
+    for point in POINTS:
+        expected(pose, *point, z, J)
+        np.testing.assert_allclose(z, seen_from(np.concatenate([pose, point])), atol=1e-14)
+        by_differences = central_differences(seen_from, np.concatenate([pose, point]))
+        np.testing.assert_allclose(J, by_differences, atol=1e-8)
+
+
+def seen_from(x):
+    """The reflector x[3:] as seen from the pose x[:3]."""
+    return se2.transform(se2.inverse(x[:3]), x[3:][None])[0]
+
+
+def correlated(b):
+    """The same with correlations among all of it."""
+    rng = np.random.default_rng(3)
+    half = 0.02 * rng.normal(size=b.cov.shape)
+    return replace(b, cov=b.cov + half @ half.T)
+
+
+def test_pairs_are_judged_by_the_whole_joint_covariance():
+    b = correlated(believed())
+    d = seen(b, shift=(0.03, -0.02))
+    spread2 = np.array([0.0, 0.01, 0.0, 0.02])
+    nu, d2, log_det = pairwise(b.pose, b.points, b.cov, spread2, d.points, d.cov)
+    for i in range(len(d)):
+        for j in range(len(b.points)):
+            by_hand, S = dense(b, d, i, j)
+            S = S + spread2[j] * np.eye(2)
+            np.testing.assert_allclose(nu[i, j], by_hand, atol=1e-12)
+            assert d2[i, j] == pytest.approx(by_hand @ np.linalg.solve(S, by_hand), rel=1e-6)
+            assert log_det[i, j] == pytest.approx(np.linalg.slogdet(S)[1], abs=1e-6)
+
+
+def test_joint_distance_is_that_of_all_innovations_at_once():
+    b = correlated(believed())
+    d = seen(b, shift=(0.03, -0.02))
+    nu, _, _ = pairwise(b.pose, b.points, b.cov, np.zeros(4), d.points, d.cov)
+    rows, cols = np.array([0, 2, 3]), np.array([0, 2, 3])
+
+    def h(x):
+        return se2.transform(se2.inverse(x[:3]), x[3:].reshape(-1, 2)[cols]).ravel()
+
+    x = np.concatenate([b.pose, b.points.ravel()])
+    H, v = central_differences(h, x), d.points[rows].ravel() - h(x)
+    S = H @ b.cov @ H.T + 0.02**2 * np.eye(6)
+    joint = joint_distance2(b.pose, b.points, b.cov, nu, d.cov, rows, cols)
+    assert joint == pytest.approx(v @ np.linalg.solve(S, v), rel=1e-6)
 
 
 def test_gate_holds_its_share_of_the_true_matches():

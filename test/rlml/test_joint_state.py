@@ -4,7 +4,7 @@ import pytest
 from differences import central_differences
 
 from rlml_slam import se2
-from rlml_slam.matching.association import predict
+from rlml_slam.matching.innovations import expected
 from rlml_slam.rlml.joint_state import ANCHORS, BIAS, LANDMARKS, JointState
 from rlml_slam.types import Motion
 
@@ -56,12 +56,13 @@ def test_update_is_that_of_a_dense_ekf():
     v = np.array([0.01, -0.02, 0.005, 0.01])
 
     def h(y):
-        return predict(y[:3], y[LANDMARKS:].reshape(-1, 2)[index])[0].ravel()
+        points = y[LANDMARKS:].reshape(-1, 2)[index]
+        return se2.transform(se2.inverse(y[:3]), points).ravel()
 
     H = central_differences(h, x)
     K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
     keep = np.eye(len(x)) - K @ H
-    columns = state.active(index)
+    columns = np.flatnonzero(H.any(axis=0))
     state.apply(columns, H[:, columns], R, v)
     expected = x + K @ v
     expected[2] = se2.wrap(expected[2])
@@ -163,9 +164,9 @@ def test_marginalisation_is_exact():
     # and what is measured of the others afterwards gives the same with it and without
     R, v = 1e-4 * np.eye(2), np.array([0.01, 0.02])
     for state, k in ((a, 2), (b, 1)):
-        columns = state.active(np.array([k]))
-        _, J, Rt = predict(state.pose, state.landmarks()[k][None])
-        H = np.hstack([J[0], np.zeros((2, 3)), Rt])
+        columns = np.r_[0:3, LANDMARKS + 2 * k, LANDMARKS + 2 * k + 1]
+        H = np.empty((2, 5))
+        expected(state.pose, *state.landmarks()[k], np.empty(2), H)
         state.apply(columns, H, R, v)
     np.testing.assert_allclose(b.x, a.x[rows], atol=1e-12)
     np.testing.assert_allclose(b.P, a.P[np.ix_(rows, rows)], atol=1e-12)

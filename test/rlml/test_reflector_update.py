@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The update with reflectors is the optimum of eq. 3, as an independent solver finds it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from differences import central_differences
+from scipy.optimize import least_squares
+
+from rlml_slam import se2
+from rlml_slam.rlml.joint_state import LANDMARKS, JointState
+from rlml_slam.rlml.reflector_update import use_reflectors
+
+INDEX = np.array([2, 0, 3])
+
+
+def made(sigma: float) -> JointState:
+    """Four reflectors around a pose that is uncertain by ``sigma``, correlated with all."""
+    rng = np.random.default_rng(4)
+    state = JointState(np.array([0.3, -0.5, 2.9]), sigma**2 * np.eye(3), 0.01)
+    for slot in range(2):
+        state.clone_pose(slot, 0.5, 1e-6 * np.eye(3))
+    for z in 5.0 * rng.normal(size=(4, 2)):
+        state.add_landmark(z, 0.03**2 * np.eye(2))
+    state.widen((0.3 * sigma) ** 2 * np.eye(3))
+    return state
+
+
+@pytest.mark.parametrize('sigma', [0.002, 0.02])
+def test_update_is_the_optimum_over_prior_and_reflectors(sigma):
+    state = made(sigma)
+    x0, P0 = state.x.copy(), state.P.copy()
+    noise = np.array([[[4e-4, 1e-4], [1e-4, 9e-4]]] * 3)
+    z = seen(x0 + np.r_[0.5 * sigma, -0.4 * sigma, 0.6 * sigma, np.zeros(len(x0) - 3)])
+    z += 0.01 * np.random.default_rng(5).normal(size=z.shape)
+
+    root = np.linalg.cholesky(np.linalg.inv(P0)).T
+    white = np.linalg.cholesky(np.linalg.inv(noise)).transpose(0, 2, 1)
+
+    def residual(x):
+        innovation = (white @ (z - seen(x))[:, :, None]).ravel()
+        return np.concatenate([root @ (x - x0), innovation])
+
+    best = least_squares(residual, x0, xtol=1e-14, ftol=1e-14, gtol=1e-14, x_scale='jac').x
+    use_reflectors(state.x, state.P, INDEX, z, noise)
+    np.testing.assert_allclose(state.x, best, atol=5e-3 * sigma)
+    J = central_differences(residual, state.x)
+    np.testing.assert_allclose(state.P, np.linalg.inv(J.T @ J), atol=0.01 * sigma**2)
+    np.testing.assert_array_equal(state.P, state.P.T)
+
+
+def seen(x):
+    """Reflectors INDEX of a state as its pose sees them (3, 2)."""
+    return se2.transform(se2.inverse(x[:3]), x[LANDMARKS:].reshape(-1, 2)[INDEX])
