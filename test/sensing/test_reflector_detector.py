@@ -431,6 +431,13 @@ def test_recorded_bearings_are_those_of_the_author_or_of_the_ranges(recorded):
     found = detect(recorded[0], Detector(diameter=0.06))
     off = np.degrees(se2.wrap(np.arctan2(*found.points.T[::-1]) - np.arctan2(*listed().T[::-1])))
     assert (np.abs(off[:7]) < 0.1).all()
+    bright = np.mean([s.intensities for s in recorded], axis=0)
+    for beam, bearing in zip(found.beams, np.arctan2(*listed().T[::-1]), strict=True):
+        spot = int(beam) + np.arange(-40, 41)
+        brightest = (
+            recorded[0].angle_min + recorded[0].angle_increment * spot[bright[spot].argmax()]
+        )
+        assert math.degrees(brightest - bearing) == pytest.approx(0.0, abs=0.01)
     ranges = np.mean([s.ranges for s in recorded], axis=0).astype(np.float64)
     scan, centre, radius = recorded[0], found.points[7], 0.03
     half = 0.8 * radius / (np.hypot(*centre) * scan.angle_increment)
