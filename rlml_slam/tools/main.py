@@ -52,6 +52,9 @@ COMMANDS: Table = {
         'saved maps',
         {
             'info': Command('map_info', 'check a saved map and say what is in it'),
+            'survey': Command(
+                'map_survey', 'reflectors of a saved map against where they were surveyed'
+            ),
             'export': Command('map_export', 'a saved map as text: CSV, g2o, TUM, PGM and YAML'),
         },
     ),

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Surveyed reflectors: where somebody measured them to be, in the frame of the plant.
+
+By the suffix of the file's name:
+
+    .csv    a header with ``x`` and ``y`` [m], and if need be ``id`` and ``diameter`` [m]
+    .json   a list of objects with the same names
+    .imk    layout of a SICK NAV scanner: ``globID x y type subtype size layer…`` [mm] per line
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam.errors import FileFormatError, MapError
+from rlml_slam.se2 import Array
+from rlml_slam.types import ANONYMOUS
+
+MM = 1e-3
+IMK_FIELDS = 6  # before the layers
+
+
+class Survey(NamedTuple):
+    """``ids`` (n,), ANONYMOUS where not told, ``points`` (n, 2) and ``diameters`` (n,) or NaN."""
+
+    ids: NDArray[np.int64]
+    points: Array
+    diameters: Array
+
+
+def load(path: str | Path) -> Survey:
+    """Read a survey. Raises MapError if there is none, FileFormatError saying what is wrong."""
+    path = Path(path)
+    try:
+        text = path.read_text(encoding='utf-8')
+    except OSError as e:
+        raise MapError(f'{path}: cannot be read: {e.strerror}') from e
+    except UnicodeDecodeError as e:
+        raise FileFormatError(f'{path}: not text') from e
+    readers = {'.csv': _csv, '.json': _json, '.imk': _imk}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise FileFormatError(f'{path}: a survey is one of {", ".join(readers)}')
+    rows = []
+    try:
+        for where, row in reader(text):
+            rows.append(_checked(where, row))
+    except (ValueError, TypeError, KeyError) as e:
+        raise FileFormatError(f'{path}: {e}') from e
+    if not rows:
+        raise FileFormatError(f'{path}: no reflector in it')
+    values = np.array(rows)
+    ids = values[:, 0].astype(np.int64)
+    told = ids[ids != ANONYMOUS]
+    if len(np.unique(told)) != len(told):
+        raise FileFormatError(f'{path}: an id stands for two reflectors')
+    return Survey(ids, values[:, 1:3].copy(), values[:, 3].copy())
+
+
+def _checked(where: str, row: Mapping[str, Any]) -> tuple[float, float, float, float]:
+    """Id, x, y and diameter; ValueError says where one is wrong."""
+    try:
+        id_ = int(row['id']) if row.get('id') not in (None, '') else ANONYMOUS
+        x, y = float(row['x']), float(row['y'])
+        diameter = float(row['diameter']) if row.get('diameter') not in (None, '') else math.nan
+    except KeyError as e:
+        raise ValueError(f'{where}: {e.args[0]} is missing') from e
+    except (ValueError, TypeError) as e:
+        raise ValueError(f'{where}: {e}') from e
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise ValueError(f'{where}: the place is not finite')
+    return float(id_), x, y, diameter
+
+
+def _csv(text: str) -> Iterable[tuple[str, Mapping[str, Any]]]:
+    for number, row in enumerate(csv.DictReader(text.splitlines()), 2):
+        yield f'line {number}', row
+
+
+def _json(text: str) -> Iterable[tuple[str, Mapping[str, Any]]]:
+    for number, row in enumerate(json.loads(text), 1):
+        if not isinstance(row, dict):
+            raise ValueError(f'entry {number}: not an object')
+        yield f'entry {number}', row
+
+
+def _imk(text: str) -> Iterable[tuple[str, Mapping[str, Any]]]:
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split()
+        if not words or words[0].startswith(('#', 'globID')):
+            continue
+        if len(words) < IMK_FIELDS:
+            raise ValueError(f'line {number}: {len(words)} fields, {IMK_FIELDS} expected')
+        id_, x, y, _, _, size = words[:IMK_FIELDS]
+        yield f'line {number}', {
+            'id': id_, 'x': MM * float(x), 'y': MM * float(y), 'diameter': MM * float(size)
+        }  # fmt: skip

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+
+import numpy as np
+import pytest
+
+from rlml_slam import se2
+from rlml_slam.errors import FileFormatError, MapError
+from rlml_slam.maps import survey
+from rlml_slam.maps.survey import Survey
+from rlml_slam.tools import map_survey
+from rlml_slam.types import ANONYMOUS, Reflectors
+
+NAMES = ('id', 'x', 'y', 'diameter')
+ROWS = [(7, 1.5, -2.25, 0.08), (9, 10.0, 4.0, 0.05)]
+
+
+@pytest.mark.parametrize(
+    ('name', 'text'),
+    [
+        ('a.csv', 'id,x,y,diameter\n7,1.5,-2.25,0.08\n9,10,4,0.05\n'),
+        ('a.json', json.dumps([dict(zip(NAMES, r, strict=True)) for r in ROWS])),
+        ('a.imk', 'globID x/mm y/mm type subtype size/mm layer\n# none\n'
+         '7 1500 -2250 1 1 80 1\n9 10000 4000 1 1 50 1 2\n\n'),
+    ],
+)  # fmt: skip
+def test_three_formats_say_the_same(tmp_path, name, text):
+    path = tmp_path / name
+    path.write_text(text)
+    found = survey.load(path)
+    np.testing.assert_array_equal(found.ids, [7, 9])
+    np.testing.assert_allclose(found.points, [[1.5, -2.25], [10.0, 4.0]])
+    np.testing.assert_allclose(found.diameters, [0.08, 0.05])
+
+
+def test_id_and_diameter_may_be_missing(tmp_path):
+    (tmp_path / 'a.csv').write_text('x,y\n1,2\n')
+    found = survey.load(tmp_path / 'a.csv')
+    assert found.ids[0] == ANONYMOUS
+    assert np.isnan(found.diameters[0])
+
+
+@pytest.mark.parametrize(
+    ('name', 'text', 'why'),
+    [
+        ('a.csv', 'x,z\n1,2\n', 'line 2: y is missing'),
+        ('a.csv', 'x,y\n1,nan\n', 'line 2: the place is not finite'),
+        ('a.csv', 'x,y\n1,far\n', 'line 2: could not convert'),
+        ('a.csv', 'x,y\n', 'no reflector'),
+        ('a.csv', 'id,x,y\n3,1,2\n3,4,5\n', 'two reflectors'),
+        ('a.json', '[3]', 'entry 1: not an object'),
+        ('a.json', '[{', 'Expecting'),
+        ('a.imk', '7 1500 -2250\n', 'line 1: 3 fields'),
+        ('a.txt', '', 'one of .csv, .json, .imk'),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path, name, text, why):
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(FileFormatError, match=why):
+        survey.load(path)
+    with pytest.raises(MapError, match='cannot be read'):
+        survey.load(tmp_path / 'none.csv')
+
+
+def mapped(points, rng=None, sigma=0.01):
+    n = len(points)
+    noise = 0.0 if rng is None else sigma * rng.standard_normal((n, 2))
+    return Reflectors(
+        100 + np.arange(n), points + noise, np.tile(sigma**2 * np.eye(2), (n, 1, 1)),
+        np.full(n, ANONYMOUS), np.full(n, 5), np.full(n, np.nan),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope='module')
+def compared():
+    """Of 20 reflectors, 3 is missing, 5 was moved by 1.5 m, and one is new."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-20.0, -12.0), (20.0, 12.0), (20, 2))
+    true = np.array([12.0, -7.0, 2.1])
+    there = points.copy()
+    there[5] += [1.5, 0.0]
+    there = np.vstack([np.delete(there, 3, axis=0), [[30.0, 25.0]]])
+    seen = se2.transform(se2.inverse(true), there)
+    ids = np.arange(20)
+    figures = map_survey.compare(mapped(seen, rng), Survey(ids, points, np.full(20, np.nan)))
+    return true, figures
+
+
+def test_map_is_found_in_the_plant(compared):
+    true, figures = compared
+    # a centimetre of noise, 18 reflectors over 40 m
+    np.testing.assert_allclose(figures['T_plant_map'], true, atol=0.01)
+    assert figures['rmse_m'] == pytest.approx(0.014, abs=0.005)
+    assert [r['id'] for r in figures['residuals']] == [k for k in range(20) if k not in (3, 5)]
+
+
+def test_missing_new_and_moved_are_told_apart(compared):
+    _, figures = compared
+    assert [r['id'] for r in figures['missing']] == [3]
+    assert [r['id'] for r in figures['moved']] == [5]
+    assert figures['moved'][0]['by_m'] == pytest.approx(1.5, abs=0.05)
+    (new,) = figures['new']
+    np.testing.assert_allclose(new['at'], [30.0, 25.0], atol=0.05)
+    lines = map_survey.text(figures).splitlines()
+    assert sum(line.startswith(('missing: 3', 'moved: 5', 'new: ')) for line in lines) == 3
+
+
+def test_map_of_another_place_is_refused():
+    rng = np.random.default_rng(1)
+    a, b = rng.uniform(-15.0, 15.0, (2, 10, 2))
+    with pytest.raises(MapError, match='not found in the survey'):
+        map_survey.compare(mapped(a), Survey(np.arange(10), b, np.full(10, np.nan)))
