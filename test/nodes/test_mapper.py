@@ -15,6 +15,7 @@ from rlml_slam.errors import MapError
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved import SavedMap
 from rlml_slam.params import Parameters
+from rlml_slam.rlml import stored_map
 from rlml_slam.ros.associated import read_reflector_map
 from rlml_slam.ros.frames import Record
 from rlml_slam.ros.map_folder import MapFolder
@@ -203,6 +204,8 @@ def test_map_without_the_grid_that_cannot_be_drawn(make, ear, tmp_path):
     assert 'no grid: map of 9 x 9 cells' in mapper.save('map')
     saved = MapFolder(str(tmp_path)).load('map')  # nothing of the older one
     assert (len(saved.reflectors), saved.grid) == (5, None)
+    whole = stored_map.saved_map(stored_map.load(tmp_path / 'map.rlml'))
+    assert (len(whole.reflectors), whole.grid) == (5, None)
     assert [w for w in ear.warnings if 'no grid' in w] == ['no grid: map of 9 x 9 cells']
 
 
