@@ -116,6 +116,9 @@ class Node(Group):
     )
     use_odom: bool = param(True, 'use odometry; false runs on scans and reflectors alone')
     use_imu: bool = param(True, 'use the yaw rate of the IMU where there is one')
+    steady_stamps: bool = param(
+        True, 'take the jitter out of the stamps of sensors that measure at a steady rate'
+    )
     use_scan: bool = param(True, 'match scans against the submap')
     use_reflectors: bool = param(True, 'use reflector detections')
     mode: str = param(

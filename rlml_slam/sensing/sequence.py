@@ -3,7 +3,8 @@
 
 A scan waits for the odometry that covers its last ray, and for the detections of the same stamp
 where those have come so far; nothing waits longer than ``transform_timeout``. All of it is decided
-by stamps and order of arrival alone, never by a clock, so a replay repeats it exactly.
+by stamps and order of arrival alone, never by a clock, so a replay repeats it exactly. Stamps of
+steady sensors that jitter are made steady first.
 
 Several lidars are told apart by their frames. Each scan is an observation of its own; a scan waits
 for those of the others that are due before it, so that no lidar makes another one late.
@@ -12,7 +13,7 @@ for those of the others that are due before it, so that no lidar makes another o
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeAlias
@@ -25,14 +26,17 @@ from rlml_slam.motion import SECOND, STILL, MotionBuffer, compose_motion
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.deskew import project, sweep_time
+from rlml_slam.sensing.steady_clock import SteadyClock
 from rlml_slam.types import Detections, Imu, Motion, Observation, Odometry, Scan
 
 PAIRING = 2_000_000  # [ns] stamps of one instant: drivers round to milliseconds
 CARRY = 5 * SECOND  # motion older than this is summed up; an observation later than it is late
 MAX_SWEEP = 1.0  # [s] of one scan
 SIGMA = (1e-4, 10.0)  # [m] a detection that claims to be better or worse is believed this much
+INSTANTS = 20  # instants remembered: the other half of one comes soon after
 PERSISTENT = 10  # inputs in a row: fewer with a strange stamp are faults, more are a new clock
-Waiting: TypeAlias = tuple[int, str, Scan | Detections]
+# stamp, stream, what came, and how much later than its stamp it was measured [ns]
+Waiting: TypeAlias = tuple[int, str, Scan | Detections, int]
 
 
 @dataclass
@@ -75,6 +79,9 @@ class Sequencer:
         self._sensor_poses: dict[str, Array] = {self._node.base_frame: np.zeros(3)}
         self._default_frame: dict[str, str] = {}
         self._waiting: list[Waiting] = []
+        self._clocks: dict[tuple[str, str], SteadyClock] = {}
+        # stamps of scans and detections, and how much later they were measured
+        self._instants: deque[tuple[int, int]] = deque(maxlen=INSTANTS)
         self._newest: dict[str, int] = {}
         self._newest_of: dict[tuple[str, str], int] = {}
         self._lidars: dict[str, tuple[int, int]] = {}  # by frame: newest stamp and period
@@ -96,6 +103,7 @@ class Sequencer:
         """One wheel odometry sample."""
         if not self._node.use_odom:
             return []
+        sample = dataclasses.replace(sample, stamp=self._steady('odom', sample.stamp))
         valid = np.shape(sample.pose) == (3,) and bool(np.all(np.isfinite(sample.pose)))
         if self._accept('odom', sample.stamp, valid, 'pose is not finite'):
             self.buffer.add_odometry(sample)
@@ -107,6 +115,7 @@ class Sequencer:
         """One IMU sample."""
         if not self._node.use_imu:
             return []
+        sample = dataclasses.replace(sample, stamp=self._steady('imu', sample.stamp))
         if self._accept('imu', sample.stamp, np.isfinite(sample.yaw_rate), 'rate is not finite'):
             self.buffer.add_imu(sample)
             self.inputs.count('imu', 'used')
@@ -144,6 +153,24 @@ class Sequencer:
         ):
             self._wait(d.stamp, 'reflectors', d)
         return self._release()
+
+    def _steady(self, stream: str, stamp: int, source: str = '') -> int:
+        """The stamp less its jitter, where the stream is one of a steady sensor."""
+        if not self._node.steady_stamps or stamp <= 0:
+            return stamp
+        return self._clocks.setdefault((stream, source), SteadyClock()).steady(stamp)
+
+    def _measured_later(self, stream: str, item: Scan | Detections) -> int:
+        """How much later than its stamp a scan, or set of detections, was measured [ns].
+
+        The stamp names it from here to the map, and stays; both of one instant were measured then.
+        """
+        for stamp, later in self._instants:
+            if abs(stamp - item.stamp) <= PAIRING:
+                return later
+        later = self._steady(stream, item.stamp, item.frame_id) - item.stamp
+        self._instants.append((item.stamp, later))
+        return later
 
     def flush(self) -> list[Observation]:
         """Everything that still waits, at the end of the data."""
@@ -212,7 +239,7 @@ class Sequencer:
         return False
 
     def _wait(self, stamp: int, stream: str, item: Scan | Detections) -> None:
-        self._waiting.append((stamp, stream, item))
+        self._waiting.append((stamp, stream, item, self._measured_later(stream, item)))
         self._waiting.sort(key=lambda w: (w[0], w[1]))
 
     def _release(self, ready: Callable[[int, int], bool] | None = None) -> list[Observation]:
@@ -224,7 +251,7 @@ class Sequencer:
             for w in self._waiting:
                 if w[0] - stamp <= PAIRING and w[1] not in [g[1] for g in group]:
                     group.append(w)
-            end = max(self._end(w[2]) for w in group)
+            end = max(self._end(w[2], w[3]) for w in group)
             if ready is None and not self._is_ready(stamp, end, group):
                 break
             self._waiting = [w for w in self._waiting if not any(w is g for g in group)]
@@ -234,9 +261,9 @@ class Sequencer:
         return out
 
     @staticmethod
-    def _end(item: Scan | Detections) -> int:
+    def _end(item: Scan | Detections, later: int) -> int:
         sweep = sweep_time(item) if isinstance(item, Scan) else 0.0
-        return item.stamp + int(sweep * SECOND)
+        return item.stamp + max(later, 0) + int(sweep * SECOND)
 
     def _is_ready(self, stamp: int, end: int, group: list[Waiting]) -> bool:
         waited = self._newest_any - end
@@ -273,17 +300,19 @@ class Sequencer:
     def _observe(self, stamp: int, group: list[Waiting]) -> Observation:
         scan: Scan | None = None
         points = origin = detections = T = delta = None
-        for _, stream, item in group:
+        for _, stream, item, later in group:
             self.inputs.count(stream, 'used')
-            if isinstance(item, Scan):
-                if self._node.use_scan:
-                    scan = item
-            else:
-                detections = self._in_base(item)
-        if scan is not None:
-            T = self._sensor_pose(scan.frame_id)
-            duration = int(sweep_time(scan) * SECOND)
-            delta = self.buffer.motion(scan.stamp, scan.stamp + duration).delta
+            # from the base at the stamp to the base when it was measured
+            moved = self._moved(item.stamp, item.stamp + later)
+            at = se2.compose(moved, self._sensor_pose(item.frame_id))
+            if not isinstance(item, Scan):
+                detections = self._in_base(item, at)
+            elif self._node.use_scan:
+                scan, T = item, at
+                began = item.stamp + later
+                swept = self.buffer.motion(began, began + int(sweep_time(item) * SECOND)).delta
+                delta = se2.compose(se2.compose(moved, swept), se2.inverse(moved))
+        if scan is not None and T is not None and delta is not None:
             points = project(scan, T, delta, self._p.submap.max_laser_range)
             origin = T[:2].copy()
             if not len(points):
@@ -320,9 +349,14 @@ class Sequencer:
             return motion
         return dataclasses.replace(motion, delta=se2.between(used, motion.delta))
 
-    def _in_base(self, d: Detections) -> Detections:
-        """Detections moved from their sensor's frame to the base frame, far ones left out."""
-        T = self._sensor_pose(d.frame_id)
+    def _moved(self, start: int, end: int) -> Array:
+        """Motion (3,) of base from one stamp to another, or back."""
+        if end >= start:
+            return self.buffer.motion(start, end).delta
+        return se2.inverse(self.buffer.motion(end, start).delta)
+
+    def _in_base(self, d: Detections, T: Array) -> Detections:
+        """Detections moved from a sensor at ``T`` (3,) to the base frame, far ones left out."""
         R = se2.rotation(T[2])
         near = np.hypot(d.points[:, 0], d.points[:, 1]) <= self._p.reflector.max_range
         if not near.all():
