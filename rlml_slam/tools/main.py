@@ -102,6 +102,7 @@ COMMANDS: Table = {
             'back-end': Command('bench_back_end', 'the graph solver against other libraries'),
             'front-end': Command('bench_front_end', 'CPU time per scan against a scan matcher'),
             'incremental': Command('bench_incremental', 'the incremental solver against iSAM2'),
+            'marginals': Command('bench_marginals', 'covariances against GTSAM'),
             'robust': Command('bench_robust', 'wrong closures in graphs, against GTSAM'),
             'live': Command('bench_live', 'whether the live nodes keep up with a fast laser'),
         },

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``rlml bench marginals``: covariances of all poses and landmarks against gtsam.Marginals.
+
+The libraries define a residual differently in second order, so that their information matrices
+agree only where residuals are zero: every measurement is replaced by what the solved graph
+predicts. What is fixed gets a prior in both. Times are CPU times of the process from a solved
+graph to all blocks, interleaved; the blocks are compared in the axes of the map.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam import se2
+from rlml_slam.errors import RlmlError
+from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.marginals import Marginals, warm_up
+from rlml_slam.graph.solver import optimize
+from rlml_slam.se2 import Array
+from rlml_slam.tools.bench_back_end import read_graphs
+from rlml_slam.tools.bench_graphs import city, warehouse
+from rlml_slam.tools.bench_rivals import bearing_range, timed
+from rlml_slam.types import EdgeKind
+
+# information of the prior that stands for a fixed pose: about that of a laser's measurement, so
+# that no digits are lost to a much stiffer matrix
+TIE = np.diag([1e4, 1e4, 1e5])
+
+
+def add_parser(subparsers: Any) -> None:
+    """Declare ``rlml bench marginals``."""
+    parser = subparsers.add_parser(
+        'marginals',
+        help='covariances against GTSAM',
+        description="Compares with gtsam.Marginals (pip install '.[bench]').",
+    )
+    parser.add_argument('graphs', nargs='*', type=Path, help='g2o/TORO files or folders of them')
+    parser.add_argument('--generated', action='store_true', help='also generated graphs')
+    parser.add_argument('--runs', type=int, default=5, help='interleaved runs (default 5)')
+    parser.add_argument('--json', action='store_true', help='one JSON object on stdout')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure and print."""
+    for name in ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS'):
+        os.environ.setdefault(name, '1')
+    if args.runs < 1:
+        raise RlmlError(f'--runs {args.runs} is not at least 1')
+    warm_up()
+    results = []
+    if not args.json:
+        print(
+            f'{"graph":30} {"poses":>6} {"marks":>6} {"rlml ms":>8} {"gtsam ms":>9} ratio  differ'
+        )
+    for name, source in _graphs(args.graphs, args.generated):
+        result = {'graph': name, **compare(source, args.runs)}
+        results.append(result)
+        if not args.json:
+            print(
+                f'{name:30} {result["poses"]:6d} {result["landmarks"]:6d} '
+                f'{result["rlml_ms"]:8.2f} {result["gtsam_ms"]:9.1f} '
+                f'{result["ratio"]:5.3f} {result["difference"]:.1e}'
+            )
+    if args.json:
+        print(json.dumps({'results': results}))
+    return 0
+
+
+def _graphs(paths: list[Path], generated: bool) -> Iterator[tuple[str, Graph]]:
+    yield from read_graphs(paths)
+    if generated:
+        yield 'city 1000', city(1000)
+        yield 'warehouse 1000', warehouse(1000, 150)
+
+
+def compare(source: Graph, runs: int = 1) -> dict[str, Any]:
+    """Sizes, times, their ratio, and the largest relative difference of a block.
+
+    The difference of two covariances is in the Frobenius norm, relative to that of the peer's.
+    """
+    graph = without_residuals(source)
+    ours, theirs = [], []
+    for _ in range(runs):
+        ms, blocks = timed(lambda: _ours(graph))
+        ours.append(ms)
+        ms, peer = _gtsam(graph)
+        theirs.append(ms)
+    worst = max(
+        float((np.linalg.norm(a - b, axis=(1, 2)) / np.linalg.norm(b, axis=(1, 2))).max())
+        for a, b in zip(blocks, peer, strict=True)
+        if len(b)
+    )
+    return {
+        'poses': len(graph.poses), 'landmarks': len(graph.landmarks), 'rlml_ms': median(ours),
+        'gtsam_ms': median(theirs), 'ratio': median(ours) / median(theirs), 'difference': worst,
+    }  # fmt: skip
+
+
+def without_residuals(source: Graph) -> Graph:
+    """The solved graph with measurements as it predicts them, and priors on what is fixed.
+
+    Raises RlmlError if a pose has no factors, for which there is nothing to compare.
+    """
+    optimize(source)
+    graph, e, s = Graph(), source.edges, source.sightings
+    touched = np.concatenate([e.nodes.ravel(), s.nodes[:, 0]])
+    if len(np.setdiff1d(np.arange(len(source.poses)), touched)):
+        raise RlmlError('a pose without factors has no covariance to compare')
+    graph.add_poses(source.poses)
+    graph.add_landmarks(source.landmarks)
+    for i in np.flatnonzero(source.fixed_poses):
+        graph.add_pose_prior(int(i), source.poses[i], TIE)
+    i, j = e.nodes.T
+    delta = se2.between(graph.poses[i], graph.poses[j])
+    graph.add_edges(EdgeKind.ODOMETRY, e.nodes, delta, e.information)
+    if len(s):
+        i, k = s.nodes.T
+        z = se2.transform(se2.inverse(graph.poses[i]), graph.landmarks[k][:, None])[:, 0]
+        graph.add_sightings(s.nodes, z, s.information)
+    return graph
+
+
+def _ours(graph: Graph) -> tuple[Array, Array]:
+    """Covariances of all poses and of the landmarks that are seen."""
+    marginals = Marginals(graph)
+    return marginals.poses(np.arange(len(graph.poses))), marginals.landmarks(_seen(graph))
+
+
+def _seen(graph: Graph) -> NDArray[np.int64]:
+    return np.unique(graph.sightings.nodes[:, 1])
+
+
+def _gtsam(graph: Graph) -> tuple[float, tuple[Array, Array]]:
+    """(CPU time [ms], the same from GTSAM), whose poses have their own axes."""
+    import gtsam
+
+    n = len(graph.poses)
+    values, fg = gtsam.Values(), gtsam.NonlinearFactorGraph()
+    for i, pose in enumerate(graph.poses):
+        values.insert(i, gtsam.Pose2(*pose))
+    for k, point in enumerate(graph.landmarks):
+        values.insert(n + k, point)
+    information = gtsam.noiseModel.Gaussian.Information
+    e, s, p = graph.edges, graph.sightings, graph.pose_priors
+    for (i, j), z, info in zip(e.nodes, e.measured, e.information, strict=True):
+        edge = gtsam.BetweenFactorPose2(int(i), int(j), gtsam.Pose2(*z), information(info))
+        fg.add(edge)
+    for (i, k), z, info in zip(s.nodes, s.measured, s.information, strict=True):
+        fg.add(bearing_range(int(i), int(n + k), z, info))
+    for (i,), z, info in zip(p.nodes, p.measured, p.information, strict=True):
+        fg.add(gtsam.PriorFactorPose2(int(i), gtsam.Pose2(*z), information(info)))
+
+    def blocks() -> list[Any]:
+        marginals = gtsam.Marginals(fg, values)
+        return [marginals.marginalCovariance(k) for k in [*range(n), *(n + _seen(graph))]]
+
+    ms, found = timed(blocks)
+    turn = np.zeros((n, 3, 3))
+    turn[:, :2, :2] = se2.rotation(graph.poses[:, 2])
+    turn[:, 2, 2] = 1.0
+    poses = turn @ np.array(found[:n]) @ np.swapaxes(turn, 1, 2)
+    return ms, (poses, np.array(found[n:]).reshape(-1, 2, 2))
