@@ -31,6 +31,7 @@ from rlml_slam.rlml.scan_update import fuse, prior_of
 from rlml_slam.rlml.second_look import second_look
 from rlml_slam.rlml.submaps import Submaps
 from rlml_slam.rlml.tracks import Tracks
+from rlml_slam.rlml.unseen import expected
 from rlml_slam.se2 import Array
 from rlml_slam.types import (
     ANONYMOUS,
@@ -77,6 +78,7 @@ class FrontEnd:
         self._map: SavedMap | None = None
         self._unconfirmed = False
         self._last_fit = 0
+        self._reach = 0.0
         self._last_stamp: int | None = None
 
     def use_map(self, reflectors: Reflectors, grid: OccupancyGrid | None = None) -> None:
@@ -423,6 +425,8 @@ class FrontEnd:
 
     def _judge(self, observation: Observation, matched: _Matched, evidence: Evidence) -> Health:
         unconfirmed = self._is_unconfirmed(matched)
+        due = self._due(observation, matched)
+        used = matched.keys[matched.status == Status.USED]
         return self.health.judge(
             observation.stamp,
             evidence,
@@ -432,7 +436,24 @@ class FrontEnd:
             cov=self.in_map(self.state.pose, self.state.pose_cov)[1],
             unconfirmed=unconfirmed,
             contradicted=self._lasts(observation.stamp) and not unconfirmed,
+            expected=int(due.sum()),
+            seen=int(np.isin(self.tracks.keys[due], used).sum()),
         )
+
+    def _due(self, observation: Observation, matched: _Matched) -> NDArray[np.bool_]:
+        """Which reflectors (m,) should have been detected; none where no one looked for them."""
+        d, m = observation.detections, len(self.tracks)
+        if d is None or observation.points is None or observation.origin is None:
+            return np.zeros(m, dtype=np.bool_)
+        used = d.points[matched.status == Status.USED]
+        if len(used):
+            self._reach = max(self._reach, float(np.hypot(used[:, 0], used[:, 1]).max()))
+        due: NDArray[np.bool_] = self.tracks.confirmed(self._p.reflector.min_sightings)
+        due &= expected(
+            self.state.pose, self.state.landmarks(), observation.points, observation.origin,
+            self._reach,
+        )  # fmt: skip
+        return due
 
     def _is_unconfirmed(self, matched: _Matched) -> bool:
         """Whether the pose in a given map is still the one that was told or assumed.

@@ -10,6 +10,8 @@ from rlml_slam.params import HealthLimits
 from rlml_slam.se2 import Array
 from rlml_slam.types import Health, Level
 
+FEW = 3  # expected reflectors below this may be missed by chance, or stand behind glass
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -39,6 +41,7 @@ class HealthMonitor:
         self._odometry_seen = -(2**62)
         self._reflectors_matched = -(2**62)
         self._scan_fits = -(2**62)
+        self._reflectors_there = -(2**62)
         self._first: int | None = None
 
     def judge(
@@ -51,11 +54,14 @@ class HealthMonitor:
         cov: Array,
         unconfirmed: bool = False,
         contradicted: bool = False,
+        expected: int = 0,
+        seen: int = 0,
     ) -> Health:
         """Health at ``stamp`` [ns]; ``detections`` is None where none were looked for.
 
         ``unconfirmed``: the pose in a given map is one that nothing measured agrees with so far;
-        ``contradicted``: all that was seen for a while contradicts the map.
+        ``contradicted``: all that was seen for a while contradicts the map; ``seen``: so many of
+        the ``expected`` reflectors of the map were.
         """
         reasons: list[str] = []
         if unconfirmed:
@@ -83,6 +89,10 @@ class HealthMonitor:
         unmatched = failing(self._reflectors_matched)
         if unmatched:
             reasons.append(f'none of {detections} detected reflectors matches the map')
+        if expected < FEW or 2 * seen > expected:
+            self._reflectors_there = stamp
+        if failing(self._reflectors_there):
+            reasons.append(f'saw {seen} of {expected} expected reflectors')
         if evidence.used or not evidence.scan:
             self._scan_fits = stamp
         misfit = failing(self._scan_fits)
