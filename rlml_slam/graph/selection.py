@@ -52,32 +52,36 @@ class Selection:
     solves: int
 
 
-def select_closures(graph: Graph, parameters: params.Solver | None = None) -> Selection:
+def select_closures(
+    graph: Graph, parameters: params.Solver | None = None, barred: Ints | None = None
+) -> Selection:
     """Enable the closures to believe and disable all others; the estimate is the optimum then.
 
-    All other factors are trusted. Raises SolverError like ``optimize``.
+    The edges ``barred`` stay out in any case. All other factors are trusted. Raises
+    SolverError like ``optimize``.
     """
     losses = graph.losses
     graph.losses = replace(losses, closure=Loss())
     try:
-        return _Selector(graph, parameters or params.Solver()).run()
+        return _Selector(graph, parameters or params.Solver(), barred).run()
     finally:
         graph.losses = losses
 
 
 class _Selector:
-    def __init__(self, graph: Graph, parameters: params.Solver) -> None:
+    def __init__(self, graph: Graph, parameters: params.Solver, barred: Ints | None) -> None:
         e = graph.edges
         self._graph, self._parameters = graph, parameters
         is_closure = e.kinds == FactorKind.CLOSURE
         self._edges = np.flatnonzero(is_closure)
+        may = np.isin(self._edges, [] if barred is None else barred, invert=True)
         self._nodes, self._z = e.nodes[self._edges], e.measured[self._edges]
         self._cov = np.asarray(np.linalg.inv(e.information[self._edges]), dtype=np.float64)
         trusted = np.flatnonzero(e.enabled & ~is_closure)
         backbone = Backbone(graph, trusted)
         area = _extent2(backbone.poses)
         self._groups = group(backbone, self._nodes, self._z, self._cov, area)
-        self._held = _bridges(backbone, self._nodes, self._groups)
+        self._held = _bridges(backbone, self._nodes, self._groups, may)
         if self._held.any():
             held = self._edges[self._held]
             backbone = Backbone(graph, np.concatenate([trusted, held]))
@@ -86,7 +90,7 @@ class _Selector:
         free = ~graph.fixed_poses
         graph.poses[free] = backbone.poses[free]
         self._accepted = self._held.copy()
-        self._left = np.where(self._held, 0, TRIES)
+        self._left = np.where(may & ~self._held, TRIES, 0)
         self._evidence = np.where(self._held, np.inf, -np.inf)
         self._backbone = backbone
         self._solves = 0
@@ -101,7 +105,7 @@ class _Selector:
             if new.any():
                 self._take(new)
                 self._judge()
-                sunk = 0.0
+                sunk = max(sunk - STEP, 0.0)
             elif sunk >= self._lowest():
                 break
             else:
@@ -209,14 +213,14 @@ def _difference_covs(marginals: Marginals, i: Ints, j: Ints, J_i: Array, J_j: Ar
     return out + _carried(J_i, marginals.poses(i)) + _carried(J_j, marginals.poses(j))
 
 
-def _bridges(backbone: Backbone, nodes: Ints, groups: Groups) -> Flags:
+def _bridges(backbone: Backbone, nodes: Ints, groups: Groups, may: Flags) -> Flags:
     """Closures that hold pieces of the backbone together: from the largest groups, no loops."""
     held = np.zeros(len(nodes), dtype=np.bool_)
     if backbone.pieces == 1:
         return held
     a, b = np.sort(backbone.piece[nodes], axis=1).T
     order = np.lexsort((-groups.size[groups.label], b, a))
-    order = order[a[order] != b[order]]
+    order = order[(a[order] != b[order]) & may[order]]
     pairs, first = np.unique(np.stack([a[order], b[order]], -1), axis=0, return_index=True)
     chosen = order[first]
     cost = 1.0 / groups.size[groups.label[chosen]]

@@ -13,6 +13,7 @@ from sensor_msgs.msg import PointCloud2
 
 from rlml_slam import warm_up
 from rlml_slam.params import Parameters
+from rlml_slam.rlml.closure_table import fates
 from rlml_slam.ros import convert
 from rlml_slam.ros.associated import read_associated
 from rlml_slam.ros.declare import declare
@@ -76,6 +77,7 @@ class BackEndNode(Node):
             'edges': len(graph.edges),
             'closures accepted': tried[True],
             'closures rejected': tried[False],
+            **fates(self.mapper.back_end.scans.closures),
             'frames waiting for the worker': self.mapper.worker.backlog,
             'frames without their points or detections': self.join.incomplete,
         }

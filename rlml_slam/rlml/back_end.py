@@ -20,6 +20,7 @@ from rlml_slam.graph.robust import Loss, Losses, LossKind
 from rlml_slam.graph.solver import optimize
 from rlml_slam.maps.occupancy import OccupancyGrid, render
 from rlml_slam.params import Parameters
+from rlml_slam.rlml.closure_watch import ClosureWatch
 from rlml_slam.rlml.correction import Correction, Known, either
 from rlml_slam.rlml.deferred import DeferredMatches
 from rlml_slam.rlml.keyframes import Interval, Keyframe
@@ -36,6 +37,8 @@ class Update:
     """What one keyframe did; ``T_map_local`` (3,) corrects the front end where ``optimized``.
 
     ``known``: how well the keyframe's pose is known with it, None where no one asked the graph.
+    ``closures`` were tried with it; ``changed`` are those, of any time, that it had disabled or
+    enabled again.
     """
 
     keyframe: int
@@ -44,6 +47,7 @@ class Update:
     closures: tuple[Closure, ...]
     wall_ms: float
     known: Known | None = None
+    changed: tuple[Closure, ...] = ()
 
 
 class BackEnd:
@@ -70,6 +74,8 @@ class BackEnd:
         self.deferred = DeferredMatches(p.reflector, self.reflector_graph)
         self.sparsifier = Sparsifier(p, self.graph, self.scans, self.reflector_graph)
         self.path = Path(p.back_end.path_frames)
+        self.closure_watch = ClosureWatch(p, self.graph)
+        self._changed: tuple[Closure, ...] = ()  # since the newest keyframe began
         self.T_map_local = np.zeros(3)
         self.known: Known | None = None
         self._optimized = False
@@ -108,7 +114,7 @@ class BackEnd:
         return moved and (frame.stamp - last.stamp) * 1e-9 >= p.minimum_time
 
     def _add_keyframe(self, frame: Frame, began: float) -> Update:
-        self._optimized = False
+        self._optimized, self._changed = False, ()
         key = self._node(frame)
         closures: tuple[Closure, ...] = ()
         if key.points is not None:
@@ -125,6 +131,7 @@ class BackEnd:
             closures,
             (time.perf_counter() - began) * 1e3,
             self.known,
+            self._changed,
         )
 
     def _node(self, frame: Frame) -> Keyframe:
@@ -195,13 +202,17 @@ class BackEnd:
         self.graph.losses = robust
         self.optimize()
 
-    def optimize(self) -> None:
-        """Solve eq. 13, merge reflectors that turned out to be one, correct the local frame."""
+    def optimize(self, final: bool = False) -> None:
+        """Solve eq. 13, merge reflectors that turned out to be one, correct the local frame.
+
+        Closures that turn out wrong are disabled; with ``final`` no doubt about them is put off.
+        """
         if len(self.keyframes) < 2:
             return
         optimize(self.graph, self._p.solver)
         if self.reflector_graph.merge(self.deferred.pending):
             optimize(self.graph, self._p.solver)
+        self._changed += self.closure_watch.review(self.scans.closures, final)
         self._optimized = True
         self._since_optimized = 0
         self.scans.changed = self.reflector_graph.changed = False
@@ -226,6 +237,12 @@ class BackEnd:
         _, cov_map = since.apply(last.T_local, last.cov_local)
         return Known(last.T_local, last.cov_local, cov_map)
 
+    def revoke(self, number: int) -> Closure:
+        """Take a loop closure out of the map for good; SolverError if there is no such one."""
+        closure = self.closure_watch.revoke(self.scans.closures, number)
+        self.optimize()
+        return closure
+
     def belief(self) -> Belief | None:
         """The newest keyframe and the reflectors, with joint covariance; None without any."""
         if not self.keyframes or not self.reflector_graph.found:
@@ -240,7 +257,7 @@ class BackEnd:
             self.scans.finish()
             if self.deferred.decide(final=True):
                 self._rejoin()
-            self.optimize()
+            self.optimize(final=True)
 
     def start_from(self, keys: list[Keyframe], arrays: Mapping[str, NDArray[Any]]) -> None:
         """Go on with a map whose graph is there already; the local frame is the map's from now on.

@@ -7,10 +7,12 @@ and by the lead over the second-best place; what fails is recorded, not used.
 
 from __future__ import annotations
 
-from collections import OrderedDict
+import math
+from collections import OrderedDict, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from enum import Enum
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +21,7 @@ from rlml_slam import se2
 from rlml_slam.graph.factors import relative_information
 from rlml_slam.graph.graph import Graph, Renumbering
 from rlml_slam.matching import observability, search, thinning
-from rlml_slam.matching.scan_match import match
+from rlml_slam.matching.scan_match import linearize, match
 from rlml_slam.matching.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.keyframes import Keyframe
@@ -31,7 +33,47 @@ TURN = np.array([0.0, 0.0, GRID_TURN])
 OPEN = 1e-2  # [1/m², 1/rad²] an edge knows its directions to 10 m and 10 rad at the worst
 COVERED = 0.8  # share of a submap's walls that a newer one must know to take its place
 RECORDS = 2000  # of closures, kept at most
+NOTES = 50  # changes of the weight of a closure that are remembered
 PYRAMIDS = 16  # search pyramids kept: each is several times as large as its submap
+
+
+class State(Enum):
+    """What a closure counts: what it is worth, nothing for now, nothing for good."""
+
+    ACTIVE = 0
+    DISABLED = 1
+    REVOKED = 2
+
+
+class Note(NamedTuple):
+    """When the newest keyframe was ``keyframe``: squared Mahalanobis norm and robust weight."""
+
+    keyframe: int
+    residual: float
+    weight: float
+
+
+@dataclass
+class Fate:
+    """What becomes of a closure: state with reason, residual now, and its weight over time."""
+
+    state: State = State.ACTIVE
+    reason: str = ''
+    residual: float = math.nan
+    notes: deque[Note] = field(default_factory=lambda: deque(maxlen=NOTES))
+
+    @property
+    def weight(self) -> float:
+        """The last one noted, NaN before the first."""
+        return self.notes[-1].weight if self.notes else math.nan
+
+    def note(self, keyframe: int, residual: float, weight: float) -> None:
+        """Remember a weight."""
+        self.notes.append(Note(keyframe, residual, weight))
+
+    def turn(self, state: State, reason: str) -> None:
+        """Go over to another state."""
+        self.state, self.reason = state, reason
 
 
 @dataclass(frozen=True)
@@ -39,6 +81,9 @@ class Closure:
     """A loop closure that was tried: poses ``i`` (submap's anchor) and ``j``, and the verdict.
 
     ``edge`` is its index in ``graph.edges``, -1 where it was rejected; ``why`` says it in words.
+    ``score`` is the mean hit probability, ``second`` that of the second-best place per the best
+    one's (NaN where there is none), ``overlap`` the share of end points on walls. Those that were
+    accepted are numbered from 0; ``fate`` is what has become of it since.
     """
 
     i: int
@@ -47,6 +92,10 @@ class Closure:
     score: float
     edge: int
     why: str
+    overlap: float = math.nan
+    second: float = math.nan
+    number: int = -1
+    fate: Fate = field(default_factory=Fate, compare=False)
 
     @property
     def accepted(self) -> bool:
@@ -82,6 +131,7 @@ class ScanGraph:
         self._finished: list[KeySubmap] = []
         self._pyramids: OrderedDict[KeySubmap, search.Pyramid] = OrderedDict()
         self._count = 0
+        self._accepted = 0
         self.closures: list[Closure] = []
         self.tried = {True: 0, False: 0}
         self.changed = False
@@ -228,8 +278,14 @@ class ScanGraph:
             'submap_shape': np.array([m.submap.values.shape for m in maps]).reshape(-1, 2),
             'submap_cells': np.concatenate([np.zeros(0, dtype=np.uint16), *cells]),
             'closure': np.array([(r.i, r.j, r.edge) for r in c], dtype=np.int64).reshape(-1, 3),
-            'closure_fit': np.array([(*r.delta, r.score) for r in c]).reshape(-1, 4),
+            'closure_fit': np.array([(*r.delta, r.score, r.overlap, r.second) for r in c]).reshape(
+                -1, 6
+            ),
             'closure_why': np.array([r.why for r in c], dtype=np.str_),
+            'closure_fate': np.array(
+                [(r.number, r.fate.state.value) for r in c], dtype=np.int64
+            ).reshape(-1, 2),
+            'closure_reason': np.array([r.fate.reason for r in c], dtype=np.str_),
             'closures_tried': np.array([self.tried[False], self.tried[True]], dtype=np.int64),
         }
 
@@ -251,11 +307,16 @@ class ScanGraph:
                 )
             )  # fmt: skip
         self.closures = [
-            Closure(i, j, fit[:3], float(fit[3]), edge, str(why))
-            for (i, j, edge), fit, why in zip(
-                a['closure'].tolist(), a['closure_fit'], a['closure_why'], strict=True
+            Closure(
+                i, j, fit[:3], float(fit[3]), edge, str(why), float(fit[4]), float(fit[5]), number,
+                Fate(State(state), str(reason)),
             )
-        ]
+            for (i, j, edge), fit, why, (number, state), reason in zip(
+                a['closure'].tolist(), a['closure_fit'], a['closure_why'],
+                a['closure_fate'].tolist(), a['closure_reason'], strict=True
+            )
+        ]  # fmt: skip
+        self._accepted = max((c.number for c in self.closures), default=-1) + 1
         rejected, accepted = a['closures_tried'].tolist()
         self.tried = {True: accepted, False: rejected}
 
@@ -299,7 +360,13 @@ class ScanGraph:
             return rejected('the refined fit is too weak', found.score)
         information = observability.information(m.submap, points, found.pose, self._p.scan_match)
         edge = self._edge(EdgeKind.CLOSURE, m, key, found.pose, information)
-        return Closure(i, j, found.pose, found.score, edge, 'fits')
+        term = linearize(m.submap, points, found.pose)
+        second = math.nan if result.second is None else result.second.score / result.best.score
+        self._accepted += 1
+        return Closure(
+            i, j, found.pose, found.score, edge, 'fits', term.inliers / max(term.count, 1), second,
+            self._accepted - 1,
+        )  # fmt: skip
 
     def _pyramid(self, m: KeySubmap) -> search.Pyramid:
         if m not in self._pyramids:

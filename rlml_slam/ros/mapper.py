@@ -17,6 +17,7 @@ from rlml_slam.maps.saved import SavedMap
 from rlml_slam.params import Parameters
 from rlml_slam.rlml import stored_map
 from rlml_slam.rlml.back_end import BackEnd
+from rlml_slam.rlml.closure_table import told
 from rlml_slam.rlml.find_place import find_place
 from rlml_slam.rlml.recovery import Recovery
 from rlml_slam.ros import build
@@ -109,6 +110,8 @@ class Mapper:
                 self._updates.publish(
                     build_update(make_rclpy, frame.stamp, self._p.node.map_frame, place, update)
                 )
+                for closure in update.changed:
+                    self._logger.warning(told(closure))
                 if update.optimized:
                     self._send_correction()
                     self._send_belief(record)
@@ -170,6 +173,19 @@ class Mapper:
             record.frame.stamp, record.session, self.back_end.T_map_local, belief
         )
         self._belief.publish(build_belief(make_rclpy, stamped, self._p.node.map_frame))
+
+    def revoke(self, number: str) -> str:
+        """In the worker: take a loop closure out of the map for good; what was done.
+
+        Raises MapError or SolverError where that cannot be.
+        """
+        if not number.isdecimal():
+            raise MapError(f'{number!r} is not the number of a loop closure')
+        closure = self.back_end.revoke(int(number))
+        self._logger.warning(told(closure))
+        self._send_correction()
+        self.publish_map()
+        return told(closure)
 
     def publish_map(self) -> None:
         """In the worker: send map, trajectory, reflectors and graph now."""

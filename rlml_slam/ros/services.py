@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from diagnostic_msgs.srv import AddDiagnostics
 from nav_msgs.srv import GetMap, LoadMap
 from rclpy.task import Future
 from std_srvs.srv import Empty, SetBool, Trigger
@@ -14,6 +15,7 @@ from std_srvs.srv import Empty, SetBool, Trigger
 from rlml_slam.errors import RlmlError
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Parameters
+from rlml_slam.rlml.closure_table import closure_table
 from rlml_slam.ros import build
 from rlml_slam.ros.frames import FrameJoin
 from rlml_slam.ros.mapper import Mapper
@@ -32,6 +34,8 @@ class MapServices:
             (Trigger, '~/save_map', self.save_map),
             (LoadMap, '~/load_map', self.load_map),
             (Trigger, '~/reset', self.reset),
+            (Trigger, '~/closures', self.closures),
+            (AddDiagnostics, '~/revoke_closure', self.revoke_closure),
             (GetMap, '~/dynamic_map', self.dynamic_map),
             (SetBool, '~/pause_new_measurements', self.pause),
             (Trigger, '~/relocalize', self.relocalize),
@@ -62,6 +66,15 @@ class MapServices:
         response.message = (
             'begins at map_start_pose in the same map' if localizes else 'the map begins anew'
         )
+
+    def closures(self, _request: Any, response: Any) -> None:
+        """All loop closures with their records, as a table of comma-separated values."""
+        response.success = True
+        response.message = closure_table(self._mapper.back_end.scans.closures)
+
+    def revoke_closure(self, request: Any, response: Any) -> None:
+        """Take a loop closure out of the map; load_namespace is its number."""
+        self._try(response, lambda: self._mapper.revoke(request.load_namespace))
 
     def pause(self, request: Any, response: Any) -> None:
         """Leave new measurements out of the map, or take them in again."""

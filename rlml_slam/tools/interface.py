@@ -172,6 +172,10 @@ SERVICES = (
             'in localization mode, use another map of `map_directory`'),
     Service('back_end', '~/reset', 'std_srvs/Trigger',
             'forget the map and begin at `map_start_pose`'),
+    Service('back_end', '~/closures', 'std_srvs/Trigger',
+            'all loop closures: why each was accepted, its residual and weight, its state'),
+    Service('back_end', '~/revoke_closure', 'diagnostic_msgs/AddDiagnostics',
+            'take a loop closure out of the map; `load_namespace` is its number'),
     Service('back_end', '~/dynamic_map', 'nav_msgs/GetMap', 'the grid as it is now'),
     Service('back_end', '~/relocalize', 'std_srvs/Trigger',
             'find the newest reflectors and scan anywhere in the map, and while localizing go on '

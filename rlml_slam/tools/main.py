@@ -58,6 +58,9 @@ COMMANDS: Table = {
             'export': Command('map_export', 'a saved map as text: CSV, g2o, TUM, PGM and YAML'),
         },
     ),
+    'closures': Command(
+        'closures', 'loop closures of a replay or of a running back end; revoke one'
+    ),
     'optimize': Command('optimize', 'optimise a pose graph file (g2o, TORO)'),
     'study': Group(
         'experiments that answer one question each',

@@ -21,8 +21,9 @@ from rlml_slam.tools.tum import Trajectory, write_tum
 def write_outputs(run: Run, folder: str | Path) -> dict[str, Any]:
     """Write all results and pictures of a run into a folder; the figures of metrics.json.
 
-    trajectory.tum, front_end.tum, map.rlml, map.pgm, map.yaml and reflectors.csv depend on the
-    data alone: two replays give the same bytes. Raises MapError if the folder cannot be written.
+    trajectory.tum, front_end.tum, map.rlml, map.pgm, map.yaml, reflectors.csv and closures.csv
+    depend on the data alone: two replays give the same bytes. Raises MapError if the folder
+    cannot be written.
     """
     folder = make_folder(folder)
     write_tum(folder / 'trajectory.tum', run.trajectory)
@@ -31,6 +32,8 @@ def write_outputs(run: Run, folder: str | Path) -> dict[str, Any]:
     reflector_file.save(run.reflectors, folder / 'reflectors.csv')
     if run.stored is not None:
         container.write(folder / 'map.rlml', run.stored)
+    if run.closure_table:
+        write_atomically(folder / 'closures.csv', run.closure_table.encode())
     judged = judge(run)
     figures = metrics(run, judged)
     write_atomically(folder / 'metrics.json', (json.dumps(figures, indent=2) + '\n').encode())

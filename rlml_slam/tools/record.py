@@ -76,7 +76,8 @@ class Run:
     """Inputs' fate, estimates, products and cost of one run.
 
     ``trajectory`` is the optimised one; ``keyframes`` (k, 3) are poses in the map and
-    ``closures`` (c, 2, 2) the ends of the accepted loop closures there. ``back_end_ms`` (k,)
+    ``closures`` (c, 2, 2) the ends of the accepted loop closures there, of which
+    ``closure_table`` tells all, empty where nothing is known of them. ``back_end_ms`` (k,)
     has the cost per keyframe. ``problem`` says in one line what ended the run early or what of it
     is missing, empty without either. ``stored`` is the whole map. ``extra`` goes into metrics.json
     as it is.
@@ -97,6 +98,7 @@ class Run:
     problem: str = ''
     stored: Content | None = None
     extra: Mapping[str, Any] = field(default_factory=dict)
+    closure_table: str = ''
 
     @property
     def duration_s(self) -> float:

@@ -23,6 +23,7 @@ from rlml_slam.maps.container import Content
 from rlml_slam.maps.saved import SavedMap
 from rlml_slam.params import EkfParameters, Parameters, from_mapping, read_yaml
 from rlml_slam.rlml import stored_map
+from rlml_slam.rlml.closure_table import closure_table
 from rlml_slam.rlml.slam import Slam
 from rlml_slam.ros.bag import BagReader
 from rlml_slam.ros.feed import Feed
@@ -208,6 +209,7 @@ def collect(slam: Slam | EkfSlam, log: FrameLog, name: str, truth: Truth | None)
         np.array([u.wall_ms for u in slam.updates]),
         truth=truth,
         problem=problem,
+        closure_table=closure_table(tried),
     )
 
 

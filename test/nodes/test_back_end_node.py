@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 import pytest
+from diagnostic_msgs.srv import AddDiagnostics
 from live import LATCHED, room
 from nav_msgs.srv import GetMap, LoadMap
 from std_srvs.srv import Empty, SetBool, Trigger
@@ -16,12 +17,15 @@ from rlml_slam.maps import reflector_file
 from rlml_slam.nodes.back_end import BackEndNode
 from rlml_slam.nodes.front_end import FrontEndNode
 from rlml_slam.params import Parameters
+from rlml_slam.rlml.loop_closure import Closure
 from rlml_slam.rlml.slam import Slam
 from rlml_slam.ros import build, convert
 from rlml_slam.ros.associated import read_reflector_map
 from rlml_slam.ros.feed import Feed
 from rlml_slam.ros.messages import make_rclpy as make
 from rlml_slam.ros.messages import rclpy_class
+from rlml_slam.tools.closures import parse
+from rlml_slam.types import EdgeKind
 
 SECOND = 1_000_000_000
 SECONDS = 8.0
@@ -165,7 +169,7 @@ def test_services_answer_in_words(live, tmp_path):
 
     saved = live.call(Trigger, 'back_end/save_map', Trigger.Request())
     assert saved.success, saved.message
-    assert {p.name for p in tmp_path.iterdir()} == {'map.csv', 'map.pgm', 'map.yaml'}
+    assert {p.name for p in tmp_path.iterdir()} == {'map.csv', 'map.pgm', 'map.rlml', 'map.yaml'}
     assert len(reflector_file.load(tmp_path / 'map.csv')) >= 3
 
     grid = live.call(GetMap, 'back_end/dynamic_map', GetMap.Request()).map
@@ -184,6 +188,29 @@ def test_services_answer_in_words(live, tmp_path):
     assert reset.success
     live.spin_until(lambda: np.abs(front.front_end.state.pose).max() < 1e-9)
     assert back.mapper.back_end.keyframes == []
+
+
+def test_loop_closures_are_listed_and_revoked_by_service(live):
+    front, back = start(live)
+    drive(live, front, back, end=3.0)
+    back_end = back.mapper.back_end
+    i, j = 0, len(back_end.keyframes) - 1
+    delta = se2.between(back_end.graph.poses[i], back_end.graph.poses[j])
+    edge = back_end.graph.add_edge(EdgeKind.CLOSURE, i, j, delta, np.eye(3))
+    back_end.scans.closures.append(Closure(i, j, delta, 0.7, edge, 'fits', number=0))
+    listed = live.call(Trigger, 'back_end/closures', Trigger.Request())
+    assert listed.success
+    assert parse(listed.message, 'back_end')[0]['state'] == 'active'
+
+    ask = AddDiagnostics.Request
+    for number, told in (('7', 'there is no loop closure 7'), ('x', 'is not the number')):
+        answer = live.call(AddDiagnostics, 'back_end/revoke_closure', ask(load_namespace=number))
+        assert not answer.success
+        assert told in answer.message
+    answer = live.call(AddDiagnostics, 'back_end/revoke_closure', ask(load_namespace='0'))
+    assert answer.success, answer.message
+    assert not back_end.graph.edges.enabled[edge]
+    assert back.figures()['closures revoked'] == 1
 
 
 @pytest.mark.parametrize('name', ['../map', '/etc/map', '.'])

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What becomes of loop closures: watched after each solve, disabled when they turn out wrong.
+
+A closure that fitted where it was made may contradict what is learned later. When the residual of
+one is likelier that of a wrong match, anywhere in the window it was searched in, than that of a
+right one, all closures are judged anew (graph/selection.py): those that agree with odometry and
+each other stay, the others are disabled, and come back if they are judged right later on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rlml_slam.errors import SolverError
+from rlml_slam.graph import factors
+from rlml_slam.graph.evidence import evidence, uniform
+from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.robust import loss
+from rlml_slam.graph.selection import select_closures
+from rlml_slam.graph.solver import optimize
+from rlml_slam.params import Parameters
+from rlml_slam.rlml.loop_closure import Closure, State
+from rlml_slam.se2 import Array
+
+# judging all anew takes as long as many solves: after one, the graph must have grown this much
+GROWTH = 1.5
+MAJORITY = 0.9  # share of all closures that must be right where some are called wrong
+CHANGED = 0.05  # change of a weight that is noted
+
+
+class ClosureWatch:
+    """Notes residuals and weights, disables, revokes; closures are those of a ScanGraph."""
+
+    def __init__(self, params: Parameters, graph: Graph) -> None:
+        self._p = params
+        self._graph = graph
+        p = params.loop_closure
+        self._wrong = uniform((2.0 * p.search_window) ** 2 * p.search_angle / np.pi)
+        self._judged = 0
+
+    def review(self, closures: Sequence[Closure], final: bool = False) -> tuple[Closure, ...]:
+        """After a solve: note how each fares; those whose state changed, in a graph solved anew.
+
+        With ``final`` doubts are settled whenever the last time was.
+        """
+        closures = [c for c in closures if c.accepted]
+        if not closures:
+            return ()
+        doubtful = self._note(closures)
+        poses = len(self._graph.poses)
+        if not doubtful or not (final or poses >= GROWTH * self._judged):
+            return ()
+        self._judged = poses
+        return self._judge(closures)
+
+    def revoke(self, closures: Sequence[Closure], number: int) -> Closure:
+        """Take a closure out for good; raises SolverError if there is no such one."""
+        found = next((c for c in closures if c.accepted and c.number == number), None)
+        if found is None:
+            raise SolverError(f'there is no loop closure {number}')
+        if found.fate.state is State.REVOKED:
+            raise SolverError(f'loop closure {number} is revoked already')
+        found.fate.turn(State.REVOKED, 'revoked by a person')
+        self._graph.edges.enabled[found.edge] = False
+        return found
+
+    def _note(self, closures: Sequence[Closure]) -> bool:
+        """Residual and weight of each; whether one that is active is likelier wrong."""
+        graph, edges = self._graph, np.array([c.edge for c in closures])
+        i, j = graph.edges.nodes[edges].T
+        e = factors.relative_pose(graph.poses[i], graph.poses[j], graph.edges.measured[edges])[0]
+        information = graph.edges.information[edges]
+        s, on = factors.chi2(e, information), graph.edges.enabled[edges]
+        one = graph.losses.closure
+        w = np.where(on, [loss(int(one.kind), one.scale, float(k))[1] for k in s], 0.0)
+        last = np.array([c.fate.weight for c in closures])
+        switched = (w == 0.0) != (last == 0.0)
+        for k in np.flatnonzero(np.isnan(last) | switched | (np.abs(w - last) > CHANGED)).tolist():
+            closures[k].fate.note(len(graph.poses) - 1, float(s[k]), float(w[k]))
+        for c, residual in zip(closures, s.tolist(), strict=True):
+            c.fate.residual = residual
+        doubt = on & (self._evidence(e, information) < 0.0)
+        return bool(doubt.any())
+
+    def _evidence(self, e: Array, information: Array) -> Array:
+        cov = np.asarray(np.linalg.inv(information), dtype=np.float64)
+        return evidence(e, cov, 1.0, self._wrong)
+
+    def _judge(self, closures: Sequence[Closure]) -> tuple[Closure, ...]:
+        """Judge all anew; those whose state changed."""
+        revoked = [c.edge for c in closures if c.fate.state is State.REVOKED]
+        chosen = select_closures(self._graph, self._p.solver, np.array(revoked, np.int64))
+        # of what is neither proven nor refuted yet, the verification when it was made is believed
+        good = chosen.accepted | (chosen.evidence > 0.0)
+        is_revoked = np.isin(chosen.edges, revoked)
+        if np.sum(good) < MAJORITY * np.sum(~is_revoked):
+            good[:] = True  # not so many matches fail that were verified: odometry is off
+        good[is_revoked] = False
+        self._graph.edges.enabled[chosen.edges] = good
+        optimize(self._graph, self._p.solver)
+        is_good = dict(zip(chosen.edges.tolist(), good.tolist(), strict=True))
+        changed = []
+        for c in closures:
+            right = is_good.get(c.edge, True)  # one that stands for several is no closure any more
+            state = State.ACTIVE if right else State.DISABLED
+            if c.fate.state not in (state, State.REVOKED):
+                why = 'agrees again' if right else 'contradicts the other closures'
+                c.fate.turn(state, why)
+                changed.append(c)
+        self._note(closures)
+        return tuple(changed)

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``rlml closures``: the loop closures of a replay, or of a running back end; revoke one there."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+from rlml_slam.errors import InputError, MapError
+from rlml_slam.rlml.closure_table import COLUMNS
+
+PATIENCE = 10.0  # [s] in which a running back end answers
+
+
+def add_parser(subparsers: Any) -> None:
+    """Declare ``rlml closures``."""
+    parser = subparsers.add_parser(
+        'closures', help='loop closures of a replay or of a running back end; revoke one'
+    )
+    parser.add_argument(
+        'folder', metavar='DIR', type=Path, nargs='?', help='what a replay wrote (closures.csv)'
+    )
+    parser.add_argument(
+        '--node', metavar='NAME', default='/back_end',
+        help='without DIR: the running back end (default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument('--revoke', metavar='NUMBER', type=int, help='take it out of its map')
+    parser.add_argument('--all', action='store_true', help='also those that are sound')
+    parser.add_argument('--json', action='store_true', help='one JSON object on stdout')
+
+
+def run(args: argparse.Namespace) -> int:
+    """List, or revoke."""
+    if args.revoke is not None:
+        if args.folder is not None:
+            raise InputError('--revoke works in a running back end; a replay is done')
+        print(_ask(args.node, 'revoke_closure', str(args.revoke)))
+        return 0
+    rows = read(args.folder) if args.folder else parse(_ask(args.node, 'closures'), args.node)
+    if args.json:
+        print(json.dumps({'closures': rows}))
+    else:
+        print(text(rows, args.all))
+    return 0
+
+
+def read(folder: Path) -> list[dict[str, str]]:
+    """The rows of a folder's closures.csv; MapError if there is none."""
+    path = folder / 'closures.csv'
+    try:
+        return parse(path.read_text(encoding='utf-8'), str(path))
+    except (OSError, UnicodeDecodeError) as e:
+        raise MapError(f'{path}: cannot be read: {e}') from e
+
+
+def parse(table: str, name: str) -> list[dict[str, str]]:
+    """The rows of a table; InputError, naming it, if it is none of closures."""
+    rows = list(csv.DictReader(io.StringIO(table)))
+    header = table.partition('\n')[0].split(',')
+    if tuple(header) != COLUMNS:
+        raise InputError(f'{name}: not a table of loop closures')
+    return rows
+
+
+def text(rows: list[dict[str, str]], everything: bool) -> str:
+    """Those that are out of the map or count for less, or all, and how many there are."""
+    sound = [r['state'] == 'active' and float(r['weight'] or 1.0) == 1.0 for r in rows]
+    shown = [r for r, is_sound in zip(rows, sound, strict=True) if everything or not is_sound]
+    columns = COLUMNS[:-1]
+    lines = [[r[name] for name in columns] for r in shown]
+    width = [max(map(len, column)) for column in zip(columns, *lines, strict=True)]
+    out = ['  '.join(w.ljust(n) for w, n in zip(row, width, strict=True)).rstrip()
+           for row in [list(columns), *lines]]  # fmt: skip
+    states = [r['state'] for r in rows]
+    counts = ', '.join(f'{states.count(s)} {s}' for s in ('active', 'disabled', 'revoked'))
+    return '\n'.join([*out, f'{len(rows)} loop closures: {counts}'])
+
+
+def _ask(node: str, service: str, argument: str | None = None) -> str:
+    """The answer of a running back end; InputError with its words where it refuses."""
+    import rclpy
+    from diagnostic_msgs.srv import AddDiagnostics
+    from std_srvs.srv import Trigger
+
+    kind = Trigger if argument is None else AddDiagnostics
+    request = kind.Request()
+    if argument is not None:
+        request.load_namespace = argument
+    rclpy.init()
+    try:
+        asker = rclpy.create_node('rlml_closures')
+        client = asker.create_client(kind, f'{node}/{service}')
+        if not client.wait_for_service(PATIENCE):
+            raise InputError(f'{node}: no such back end is running')
+        future = client.call_async(request)
+        rclpy.spin_until_future_complete(asker, future, timeout_sec=PATIENCE)
+        answer = future.result() if future.done() else None
+        asker.destroy_node()
+    finally:
+        rclpy.shutdown()
+    if answer is None:
+        raise InputError(f'{node}: no answer within {PATIENCE:.0f} s')
+    if not answer.success:
+        raise InputError(str(answer.message))
+    return str(answer.message)
