@@ -483,7 +483,7 @@ class Ekf(Group):
     )  # fmt: skip
     association: str = param(
         'nearest', 'nearest neighbour in Mahalanobis distance, or joint compatibility',
-        choices=('nearest', 'joint'),
+        choices=('nearest', 'joint', 'deferred'),
     )  # fmt: skip
     gate: float = param(0.997, 'probability inside the validation gate', '', 0.5, 0.999999)
     new_gate: float = param(

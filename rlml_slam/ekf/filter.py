@@ -24,6 +24,7 @@ from rlml_slam.se2 import Array
 from rlml_slam.types import Motion
 
 BIAS, ROBOT = 3, 4
+JOINED = 1e-3  # [m] what the places of one landmark may differ by
 PENDING = 128  # updates whose share in Psi is summed up at once
 
 
@@ -191,6 +192,20 @@ class Filter:
             self._phi = np.concatenate([self._phi, np.zeros((2, self._phi.shape[1]))])
         return self._append()
 
+    def join(self, a: int, b: int) -> None:
+        """Landmarks a and b are one: 0 = m_a - m_b, a measurement without noise to speak of.
+
+        b leaves the state, and the landmarks after it move up by one number.
+        """
+        self.settle()
+        columns = np.concatenate([self._columns(np.array([a])), self._columns(np.array([b]))])
+        H = np.concatenate([np.eye(2), -np.eye(2)], axis=1)
+        self.apply(columns, H, JOINED**2 * np.eye(2), -H @ self.x[columns])
+        keep = np.delete(np.arange(len(self.x)), columns[2:])
+        self.x, self.P = self.x[keep], self.P[np.ix_(keep, keep)]
+        self.num_landmarks -= 1
+        self.local = np.arange(self.num_landmarks)
+
     def _append(self) -> int:
         self.local = np.append(self.local, self.num_landmarks)
         self.num_landmarks += 1
@@ -276,6 +291,12 @@ class Filter:
         out = np.empty((self.num_landmarks, 2))
         out[self.local] = self.points
         out[self._others] = self._x[self._columns(self._others)].reshape(-1, 2)
+        return out
+
+    def difference_cov(self, a: int, b: int) -> Array:
+        """Covariance (2, 2) of the difference of two local landmarks."""
+        i, j = (slice(ROBOT + 2 * k, ROBOT + 2 * k + 2) for k in (a, b))
+        out: Array = self.P[i, i] + self.P[j, j] - self.P[i, j] - self.P[j, i]
         return out
 
     def pose_and_points_cov(self) -> Array:

@@ -58,7 +58,7 @@ class EkfSlam:
         return [self.estimator.process(o) for o in observations]
 
     def trajectory(self) -> tuple[NDArray[np.int64], Array]:
-        """Stamps (n,) and poses (n, 3) as estimated live: a filter does not correct its past."""
+        """Stamps (n,) and poses (n, 3) of the likeliest branch, as they were estimated live."""
         return self.estimator.trajectory()
 
     def reflectors(self) -> Reflectors:

@@ -65,7 +65,7 @@ def drive(p, rng=None, ids=False, steps=STEPS, q=Q):
     return estimator, frames, np.array(truth)
 
 
-@pytest.mark.parametrize('association', ['nearest', 'joint'])
+@pytest.mark.parametrize('association', ['nearest', 'joint', 'deferred'])
 @pytest.mark.parametrize('update', ['plain', 'compressed'])
 def test_without_noise_there_is_no_error(association, update):
     estimator, frames, truth = drive(

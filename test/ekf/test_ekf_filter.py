@@ -6,7 +6,7 @@ import pytest
 from differences import central_differences
 
 from rlml_slam import se2
-from rlml_slam.ekf.filter import ROBOT, Filter
+from rlml_slam.ekf.filter import JOINED, ROBOT, Filter
 from rlml_slam.ekf.models import POINT, line_model
 from rlml_slam.types import Motion
 
@@ -168,3 +168,29 @@ def test_small_corrections_are_the_same_in_both_errors():
         corrections.append(f.x - x)
     assert np.abs(corrections[0] - corrections[1]).max() < 1e-10
     assert np.abs(corrections[0]).max() > 1e-7
+
+
+def test_join_is_the_state_on_condition_that_two_landmarks_are_one():
+    f, _ = small()
+    x, P = f.x.copy(), f.P.copy()
+    a, b = ROBOT + 2 * 1, ROBOT + 2 * 3
+    H = np.zeros((2, len(x)))
+    H[:, a : a + 2], H[:, b : b + 2] = np.eye(2), -np.eye(2)
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + JOINED**2 * np.eye(2))
+    rest = np.arange(b)
+    f.join(1, 3)
+    assert f.num_landmarks == 3
+    assert np.abs(f.x - (x - K @ H @ x)[rest]).max() < 1e-9
+    assert np.abs(f.P - (P - K @ H @ P)[np.ix_(rest, rest)]).max() < 1e-9
+    assert is_covariance(f.P)
+
+
+def test_join_in_a_region_is_join_in_the_whole():
+    plain, _ = small()
+    postponed, _ = small()
+    postponed.choose(np.array([True, True, False, True]))
+    for f in (plain, postponed):
+        f.update(0, f.model.observe(f.x[:3], f.points)[0][0] + 0.01, R)
+        f.join(0, 2)
+    assert np.abs(postponed.x - plain.x).max() < 1e-12
+    assert np.abs(postponed.P - plain.P).max() < 1e-12

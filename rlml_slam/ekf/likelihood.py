@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How likely a measurement is of each landmark: what weighs the branches against each other."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rlml_slam.ekf.association import mahalanobis2
+from rlml_slam.ekf.extraction import Measured
+from rlml_slam.ekf.filter import Filter
+from rlml_slam.rlml.deferred import SPREAD
+from rlml_slam.rlml.tracks import Tracks
+from rlml_slam.se2 import Array
+
+# [m], [rad] of motion between two looks that tell different things: errors of a sensor, and which
+# one of a group of landmarks it sees, are alike from one look to the next
+ALIKE = np.array([0.3, 0.25])
+SAME_PLACE = 0.3  # what a look from the same place is worth to the filter, of one from elsewhere
+
+
+def log_density(filter_: Filter, tracks: Tracks, seen: Measured) -> tuple[Array, Array]:
+    """Log density [1/m²] and squared Mahalanobis distance (k, a) of measurements, by landmark.
+
+    What is held as one landmark may be several that stand together: nothing finer than SPREAD
+    may speak for an answer.
+    """
+    z = seen.z
+    h, H_r, H_m = filter_.model.observe(filter_.x[:3], filter_.points)
+    S = filter_.innovation_covs(H_r, H_m)[None] + seen.R[:, None]
+    spread2 = tracks.spread2[filter_.local][None] + SPREAD**2
+    r2 = np.maximum(z[:, :1] ** 2, 1e-12)
+    S[..., 0, 0] += spread2
+    S[..., 1, 1] += spread2 / r2
+    d2 = mahalanobis2(filter_.model.innovation(z[:, None], h[None]), S)
+    # the density of range and bearing over that of the plane is the range
+    log_det = np.log(np.linalg.det(S) * r2)
+    return -0.5 * (d2 + log_det) - math.log(2.0 * math.pi), d2

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which measurement is of which landmark of the state, by the rule that the parameters name."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam.ekf.association import compatible_ids, mahalanobis2, nearest
+from rlml_slam.ekf.extraction import Measured
+from rlml_slam.ekf.filter import Filter
+from rlml_slam.matching.association import Associator, Believed, gate
+from rlml_slam.params import EkfParameters
+from rlml_slam.rlml.tracks import Tracks
+from rlml_slam.se2 import Array
+from rlml_slam.types import ANONYMOUS, Status
+
+
+@dataclass(frozen=True)
+class Matches:
+    """``slots`` (k,) of the filter's local landmarks, -1 for none; ``statuses`` (k,) of Status.
+
+    ``distance2`` (k,) is the squared Mahalanobis distance to the match, NaN without one.
+    """
+
+    slots: NDArray[np.int64]
+    statuses: NDArray[np.int64]
+    distance2: Array
+
+
+class Matcher:
+    """Association with the thresholds of one parameter set.
+
+    ``defers``: what cannot be told yet is kept apart, and asks to be told later.
+    """
+
+    def __init__(self, params: EkfParameters) -> None:
+        e = self._p = params.ekf
+        self._reflector = params.reflector
+        self.gate, self._new_gate = gate(e.gate), gate(e.new_gate)
+        self._joint: Associator | None = None
+        # a line has no place that could be jointly compatible
+        if e.association != 'nearest' and e.extractor != 'lines':
+            self._joint = Associator(
+                dataclasses.replace(
+                    params.reflector, gate=e.gate, new_gate=e.new_gate,
+                    min_separation=e.min_separation,
+                )
+            )  # fmt: skip
+        self.defers = e.association == 'deferred' and self._joint is not None
+
+    def match(self, seen: Measured, filter_: Filter, tracks: Tracks, stamp: int) -> Matches:
+        """The landmark of the filter's region that each measurement is of."""
+        if self._joint is None:
+            return self._nearest(seen, filter_, tracks.ids[filter_.local])
+        local = filter_.local
+        recent = stamp - tracks.last_seen[local] < self._reflector.track_timeout * 1e9
+        found = self._joint.associate(
+            seen.detections,
+            Believed(
+                filter_.pose, filter_.points, tracks.ids[local], filter_.pose_and_points_cov(),
+                recent if self.defers else None, tracks.spread2[local] if self.defers else None,
+            ),
+        )  # fmt: skip
+        return Matches(found.match, found.status, found.distance2)
+
+    def learn_spread(
+        self, seen: Measured, matches: Matches, local: NDArray[np.int64], tracks: Tracks
+    ) -> None:
+        """Two detections at once of one landmark: it is several which cannot be told apart."""
+        assert self._joint is not None
+        points = seen.detections.points
+        double = self._joint.doubles(seen.detections, matches.slots)
+        for k in np.flatnonzero(double >= 0):
+            gap = float(np.linalg.norm(points[k] - points[double[k]]))
+            tracks.see_double(int(local[matches.slots[double[k]]]), gap)
+
+    def _nearest(self, seen: Measured, filter_: Filter, ids: NDArray[np.int64]) -> Matches:
+        """The nearest neighbour in the gate; an id needs no gate but sense."""
+        z, detections, k = seen.z, seen.detections, len(seen.z)
+        slots, statuses = np.full(k, -1, dtype=np.int64), np.full(k, Status.NEW, dtype=np.int64)
+        if not len(ids):
+            return Matches(slots, statuses, np.full(k, np.nan))
+        model = filter_.model
+        h, H_r, H_m = model.observe(filter_.x[:3], filter_.points)
+        nu = model.innovation(z[:, None], h[None])
+        d2 = mahalanobis2(nu, filter_.innovation_covs(H_r, H_m)[None] + seen.R[:, None])
+        told = (detections.ids[:, None] == ids[None]) & (ids[None] != ANONYMOUS)
+        gated = np.where(told, np.where(d2 <= self._new_gate, 0.0, np.inf), d2)
+        same = compatible_ids(detections.ids, ids)
+        slots = nearest(np.where(same, gated, np.inf), self.gate)
+        statuses[slots >= 0] = Status.USED
+        statuses[(slots < 0) & self._is_known(seen, filter_, d2, told)] = Status.GATED
+        best = np.where(slots >= 0, d2[np.arange(k), np.maximum(slots, 0)], np.nan)
+        return Matches(slots, statuses, best)
+
+    def _is_known(
+        self, seen: Measured, filter_: Filter, d2: Array, told: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """(k,): so near to a landmark, though outside of its gate, that it starts no candidate."""
+        where = filter_.model.place(filter_.x[:3], seen.z)[0]
+        gap = np.linalg.norm(where[:, None] - filter_.points[None], axis=-1)
+        sigma = np.sqrt(np.linalg.eigvalsh(seen.detections.cov)[:, -1])
+        blur = self._reflector.blur * sigma
+        near = gap.min(axis=1) < np.maximum(self._p.min_separation, blur)
+        near |= d2.min(axis=1) <= self._new_gate
+        # one that tells who it is, is new if nobody has told so before
+        anonymous = seen.detections.ids == ANONYMOUS
+        out: NDArray[np.bool_] = (near & anonymous) | told.any(axis=1)
+        return out

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Anonymous landmarks seen again after a stretch without any, in which the wheels slipped."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rlml.made_worlds import ROOM, drive, observations
+
+from rlml_slam import se2
+from rlml_slam.ekf.estimator import Estimator
+from rlml_slam.ekf.filter import Filter
+from rlml_slam.ekf.models import POINT
+from rlml_slam.params import EkfParameters, from_mapping
+from rlml_slam.types import Motion
+
+LOOP = drive((0.5, 0.0, 4.0), (0.5, 1.2, 5.2), (0.5, 0.0, 6.0), (0.5, 1.2, 5.2), (0.5, 0.0, 3.0))
+BLIND = slice(60, 110)
+SURPRISE = np.array([0.25, -0.1, 0.4])  # of the wheels while nothing is in view
+
+
+def blinded(seed):
+    """The loop with a stretch without a sighting, in which the wheels slip by what they may."""
+    rng = np.random.default_rng(seed)
+    out = observations(ROOM, LOOP, scan=False, rng=rng, sigma=0.02)
+    for k in range(BLIND.start, BLIND.stop):
+        out[k] = replace(out[k], detections=None)
+    k = BLIND.stop - 1
+    delta = se2.compose(out[k].motion.delta, SURPRISE)
+    cov = out[k].motion.cov + np.diag(np.square((0.25, 0.15, 0.35)))
+    out[k] = replace(out[k], motion=Motion(delta, cov))
+    return out
+
+
+def run(observed, association):
+    """The estimator, its frames and how many branches it had after each."""
+    estimator = Estimator(from_mapping({'ekf.association': association}, EkfParameters))
+    frames, branches = [], []
+    for o in observed:
+        frames.append(estimator.process(o))
+        branches.append(len(estimator.branches))
+    return estimator, frames, np.array(branches)
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_landmarks_seen_again_after_a_blind_stretch_are_told_in_the_end(seed):
+    estimator, _, branches = run(blinded(seed), 'deferred')
+    assert (branches[: BLIND.stop] == 1).all()
+    assert branches.max() > 1
+    found = estimator.reflectors()
+    gap = np.linalg.norm(found.points[:, None] - ROOM.reflectors[None], axis=-1)
+    assert sorted(gap.argmin(axis=1)) == list(range(len(ROOM.reflectors)))
+    assert gap.min(axis=1).max() < 0.1
+    _, poses = estimator.trajectory()
+    assert np.abs(poses[-1] - LOOP[-1])[:2].max() < 0.1
+
+
+def test_nearest_neighbour_takes_them_for_others():
+    worst = 0.0
+    for seed in range(4):
+        estimator, _, _ = run(blinded(seed), 'nearest')
+        worst = max(worst, float(np.hypot(*(estimator.trajectory()[1][-1] - LOOP[-1])[:2])))
+    assert worst > 0.1
+
+
+def test_one_branch_is_enough_where_landmarks_stay_in_view():
+    observed = observations(ROOM, LOOP, scan=False, rng=np.random.default_rng(0), sigma=0.02)
+    _, frames, branches = run(observed, 'deferred')
+    assert (branches == 1).all()
+    assert np.abs(frames[-1].T_map_base - LOOP[-1])[:2].max() < 0.1
+
+
+def test_a_branch_and_its_copy_are_equal_until_they_see_different_things():
+    estimator, _, _ = run(blinded(0)[: BLIND.start], 'deferred')
+    (branch,) = estimator.branches
+    twin = branch.copy()
+    assert branch.equals(twin)
+    twin.filter.x[0] += 1.0
+    assert branch.filter.x[0] == pytest.approx(estimator.filter.pose[0])
+    assert not branch.equals(twin)
+
+
+def test_covariance_tells_that_another_branch_may_be_right():
+    estimator, _, _ = run(blinded(0)[: BLIND.start], 'deferred')
+    (branch,) = estimator.branches
+    twin = branch.copy()
+    twin.filter = Filter(
+        branch.filter.pose + np.array([2.0, 0.0, 0.0]), branch.filter.pose_cov, 0.1, POINT
+    )
+    estimator.branches = [branch, twin]
+    twin.weight = branch.weight
+    # half of the weight stands 2 m away
+    assert estimator.pose_cov[0, 0] == pytest.approx(branch.filter.P[0, 0] + 2.0, abs=1e-9)
