@@ -6,6 +6,9 @@ separator moved by D is |L21^T D|^2, at most the sum of h D^2 over the separator
 information h of all factors on a variable. So a clique is updated when some variable of its
 separator moved by more than a small share of its standard deviation 1 / sqrt(h) since the last
 time (the wildfire threshold of iSAM2, in sigmas).
+
+The functions that run once per clique take the few arrays that they need: all of the state in
+every call would cost as much as the work.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ import numpy as np
 from rlml_slam.compiled import part
 from rlml_slam.graph.increments import STEP, State
 from rlml_slam.graph.linearize import wrapped
-from rlml_slam.graph.structure import Ints
+from rlml_slam.graph.structure import Ints, Records
 from rlml_slam.se2 import Array
 
 
@@ -28,7 +31,7 @@ def propagate(
 
     ``moved`` is filled with the unknowns that moved by more than ``still`` sigmas.
     """
-    cliques, step = state.cliques, state.counts[STEP]
+    unknowns, cliques, step = state.unknowns, state.cliques, state.counts[STEP]
     num, solved, most = 0, 0, 1
     for s in range(len(of_front)):
         if of_front[s] >= 0:
@@ -41,12 +44,15 @@ def propagate(
         c = of_front[s]
         if c < 0:
             continue
-        num = _solve(state, pool, numbers, c, poses, landmarks, still, moved, num, work)
+        num = _solve(
+            unknowns, cliques[c], step, pool, numbers, poses, landmarks, still, moved, num, work
+        )
         solved += cliques[c]['own']
         child = cliques[c]['child']
         while True:
             while child >= 0:
-                if cliques[child]['mark'] != step and _feels(state, numbers, child):
+                new = cliques[child]['mark'] == step
+                if not new and _feels(unknowns, cliques, numbers, child, step):
                     if depth == len(stack):
                         more = np.empty(2 * depth, np.int64)
                         more[:depth] = stack
@@ -60,30 +66,41 @@ def propagate(
             c = stack[depth]
             if cliques[c]['height'] > len(work):
                 work = np.empty(2 * cliques[c]['height'])
-            num = _solve(state, pool, numbers, c, poses, landmarks, still, moved, num, work)
+            num = _solve(
+                unknowns,
+                cliques[c],
+                step,
+                pool,
+                numbers,
+                poses,
+                landmarks,
+                still,
+                moved,
+                num,
+                work,
+            )
             solved += cliques[c]['own']
             child = cliques[c]['child']
     return num, solved
 
 
 @part
-def _feels(state: State, numbers: Ints, c: int) -> bool:
+def _feels(unknowns: Records, cliques: Records, numbers: Ints, c: int, step: int) -> bool:
     """Whether a variable of the separator has moved in this step."""
-    clique, step = state.cliques[c], state.counts[STEP]
+    clique = cliques[c]
     first = clique['block']
     for p in range(first + clique['own'], first + clique['members']):
-        if state.unknowns[numbers[p]]['moved'] == step:
+        if unknowns[numbers[p]]['moved'] == step:
             return True
     return False
 
 
 @part
 def _solve(
-    state: State, pool: Array, numbers: Ints, c: int, poses: Array, landmarks: Array,
-    still: float, moved: Ints, num: int, x: Array,
+    unknowns: Records, clique: np.void, step: int, pool: Array, numbers: Ints, poses: Array,
+    landmarks: Array, still: float, moved: Ints, num: int, x: Array,
 ) -> int:  # fmt: skip
-    """Update the own variables of clique c; the number of moved unknowns so far."""
-    clique, unknowns = state.cliques[c], state.unknowns
+    """Update the own variables of a clique; the number of moved unknowns so far."""
     at, width, height = clique['panel'], clique['width'], clique['height']
     tall = height + 1
     first = clique['block']
@@ -126,7 +143,7 @@ def _solve(
         w += u['size']
         if (sx * sx + sy * sy) * u['stiff'] + st * st * u['turn'] > still * still:
             u['sx'], u['sy'], u['stheta'] = u['dx'], u['dy'], u['dtheta']
-            u['moved'] = state.counts[STEP]
+            u['moved'] = step
             moved[num] = v
             num += 1
     return num

@@ -286,7 +286,7 @@ def judge(
             if z['checked'] == counts[STEP]:
                 continue
             z['checked'] = counts[STEP]
-            error = _error(state, f, losses, poses, landmarks, due, turn)
+            error = _error(z, losses, poses, landmarks, due, turn)
             if error > NEAR * NEAR:
                 worst = max(worst, error)
                 state.due[counts[LISTED]] = f
@@ -297,10 +297,9 @@ def judge(
 
 @part
 def _error(
-    state: State, f: int, losses: Array, poses: Array, landmarks: Array, due: float, turn: float
+    z: np.void, losses: Array, poses: Array, landmarks: Array, due: float, turn: float
 ) -> float:
     """Squared error of a factor's linear model, 1 where it is due."""
-    z = state.factors[f]
     i, j, kind = z['i'], z['j'], z['kind']
     robust = losses[kind, 0] != 0
     if i < 0 and not robust:
