@@ -66,6 +66,9 @@ def add_parser(subparsers: Any) -> None:
         '--continue', metavar='MAP', type=Path, dest='go_on',
         help='go on mapping with this .rlml file',
     )  # fmt: skip
+    parser.add_argument(
+        '--no-odometry', action='store_true', help='leave out the odometry: as use_odom false'
+    )
     parser.add_argument('--json', action='store_true', help='print metrics.json and no more')
 
 
@@ -73,6 +76,8 @@ def run(args: argparse.Namespace) -> int:
     """Replay, write the results, and say what they are."""
     kind = SYSTEMS[args.system][0]
     params = from_mapping(read_yaml(args.config), kind) if args.config else kind()
+    if args.no_odometry:
+        params = replace(params, node=replace(params.node, use_odom=False))
     make_folder(args.out)  # before the work, not after it
     truth = Truth(read_tum(args.truth), is_map=False) if args.truth else None
     if args.map and args.go_on:

@@ -99,6 +99,16 @@ def test_configuration_is_used(tmp_path, capsys):
     assert "unknown parameter 'use_scam'" in capsys.readouterr().err
 
 
+def test_odometry_is_left_out_where_it_is_withheld(tmp_path, capsys):
+    out = tmp_path / 'out'
+    assert main(['replay', str(BAGS / 'room'), '--out', str(out), '--no-odometry', '--json']) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert 'odom' not in figures['inputs']
+    assert figures['inputs']['scan']['used'] > 0
+    # the walls of the room hold the pose without any odometry
+    assert figures['live_ate_rmse_m'] < 0.1
+
+
 def test_no_such_bag_is_one_line(tmp_path, capsys):
     assert main(['replay', str(tmp_path / 'gone'), '--out', str(tmp_path / 'out')]) == 1
     assert capsys.readouterr().err.endswith('gone: no such bag\n')
