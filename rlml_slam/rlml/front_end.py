@@ -45,6 +45,7 @@ from rlml_slam.types import (
     Status,
 )
 
+BURST = 50_000_000  # [ns] between two scans that tell a velocity
 START_SIGMA = np.array([0.5, 0.5, 0.26])  # [m, m, rad] what RViz says of a pose set by hand
 
 
@@ -74,6 +75,7 @@ class FrontEnd:
         self._correction = Correction(np.zeros(3))
         self._velocity = np.zeros(3)
         self._velocity_known = False
+        self._since: tuple[int, Array] | None = None
         self._has_odometry = False
         self._map: SavedMap | None = None
         self._unconfirmed = False
@@ -127,7 +129,7 @@ class FrontEnd:
             self.state.place(pose, cov)
             self.submaps = Submaps(self._p.submap)
             self.doubt = Doubt(self._p.health)
-            self._velocity_known = False
+            self._velocity_known, self._since = False, None
             T_map_local = self.T_map_local
         # what the graph knows is of where the robot was
         self._correction = Correction(T_map_local)
@@ -202,7 +204,6 @@ class FrontEnd:
     def process(self, observation: Observation) -> Frame:
         """The pose at the observation's stamp; never raises for what was measured."""
         began = time.perf_counter()
-        before = self.state.pose
         self.state.predict(self._motion(observation), self._bias_walk(observation.stamp))
         matched = _Matched.none(observation.detections)
         self._use_reflectors(observation, matched)
@@ -213,7 +214,7 @@ class FrontEnd:
         observation = self._with_spread(observation, matched)
         self._map_reflectors(observation, matched, doubtful)
         self._map_scan(observation, evidence, doubtful and evidence.misfit)
-        self._remember_velocity(before, observation.stamp)
+        self._remember_velocity(observation.stamp)
         health = self._judge(observation, matched, evidence)
         frame = self._frame(observation, matched, evidence, health, doubtful, began)
         self._jumped = False
@@ -239,11 +240,15 @@ class FrontEnd:
         dt = 0.0 if self._last_stamp is None else (stamp - self._last_stamp) * 1e-9
         return self._p.motion.imu_bias_walk**2 * dt
 
-    def _remember_velocity(self, before: Array, stamp: int) -> None:
-        if self._last_stamp is not None and stamp > self._last_stamp:
-            dt = (stamp - self._last_stamp) * 1e-9
-            self._velocity = se2.log(se2.between(before, self.state.x[:3])) / dt
-            self._velocity_known = True
+    def _remember_velocity(self, stamp: int) -> None:
+        """Velocity over BURST at least: scans of one burst are too close to divide by."""
+        pose, since = self.state.pose, self._since
+        if since is None:
+            self._since = (stamp, pose)
+        elif stamp - since[0] >= BURST:
+            dt = (stamp - since[0]) * 1e-9
+            self._velocity = se2.log(se2.between(since[1], pose)) / dt
+            self._velocity_known, self._since = True, (stamp, pose)
         self._last_stamp = stamp
 
     # --- reflector term ----------------------------------------------------------------------

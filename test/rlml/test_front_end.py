@@ -434,3 +434,19 @@ def test_stamps_and_observations_are_copied_from_the_input():
     frames, _ = run(observed)
     assert [f.stamp for f in frames] == [FIRST + k * STEP for k in range(3)]
     assert all(f.observation is o for f, o in zip(frames, observed, strict=True))
+
+
+def test_scans_that_come_in_bursts_tell_no_velocity():
+    front_end = FrontEnd(Parameters())
+    poses = drive((0.4, 0.2, 6.0))
+    got = []
+    for o in observations(
+        ROOM, poses, reflectors=False, odometry=False, rng=np.random.default_rng(5)
+    ):
+        again = replace(o, stamp=o.stamp + 1_000_000, motion=Motion(np.zeros(3), np.eye(3), False))
+        for one in (o, again):
+            frame = front_end.process(one)
+        got.append(frame.T_local_base)
+    distance, _ = errors(np.array(got), poses)
+    # a scan that is found 1 mm off in 1 ms would make it 1 m/s
+    assert distance.max() < 0.03
