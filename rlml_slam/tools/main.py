@@ -91,6 +91,9 @@ COMMANDS: Table = {
                 'study_repeatability',
                 'how often spikes and lines of a corrected log are seen again',
             ),
+            'closures': Command(
+                'study_closures', 'whether the loop closures of a log are right, by its relations'
+            ),
             'detector': Command(
                 'study_detector', 'bias, false detections and reach of the reflector detector'
             ),
