@@ -146,8 +146,10 @@ class _Selector:
         poses = self._graph.poses
         i, j = self._nodes.T
         e = factors.relative_pose(poses[i], poses[j], self._z)[0]
-        bad = self._accepted & ~self._held & (self._weigh(e, self._cov) < 0.0)
+        now = self._weigh(e, self._cov)
+        bad = self._accepted & ~self._held & (now < 0.0)
         if bad.any():
+            self._evidence[bad] = now[bad]
             self._left[bad] -= 1
             self._accepted &= ~bad
             self._solve()

@@ -91,12 +91,14 @@ class ClosureWatch:
     def _judge(self, closures: Sequence[Closure]) -> tuple[Closure, ...]:
         """Judge all anew; those whose state changed."""
         revoked = [c.edge for c in closures if c.fate.state is State.REVOKED]
+        before = self._graph.edges.enabled.copy()
         chosen = select_closures(self._graph, self._p.solver, np.array(revoked, np.int64))
         # of what is neither proven nor refuted yet, the verification when it was made is believed
         good = chosen.accepted | (chosen.evidence > 0.0)
         is_revoked = np.isin(chosen.edges, revoked)
         if np.sum(good) < MAJORITY * np.sum(~is_revoked):
-            good[:] = True  # not so many matches fail that were verified: odometry is off
+            # not so many matches fail that were verified: odometry is off, and all stays as it was
+            good = before[chosen.edges]
         good[is_revoked] = False
         self._graph.edges.enabled[chosen.edges] = good
         optimize(self._graph, self._p.solver)
