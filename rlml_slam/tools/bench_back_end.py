@@ -18,6 +18,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import numpy as np
+
 from rlml_slam.errors import RlmlError
 from rlml_slam.graph.g2o import read_graph
 from rlml_slam.graph.graph import Graph
@@ -53,13 +55,14 @@ def run(args: argparse.Namespace) -> int:
         os.environ.setdefault(name, '1')
     if args.runs < 1:
         raise RlmlError(f'--runs {args.runs} is not at least 1')
+    libraries = {name: m for name, m in installed().items() if name not in args.without}
+    if 'g2o' in libraries and int(np.__version__.partition('.')[0]) >= 2:
+        raise RlmlError(
+            f'g2o-python dies of NumPy {np.__version__}: take an environment with '
+            "'numpy<2', or --without g2o"
+        )
     warm_up()
-    solvers = {
-        name: solver
-        for library, members in installed().items()
-        for name, solver in members.items()
-        if library not in args.without
-    }
+    solvers = {name: solver for m in libraries.values() for name, solver in m.items()}
     results = []
     for name, graph in _graphs(args.graphs, args.generated):
         for start in ('file', 'odometry'):
