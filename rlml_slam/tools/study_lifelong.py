@@ -187,7 +187,7 @@ def row(slam: Slam, errors: list[float], t: float, before_mb: float) -> dict[str
 
 
 def judge(slam: Slam, before: World, after: World, moved: NDArray[np.int64]) -> dict[str, Any]:
-    """How many reflectors of each sort the map has, and how far the unmoved ones are off."""
+    """How many reflectors of each sort the map has, and how far the unmoved ones in it are off."""
     found = slam.reflectors()
     start = se2.inverse(before.start)
     old, new = (se2.transform(start, w.reflectors.points) for w in (before, after))
@@ -197,11 +197,13 @@ def judge(slam: Slam, before: World, after: World, moved: NDArray[np.int64]) -> 
         gap = np.linalg.norm(points[:, None] - found.points[None], axis=-1)
         return np.asarray(gap.min(axis=1, initial=np.inf))
 
+    gaps = near(old[still])
+    there = gaps[gaps < CLOSE]
     return {
         'mapped': len(found),
-        'unmoved_mapped': int((near(old[still]) < CLOSE).sum()),
+        'unmoved_mapped': len(there),
         'unmoved': len(still),
-        'unmoved_rmse_m': float(np.sqrt(np.mean(np.minimum(near(old[still]), CLOSE) ** 2))),
+        'unmoved_rmse_m': float(np.sqrt(np.mean(there**2))) if len(there) else None,
         'moved_learned_anew': int((near(new[moved]) < CLOSE).sum()),
         'moved': len(moved),
     }
@@ -216,9 +218,11 @@ def text(figures: dict[str, Any]) -> str:
     widths = [max(len(c[k]) for c in cells) for k in range(len(names))]
     lines = ['  '.join(f'{c:>{w}}' for c, w in zip(r, widths, strict=True)) for r in cells]
     r = figures['reflectors']
+    off = r['unmoved_rmse_m']
+    by = '' if off is None else f', off by {100 * off:.1f} cm'
     lines.append(
-        f'{r["unmoved_mapped"]} of {r["unmoved"]} reflectors that stayed are in the map, off by '
-        f'{100 * r["unmoved_rmse_m"]:.1f} cm; {r["moved_learned_anew"]} of {r["moved"]} that were '
+        f'{r["unmoved_mapped"]} of {r["unmoved"]} reflectors that stayed are in the map{by}; '
+        f'{r["moved_learned_anew"]} of {r["moved"]} that were '
         f'moved are there anew; {r["mapped"]} in all'
     )
     return '\n'.join(lines)

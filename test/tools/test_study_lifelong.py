@@ -31,6 +31,7 @@ def test_short_drive_has_a_row_per_part(capsys):
     assert last['keyframes'] > first['keyframes'] > 0
     assert last['live_ate_rmse_m'] < 0.05
     assert figures['reflectors']['mapped'] > 0
+    assert figures['reflectors']['unmoved_rmse_m'] < 0.05
     assert len(study.text(figures).splitlines()) == 4
 
 
