@@ -95,7 +95,8 @@ class Observation:
     the de-skewed end points of the valid beams, ``origin`` (2,) the laser's position; None where
     there was no scan. ``scan`` is the raw sweep. ``odom_pose`` (3,) is the raw odometry at the
     stamp, None without odometry. ``T_base_laser`` (3,) and ``sweep`` (3,), the motion of base
-    during the sweep, are those that ``points`` were made with.
+    during the sweep, are those that ``points`` were made with. ``stamp_sigma`` [s] is the error
+    of the stamps, where they jitter.
     """
 
     stamp: int
@@ -107,6 +108,7 @@ class Observation:
     odom_pose: Array | None = None
     T_base_laser: Array | None = None
     sweep: Array | None = None
+    stamp_sigma: float = 0.0
 
 
 class Status(IntEnum):

@@ -485,7 +485,7 @@ class FrontEnd:
         began: float,
     ) -> Frame:
         pose, cov = self.state.pose, self.state.pose_cov
-        T_map_base, cov_map = self.in_map(pose, cov)
+        T_map_base, cov_map = self.in_map(pose, cov + self._late(observation.stamp_sigma))
         used = matched.status == Status.USED
         return Frame(
             stamp=observation.stamp,
@@ -505,6 +505,16 @@ class FrontEnd:
             doubtful=doubtful or self._unconfirmed,
             jumped=self._jumped,
         )
+
+    def _late(self, sigma: float) -> Array:
+        """Covariance (3, 3) of how far the robot goes in the error ``sigma`` [s] of a stamp.
+
+        It is published alone: one stamp's error is nearly that of the next, and of the map's.
+        """
+        R = np.eye(3)
+        R[:2, :2] = se2.rotation(self.state.pose[2])
+        gone = R @ self._velocity * sigma
+        return np.outer(gone, gone)
 
     def reflectors(self) -> Reflectors:
         """The confirmed reflectors in the map frame."""

@@ -13,6 +13,7 @@ for those of the others that are due before it, so that no lidar makes another o
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -324,8 +325,28 @@ class Sequencer:
             motion = compose_motion(self._carried, self._motion(self._last, stamp))
         self._last, self._carried = stamp, STILL
         return Observation(
-            stamp, motion, points, origin, detections, scan, self.buffer.pose_at(stamp), T, delta
+            stamp,
+            motion,
+            points,
+            origin,
+            detections,
+            scan,
+            self.buffer.pose_at(stamp),
+            T,
+            delta,
+            self._stamp_sigma(group),
         )
+
+    def _stamp_sigma(self, group: list[Waiting]) -> float:
+        """Error [s] of what was measured when, against odometry, where stamps jitter."""
+        sources = [(stream, item.frame_id) for _, stream, item, _ in group]
+        # both of one instant have the clock of that which came first
+        measured = max((self._sigma(*source) for source in sources), default=0.0)
+        return math.hypot(measured, self._sigma('odom')) / SECOND
+
+    def _sigma(self, stream: str, source: str = '') -> float:
+        clock = self._clocks.get((stream, source))
+        return 0.0 if clock is None else clock.sigma
 
     def _carry(self, now: int) -> None:
         """Sum up the motion of a long time without observations before the buffer forgets it."""

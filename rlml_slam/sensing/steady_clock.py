@@ -4,7 +4,7 @@
 A stamp that a driver takes when the data have come jitters by what the transport does, at the
 robot's speed some centimetres. The sensor itself is steady: its true times lie on a straight line
 over the number of the message, and a line through the last WINDOW stamps tells the newest one with
-an error of 2 / sqrt(WINDOW) of the jitter.
+an error of 2 / sqrt(WINDOW) of the jitter; ``sigma`` is the error that is left.
 
 Whether a sensor is steady is asked of the stamps. White jitter makes the variance of the intervals
 twice that about the line; where the intervals themselves vary, times wander off any line, and the
@@ -18,12 +18,12 @@ import math
 from collections import deque
 from typing import NamedTuple
 
-WINDOW = 100  # stamps that the line is laid through
+WINDOW = 400  # stamps that the line is laid through
 FEW = 8  # stamps through which a line tells whether messages were lost
 ENOUGH = 32  # stamps before anything is said: intervals that vary have wandered off by then
 # variance about the line per variance of the intervals; 0.5 is that of white jitter
 STEADY = 0.6
-UNSTEADY = 0.9  # of a clock that was steady
+UNSTEADY = 0.9  # no jitter: that of a clock that was steady is not above it
 SMALL = 5e6  # [ns] at 1 m/s, jitter below this is less than the noise: the stamps stay as they are
 OVERTAKES = 0.5  # of the expected number of stamps earlier than the one before
 OUTLIER = 5.0  # sigmas of the jitter: a stamp farther from the line is not on it
@@ -47,6 +47,7 @@ class SteadyClock:
     """The line through the newest stamps of one sensor, in whole nanoseconds."""
 
     def __init__(self) -> None:
+        self.sigma = 0.0  # [ns] of the stamp told last, where jitter shows
         self._restart()
         self._told: tuple[int, int] | None = None
 
@@ -54,6 +55,7 @@ class SteadyClock:
         self._stamps: deque[tuple[int, int]] = deque()  # number of the message, stamp
         self._first = 0
         self._is_steady = False
+        self._lost = 0  # messages thought lost before the newest
         # sums over the window of 1, k, k^2, s, k s, s^2, k being the number, s the stamp since
         # the first; and over its steps of n^2, n d, d^2
         self._sums = [0] * 6
@@ -72,10 +74,17 @@ class SteadyClock:
                 number = self._numbered(stamp, number, line)
         self._add(number, stamp)
         line = self._line()
-        self._is_steady = line is not None and self._is_jitter(line)
-        out = stamp
-        if line is not None and self._is_steady and line.sigma > SMALL:
-            out = self._first + round(line.start + line.period * number)
+        out, self.sigma = stamp, 0.0
+        if line is None or not self._is_jitter(line):
+            self._is_steady = False
+        else:
+            limit = UNSTEADY if self._is_steady else STEADY
+            self._is_steady = len(self._stamps) >= ENOUGH and line.ratio < limit
+            self.sigma = line.sigma if line.sigma > SMALL else 0.0
+            # whether one was lost, or this one is late, the next will tell
+            if self._is_steady and self.sigma and not self._lost:
+                out = self._first + round(line.start + line.period * number)
+                self.sigma *= 2.0 / math.sqrt(len(self._stamps))
         self._told = (stamp, out)
         return out
 
@@ -86,6 +95,11 @@ class SteadyClock:
         """
         sigma = max(line.sigma, SMALL)
         ahead = stamp - self._first - (line.start + line.period * number)
+        if self._lost == 1 and ahead < -0.5 * line.period:
+            # none was lost: the one before was late
+            self._renumber_newest(number - 2)
+            number -= 1
+            ahead += line.period
         resolved = RESOLVED * sigma < line.period
         lost = 0
         if ahead > (LOST * line.period if resolved else OUTLIER * sigma):
@@ -94,28 +108,38 @@ class SteadyClock:
         if (self._is_steady and off) or lost > WINDOW:
             self._restart()
             return 0
+        self._lost = lost
         return number + lost
 
+    def _renumber_newest(self, number: int) -> None:
+        last, stamp = self._stamps.pop()
+        self._count(last, stamp, -1)
+        self._count_step(self._stamps[-1], (last, stamp), -1)
+        self._append(number, stamp)
+
     def _is_jitter(self, line: Line) -> bool:
-        """Whether the stamps are those of a steady sensor and white jitter."""
-        n = len(self._stamps)
-        if n < ENOUGH or line.ratio >= (UNSTEADY if self._is_steady else STEADY):
+        """Whether the stamps may be those of a steady sensor and white jitter."""
+        if line.ratio >= UNSTEADY:
             return False
         # two neighbours' jitter differs by a normal deviate of sqrt(2) sigma
+        n = len(self._stamps)
         expected = 0.5 * n * math.erfc(0.5 * line.period / max(line.sigma, SMALL))
         return self._overtakes >= OVERTAKES * expected - 1.0
 
     def _add(self, number: int, stamp: int) -> None:
         if not self._stamps:
             self._first = stamp
-        else:
-            self._count_step(self._stamps[-1], (number, stamp), 1)
-        self._stamps.append((number, stamp))
-        self._count(number, stamp, 1)
+        self._append(number, stamp)
         if len(self._stamps) > WINDOW:
             oldest = self._stamps.popleft()
             self._count(*oldest, -1)
             self._count_step(oldest, self._stamps[0], -1)
+
+    def _append(self, number: int, stamp: int) -> None:
+        if self._stamps:
+            self._count_step(self._stamps[-1], (number, stamp), 1)
+        self._stamps.append((number, stamp))
+        self._count(number, stamp, 1)
 
     def _count(self, k: int, stamp: int, sign: int) -> None:
         s = stamp - self._first

@@ -450,3 +450,15 @@ def test_scans_that_come_in_bursts_tell_no_velocity():
     distance, _ = errors(np.array(got), poses)
     # a scan that is found 1 mm off in 1 ms would make it 1 m/s
     assert distance.max() < 0.03
+
+
+def test_a_moving_robot_is_as_uncertain_as_its_stamps_are():
+    speed, late = 0.5, 0.02
+    observed = observations(ROOM, drive((speed, 0.0, 2.0)))
+    sure, _ = run(observed)
+    unsure, _ = run([replace(o, stamp_sigma=late) for o in observed])
+    added = np.array([f.cov_map for f in unsure]) - np.array([f.cov_map for f in sure])
+    along = unsure[-1].T_map_base[2]
+    gone = late * speed * np.array([np.cos(along), np.sin(along)])
+    np.testing.assert_allclose(added[-1][:2, :2], np.outer(gone, gone), atol=0.1 * gone @ gone)
+    np.testing.assert_allclose(unsure[-1].T_map_base, sure[-1].T_map_base, atol=1e-12)

@@ -33,11 +33,28 @@ def jittered(true, rng, sigma=20):
 
 @pytest.mark.parametrize('period', [100, 20, 10])
 def test_jitter_of_a_steady_sensor_is_averaged_over_the_window(period):
-    true = ticks(period, 2000)
+    true = ticks(period, 8000)
     error = (told(jittered(true, np.random.default_rng(0))) - true)[WINDOW:] / MS
     # the end of a line through n stamps has 2 / sqrt(n) of their error; a tenth of it is the
     # sampling error of some twenty independent windows
-    assert 0.7 * 4.0 < error.std() < 1.3 * 4.0
+    assert 0.7 * 2.0 < error.std() < 1.3 * 2.0
+
+
+@pytest.mark.parametrize('seed', [1, 5])
+def test_the_error_that_is_left_is_told(seed):
+    # five sigmas per period: some late messages look as if one had been lost before
+    true = ticks(100, 6000)
+    stamps = jittered(true, np.random.default_rng(seed))
+    clock, error, sigma = SteadyClock(), [], []
+    for t, s in zip(true, stamps, strict=True):
+        error.append(clock.steady(int(s)) - t)
+        sigma.append(clock.sigma)
+    normalised = (np.array(error) / np.maximum(sigma, 1.0))[ENOUGH:]
+    assert 0.6 < normalised.std() < 1.5
+    # before a line is believed, the stamps have all of their jitter
+    assert 10 * MS < sigma[ENOUGH - 2] < 30 * MS
+    assert told(true).tolist() == true.tolist()
+    assert SteadyClock().sigma == 0.0
 
 
 def test_stamps_with_little_jitter_stay_as_they_are():
