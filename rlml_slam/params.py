@@ -129,6 +129,9 @@ class Node(Group):
     map_start_pose: tuple[float, ...] = param(
         (0.0, 0.0, 0.0), 'start pose in the map', 'm, m, rad'
     )
+    restore_pose: bool = param(
+        True, 'start in a saved map where the robot was last, if what it sees fits there'
+    )
     laser_pose: tuple[float, ...] = param(
         (0.0, 0.0, 0.0), 'pose of the laser in base_frame where no /tf_static tells', 'm, m, rad'
     )

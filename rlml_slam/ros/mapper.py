@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rlml_slam import se2
-from rlml_slam.errors import MapError
+from rlml_slam.errors import FileFormatError, MapError
 from rlml_slam.maps import container
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved import SavedMap
@@ -24,6 +24,7 @@ from rlml_slam.ros import build
 from rlml_slam.ros.associated import build_reflector_map
 from rlml_slam.ros.beliefs import StampedBelief, build_belief
 from rlml_slam.ros.frames import Record
+from rlml_slam.ros.last_pose import LastPose, verified
 from rlml_slam.ros.map_folder import MapFolder
 from rlml_slam.ros.messages import make_rclpy, rclpy_class
 from rlml_slam.ros.products import MapProducts
@@ -57,8 +58,10 @@ class Mapper:
         self.folder = MapFolder(params.node.map_directory)
         self.saved: SavedMap | None = None
         self._loaded: SavedMap | None = None  # the last one that came from the folder
+        self._last_pose: LastPose | None = None
+        self._started = False  # whether the last pose was looked at
         if params.node.mode == 'localization':
-            self.saved = self._loaded = self.folder.load(params.node.map_file_name)
+            self._load(params.node.map_file_name)
         self.back_end = BackEnd(params)
         self.recovery = Recovery(params)
         self.worker = Worker()
@@ -117,6 +120,7 @@ class Mapper:
                     self._send_belief(record)
         self._place_odom(frame)
         self._recover(record)
+        self._use_last_pose(frame)
         due = self.saved is None and self.products.is_due(frame.stamp)
         if due and self.worker.backlog < MAX_BACKLOG:
             self.publish_map()
@@ -142,6 +146,37 @@ class Mapper:
             self._relocation.publish(
                 build.pose_with_covariance(make_rclpy, frame.stamp, name, found.pose, found.cov)
             )
+
+    def _use_last_pose(self, frame: Frame) -> None:
+        """Start where the robot was last, if that is verified; and write down where it is."""
+        if self._last_pose is None or self.saved is not self._loaded:
+            return
+        try:
+            if self._started:
+                self._last_pose.remember(frame)
+            elif frame.observation.points is not None or frame.observation.detections is not None:
+                self._started = True
+                self._restore(frame, self._last_pose)
+        except MapError as e:
+            self._logger.warning(f'{e}')
+            self._last_pose = None  # where it cannot be written now, it cannot later
+
+    def _restore(self, frame: Frame, file: LastPose) -> None:
+        try:
+            last = file.read()
+        except FileFormatError as e:
+            self._logger.warning(f'{e}')
+            return
+        if last is None:
+            return
+        in_map = self.current()
+        found = find_place(in_map.grid, in_map.reflectors, frame.observation, self._p)
+        start, why = verified(last, found)
+        if start is None:
+            self._logger.warning(why)
+        else:
+            self._logger.info(why)
+            self._tell_pose(frame.stamp, *start)
 
     def _place_odom(self, frame: Frame) -> None:
         """Map to odom by a frame; one that lacks the odometry there is leaves it as it was."""
@@ -249,9 +284,16 @@ class Mapper:
         """In the worker: localise in another saved map. Raises MapError."""
         if self.saved is None:
             raise MapError('load_map needs mode:=localization')
-        self.saved = self._loaded = self.folder.load(name)
+        self._started = True  # the robot is where it is, not where it was last in that map
+        self._load(name)
         self._use_saved()
         return self.saved
+
+    def _load(self, name: str) -> None:
+        self.saved = self._loaded = self.folder.load(name)
+        if self._p.node.restore_pose:
+            path = self.folder.path(name)
+            self._last_pose = LastPose(path.with_name(path.name + '.pose'))
 
     def _use_saved(self) -> None:
         """Publish the map that never changes, and tell the front end to localize in it."""

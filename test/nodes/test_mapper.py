@@ -18,9 +18,10 @@ from rlml_slam.params import Parameters
 from rlml_slam.rlml import stored_map
 from rlml_slam.ros.associated import read_reflector_map
 from rlml_slam.ros.frames import Record
+from rlml_slam.ros.last_pose import LastPose
 from rlml_slam.ros.map_folder import MapFolder
 from rlml_slam.ros.mapper import Mapper
-from rlml_slam.types import Frame, Motion, Observation, Reflectors
+from rlml_slam.types import Detections, Frame, Health, Level, Motion, Observation, Reflectors
 
 SECOND = 1_000_000_000
 ODOMETRY = np.array([100.0, 50.0, 1.0])
@@ -211,3 +212,72 @@ def test_map_without_the_grid_that_cannot_be_drawn(make, ear, tmp_path):
 
 def too_large():
     raise MapError('map of 9 x 9 cells')
+
+
+# --- the last pose ----------------------------------------------------------------------------
+
+STARS = np.array([[-3.6, -2.7], [3.4, -2.9], [3.8, 1.1], [-0.7, 2.6], [-3.9, 1.9], [1.5, -2.4]])
+HERE = np.array([0.8, 0.5, 1.1])
+
+
+def sees(mapper, k, pose, level=Level.OK):
+    """The k-th frame of a robot that sees STARS from a pose, and believes to be there."""
+    stamp, cov, n = (k + 1) * SECOND, 1e-4 * np.eye(3), len(STARS)
+    points = se2.transform(se2.inverse(pose), STARS)
+    detections = Detections(
+        stamp, 'base_link', points, np.tile(1e-4 * np.eye(2), (n, 1, 1)), np.full(n, -1),
+        np.full(n, np.nan),
+    )  # fmt: skip
+    observation = Observation(
+        stamp, Motion(np.zeros(3), cov), detections=detections, odom_pose=ODOMETRY
+    )
+    used = np.arange(n)
+    frame = Frame(
+        stamp, observation, pose, cov, pose, cov, used, np.zeros(n, dtype=np.int64),
+        Health(level, ()),
+    )  # fmt: skip
+    mapper.add(Record(1, frame, False, False))
+    mapper.worker.submit(lambda: None).result()
+
+
+@pytest.fixture
+def switched_off(make, tmp_path):
+    """A folder with a map of STARS in which a robot was at HERE when it was switched off."""
+    stars = dataclasses.replace(posts(len(STARS)), points=STARS)
+    MapFolder(str(tmp_path)).save('map', SavedMap(stars))
+    mapper = make(mode='localization', map_directory=str(tmp_path))
+    sees(mapper, 0, np.zeros(3))
+    sees(mapper, 1, HERE)
+    return tmp_path
+
+
+def told(ear):
+    return [[m.pose.pose.position.x, m.pose.pose.position.y] for m in ear.sent['initialpose']]
+
+
+def test_robot_starts_where_it_was_switched_off(make, ear, switched_off):
+    assert told(ear) == []
+    mapper = make(mode='localization', map_directory=str(switched_off))
+    sees(mapper, 0, HERE, Level.DEGRADED)
+    np.testing.assert_allclose(told(ear), [HERE[:2]], atol=0.02)
+    sees(mapper, 1, HERE)
+    assert len(told(ear)) == 1
+
+
+def test_robot_that_was_moved_while_it_was_off_does_not(make, ear, switched_off):
+    mapper = make(mode='localization', map_directory=str(switched_off))
+    sees(mapper, 0, np.array([-1.5, 0.5, -2.0]), Level.DEGRADED)
+    assert told(ear) == []
+    assert 'is not restored: the robot is rather at x = -1.5' in ear.warnings[-1]
+
+
+def test_last_pose_that_is_damaged_or_not_wanted_is_left(make, ear, switched_off):
+    mapper = make(mode='localization', map_directory=str(switched_off), restore_pose=False)
+    sees(mapper, 0, HERE, Level.DEGRADED)
+    (switched_off / 'map.pose').write_text('{')
+    mapper = make(mode='localization', map_directory=str(switched_off))
+    sees(mapper, 0, HERE, Level.DEGRADED)
+    sees(mapper, 1, HERE)
+    assert told(ear) == []
+    assert 'map.pose: no pose' in ear.warnings[-1]
+    assert LastPose(switched_off / 'map.pose').read() is not None  # a new one is kept
