@@ -371,6 +371,14 @@ class BackEnd(Group):
     place_distance: float = param(0.5, 'keyframes nearer than this are of one place', 'm', 0.01,
                                   100.0)  # fmt: skip
     place_heading: float = param(0.6, 'and turned by less than this', 'rad', 0.01, 3.2)
+    survey: str = param(
+        '',
+        'survey of reflectors (.csv, .json, SICK .imk) in map_directory; the map gets its frame',
+    )  # fmt: skip
+    survey_sigma: float = param(
+        0.02, 'error of a surveyed place per axis; 0.001 holds reflectors where surveyed', 'm',
+        0.001, 1.0,
+    )  # fmt: skip
     path_frames: int = param(
         1_000_000, 'frames of which the path is kept; beyond, every second one is let go', '',
         1000, 100_000_000,

@@ -255,6 +255,19 @@ def interpolate(T_a_b: ArrayLike, T_a_c: ArrayLike, fraction: ArrayLike) -> Arra
     return compose(T_a_b, exp(step * np.asarray(fraction, dtype=np.float64)[..., None]))
 
 
+def align(points: Array, targets: Array) -> Array:
+    """Pose (3,) T that minimises sum |T points_k - targets_k|^2; both (n, 2), in closed form.
+
+    theta = atan2(sum p x q, sum p . q) over the centred points (Horn/Umeyama in the plane).
+    """
+    p_mean, q_mean = points.mean(axis=0), targets.mean(axis=0)
+    p, q = points - p_mean, targets - q_mean
+    cross = float((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum())
+    theta = math.atan2(cross, float((p * q).sum()))
+    shift = q_mean - rotation(theta) @ p_mean
+    return np.array([shift[0], shift[1], theta])
+
+
 def warm_up() -> None:
     """Compile the kernels."""
     transform(np.zeros(3), np.zeros((1, 2)))

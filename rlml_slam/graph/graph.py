@@ -19,7 +19,7 @@ from rlml_slam.graph import factors
 from rlml_slam.graph.robust import Losses
 from rlml_slam.graph.system import Tables
 from rlml_slam.graph.table import Column, FactorKind, FactorTable, renumbered
-from rlml_slam.se2 import Array, wrap
+from rlml_slam.se2 import Array, compose, transform, wrap
 from rlml_slam.types import EdgeKind
 
 EDGE_KINDS = {
@@ -152,6 +152,14 @@ class Graph:
         """Add a prior on landmark k (a survey); information (2, 2) in the map's axes."""
         kind, sizes = FactorKind.LANDMARK_PRIOR, (len(self._landmarks),)
         return int(self.landmark_priors.append(kind, [[k]], point, information, sizes)[0])
+
+    def move(self, T: Array) -> None:
+        """Put all poses and landmarks elsewhere, as one: what lay at the origin lies at T (3,).
+
+        Factors between them hold as before; priors stay what they are.
+        """
+        self.poses[:] = compose(T, self.poses)
+        self.landmarks[:] = transform(T, self.landmarks)
 
     def keep(self, poses: NDArray[np.bool_], landmarks: NDArray[np.bool_]) -> Renumbering:
         """Let go of all other poses and landmarks with their factors, and of disabled sightings.

@@ -36,6 +36,11 @@ class Survey(NamedTuple):
     diameters: Array
 
 
+def same(a: Survey, b: Survey) -> bool:
+    """Whether two surveys say the same of where which reflector is."""
+    return np.array_equal(a.ids, b.ids) and np.array_equal(a.points, b.points)
+
+
 def load(path: str | Path) -> Survey:
     """Read a survey. Raises MapError if there is none, FileFormatError saying what is wrong."""
     path = Path(path)

@@ -72,12 +72,14 @@ class BackEndNode(Node):
     def figures(self) -> dict[str, object]:
         """Figures for /diagnostics."""
         graph, tried = self.mapper.back_end.graph, self.mapper.back_end.scans.tried
+        plant = self.mapper.back_end.plant
         return {
             'keyframes': len(graph.poses),
             'edges': len(graph.edges),
             'closures accepted': tried[True],
             'closures rejected': tried[False],
             **fates(self.mapper.back_end.scans.closures),
+            **({} if plant is None else {'survey': plant.why}),
             'frames waiting for the worker': self.mapper.worker.backlog,
             'frames without their points or detections': self.join.incomplete,
         }

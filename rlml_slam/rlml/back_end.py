@@ -13,12 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
+from rlml_slam.errors import MapError
 from rlml_slam.graph.factors import relative_information
 from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.marginals import Marginals
 from rlml_slam.graph.robust import Loss, Losses, LossKind
 from rlml_slam.graph.solver import optimize
 from rlml_slam.maps.occupancy import OccupancyGrid, render
+from rlml_slam.maps.survey import Survey, same
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.closure_watch import ClosureWatch
 from rlml_slam.rlml.correction import Correction, Known, either
@@ -26,6 +28,7 @@ from rlml_slam.rlml.deferred import DeferredMatches
 from rlml_slam.rlml.keyframes import Interval, Keyframe
 from rlml_slam.rlml.loop_closure import Closure, ScanGraph
 from rlml_slam.rlml.path import Path
+from rlml_slam.rlml.plant_frame import PlantFrame
 from rlml_slam.rlml.reflector_graph import ReflectorGraph
 from rlml_slam.rlml.sparsify import Sparsifier
 from rlml_slam.se2 import Array
@@ -51,10 +54,14 @@ class Update:
 
 
 class BackEnd:
-    """The graph over all keyframes; ``add`` each frame, read the map at any time."""
+    """The graph over all keyframes; ``add`` each frame, read the map at any time.
 
-    def __init__(self, params: Parameters) -> None:
+    With a ``survey``, its frame becomes that of the map as soon as the reflectors tell it.
+    """
+
+    def __init__(self, params: Parameters, survey: Survey | None = None) -> None:
         self._p = params
+        self._survey = survey
         self.reset()
 
     def reset(self) -> None:
@@ -75,12 +82,18 @@ class BackEnd:
         self.sparsifier = Sparsifier(p, self.graph, self.scans, self.reflector_graph)
         self.path = Path(p.back_end.path_frames)
         self.closure_watch = ClosureWatch(p, self.graph)
+        self.plant = self._plant_frame(self._survey)
         self._changed: tuple[Closure, ...] = ()  # since the newest keyframe began
         self.T_map_local = np.zeros(3)
         self.known: Known | None = None
         self._optimized = False
         self._interval: Interval | None = None
         self._since_optimized = 0
+
+    def _plant_frame(self, survey: Survey | None) -> PlantFrame | None:
+        if survey is None:
+            return None
+        return PlantFrame(self._p, self.graph, self.reflector_graph, survey)
 
     def add(self, frame: Frame) -> Update | None:
         """Take one frame of the front end; an Update where it became a keyframe."""
@@ -212,6 +225,9 @@ class BackEnd:
         optimize(self.graph, self._p.solver)
         if self.reflector_graph.merge(self.deferred.pending):
             optimize(self.graph, self._p.solver)
+        # open hypotheses are about places in the frame of now
+        if self.plant is not None and not self.deferred.pending and self.plant.update():
+            optimize(self.graph, self._p.solver)
         self._changed += self.closure_watch.review(self.scans.closures, final)
         self._optimized = True
         self._since_optimized = 0
@@ -225,13 +241,14 @@ class BackEnd:
 
         Nothing that was seen near it is in the graph yet: that is of the keyframe before, from
         which the front end's covariance has grown. What both have seen neither judges better; the
-        graph alone knows of the loops that scans have closed.
+        graph alone knows of the loops that scans have closed, and of the survey.
         """
         before, last = self.keyframes[-2:]
         cov = self.marginals().joint([before.index])
         R = np.eye(3)
         R[:2, :2] = se2.rotation(self.T_map_local[2])
-        if not any(closure.accepted for closure in self.scans.closures):
+        in_plant = self.plant is not None and self.plant.found
+        if not in_plant and not any(closure.accepted for closure in self.scans.closures):
             cov = either(cov, R @ before.cov_local @ R.T)
         since = Correction(self.T_map_local, Known(before.T_local, before.cov_local, cov))
         _, cov_map = since.apply(last.T_local, last.cov_local)
@@ -259,11 +276,23 @@ class BackEnd:
                 self._rejoin()
             self.optimize(final=True)
 
-    def start_from(self, keys: list[Keyframe], arrays: Mapping[str, NDArray[Any]]) -> None:
+    def start_from(
+        self,
+        keys: list[Keyframe],
+        arrays: Mapping[str, NDArray[Any]],
+        survey: Survey | None = None,
+    ) -> None:
         """Go on with a map whose graph is there already; the local frame is the map's from now on.
 
-        The next frame has to be one that ``jumped``: no motion leads to it.
+        The next frame has to be one that ``jumped``: no motion leads to it. A ``survey`` is that
+        whose frame the map has. Raises MapError if that is another one than was given to be used.
         """
+        if survey is not None:
+            if self._survey is not None and not same(survey, self._survey):
+                raise MapError('the map has the frame of another survey')
+            self.plant = self._plant_frame(survey)
+            assert self.plant is not None
+            self.plant.found = True
         last = keys[-1]
         last.T_local = self.graph.poses[last.index].copy()
         self.keyframes = keys

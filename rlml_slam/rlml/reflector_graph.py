@@ -42,7 +42,10 @@ SIGHTING = np.dtype(
 
 @dataclass
 class _Landmark:
-    """One reflector of the graph; ``beside`` are the keys of those seen with it at one time."""
+    """One reflector of the graph; ``beside`` are the keys of those seen with it at one time.
+
+    ``surveyed`` is its row in the survey, -1 where it is not in it.
+    """
 
     key: int
     index: int = -1
@@ -51,6 +54,7 @@ class _Landmark:
     count: int = 0
     sightings: Column = field(default_factory=lambda: Column((), SIGHTING))
     beside: set[int] = field(default_factory=set)
+    surveyed: int = -1
 
 
 class ReflectorGraph:
@@ -114,6 +118,25 @@ class ReflectorGraph:
     def _alive(self) -> list[_Landmark]:
         return [m for m in self._landmarks.values() if m.index >= 0]
 
+    def keys(self) -> frozenset[int]:
+        """Of the reflectors in the graph."""
+        return frozenset(m.key for m in self._alive())
+
+    def key_of(self, index: int) -> int:
+        """Of the reflector that is a landmark of the graph."""
+        return next(m.key for m in self._alive() if m.index == index)
+
+    def surveyed(self) -> dict[int, int]:
+        """Rows of the survey by key, of the reflectors that are in it."""
+        return {m.key: m.surveyed for m in self._alive() if m.surveyed >= 0}
+
+    def survey(self, key: int, row: int, id_: int) -> int:
+        """A reflector of the graph is one of the survey, or none (-1); its landmark there."""
+        landmark = self._landmarks[key]
+        landmark.surveyed = row
+        landmark.id = id_ if landmark.id == ANONYMOUS else landmark.id
+        return landmark.index
+
     def is_mapped(self, key: int) -> bool:
         """Whether the reflector has entered the graph."""
         landmark = self._landmarks.get(self.resolve(key))
@@ -147,13 +170,13 @@ class ReflectorGraph:
             d = points[i] - points[j]
             near = gap[i, j] < self._p.min_separation
             if near or d @ np.linalg.solve(cov, d) < limit:
-                self._absorb(alive[i], alive[j])
+                self._absorb(*_first(alive[i], alive[j]))
                 merged |= {i, j}
         return bool(merged)
 
     @staticmethod
     def _distinct(a: _Landmark, b: _Landmark) -> bool:
-        """Whether the two were seen from one keyframe, or tell different ids."""
+        """Whether the two were seen from one keyframe, or tell or were surveyed to be two."""
         return _named_apart(a, b) or b.key in a.beside
 
     def join(self, a: int, b: int) -> None:
@@ -166,9 +189,7 @@ class ReflectorGraph:
         )
         if first is second or _named_apart(first, second):
             return
-        if first.index < 0 <= second.index:
-            first, second = second, first
-        self._absorb(first, second)
+        self._absorb(*_first(first, second))
 
     def _absorb(self, keep: _Landmark, gone: _Landmark) -> None:
         self._unlink(gone.sightings.view)
@@ -241,6 +262,7 @@ class ReflectorGraph:
             'reflector_id': np.array([m.id for m in marks], dtype=np.int64),
             'reflector_diameter': np.array([m.diameter for m in marks], dtype=np.float64),
             'reflector_count': np.array([m.count for m in marks], dtype=np.int64),
+            'reflector_surveyed': np.array([m.surveyed for m in marks], dtype=np.int64),
             'reflector_sightings': np.array([len(r) for r in rows], dtype=np.int64),
             'reflector_beside': np.array(beside, dtype=np.int64).reshape(-1, 2),
             'reflector_alias': np.array(list(self._alias.items()), dtype=np.int64).reshape(-1, 2),
@@ -251,11 +273,13 @@ class ReflectorGraph:
         """Take over what was saved, with the graph that belongs to it."""
         a = arrays
         ends = np.cumsum(a['reflector_sightings'])
+        surveyed = a.get('reflector_surveyed', np.full(len(a['reflector_key']), -1))
         for k, key in enumerate(a['reflector_key'].tolist()):
             landmark = _Landmark(
                 key, int(a['reflector_node'][k]), int(a['reflector_id'][k]),
                 float(a['reflector_diameter'][k]), int(a['reflector_count'][k]),
             )  # fmt: skip
+            landmark.surveyed = int(surveyed[k])
             landmark.sightings.append(
                 a['sighting'][ends[k] - a['reflector_sightings'][k] : ends[k]]
             )
@@ -331,8 +355,15 @@ def _fused(s: Records) -> Records:
 
 
 def _named_apart(a: _Landmark, b: _Landmark) -> bool:
-    """Whether the two tell different ids."""
-    return a.id != ANONYMOUS and b.id != ANONYMOUS and a.id != b.id
+    """Whether the two tell different ids, or are different ones of the survey."""
+    named = a.id != ANONYMOUS and b.id != ANONYMOUS and a.id != b.id
+    return named or (a.surveyed >= 0 and b.surveyed >= 0 and a.surveyed != b.surveyed)
+
+
+def _first(a: _Landmark, b: _Landmark) -> tuple[_Landmark, _Landmark]:
+    """The one of two that goes on, which the graph or even the survey has, and the other."""
+    better = (b.index >= 0, b.surveyed >= 0) > (a.index >= 0, a.surveyed >= 0)
+    return (b, a) if better else (a, b)
 
 
 def _difference_cov(marginals: Marginals, a: int, b: int) -> Array:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rlml_slam.maps.container import Content
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved import SavedMap
+from rlml_slam.maps.survey import Survey
 from rlml_slam.params import Parameters
 from rlml_slam.rlml import stored_map
 from rlml_slam.rlml.back_end import BackEnd, Update
@@ -49,10 +50,12 @@ class Slam:
     another, as the back end's are in any case.
     """
 
-    def __init__(self, params: Parameters, parallel: bool = False) -> None:
+    def __init__(
+        self, params: Parameters, parallel: bool = False, survey: Survey | None = None
+    ) -> None:
         self.sequencer = Sequencer(params)
         self.front_end = FrontEnd(params)
-        self.back_end = BackEnd(params)
+        self.back_end = BackEnd(params, survey)
         self.recovery = Recovery(params)
         self.updates: list[Update] = []
         self._params = params

@@ -11,6 +11,7 @@ What maps/container.py writes, by name; n keyframes, m landmarks, lengths in met
     submap_…                        the grids that scans are matched against, cells in one row
     reflector_…, sighting           reflectors by key; `reflector_map` and `reflector_cov` are what
                                     a robot localizes with
+    survey_ids, survey_points, survey_diameters     the survey whose frame the map has, if any
     closure…, path, path_motion     records of closures, the path of all frames
     grid (rows, columns)            the occupancy grid, where there are scans
 
@@ -35,6 +36,7 @@ from rlml_slam.maps import container
 from rlml_slam.maps.container import Content
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved import SavedMap
+from rlml_slam.maps.survey import Survey
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.keyframes import Keyframe
@@ -76,6 +78,9 @@ def content_of(back_end: BackEnd, params: Parameters, grid: OccupancyGrid | None
         'program': __version__,
         'parameters': dataclasses.asdict(params),
     }
+    plant = back_end.plant
+    if plant is not None and plant.found:
+        arrays |= {f'survey_{name}': array for name, array in plant.survey._asdict().items()}
     if grid is not None:
         arrays['grid'] = grid.cells
         description['grid'] = {'resolution': grid.resolution, 'origin': list(grid.origin)}
@@ -122,12 +127,23 @@ def saved_map(content: Content) -> SavedMap:
     return SavedMap(reflectors, OccupancyGrid(float(d['grid']['resolution']), (x, y), a['grid']))
 
 
+def survey_of(content: Content) -> Survey | None:
+    """The survey whose frame the map has, None where the map has a frame of its own."""
+    a = content.arrays
+    if 'survey_points' not in a:
+        return None
+    return Survey(a['survey_ids'], a['survey_points'], a['survey_diameters'])
+
+
 def restore(content: Content, back_end: BackEnd) -> None:
-    """Let an empty back end go on with the map. Raises FileFormatError if its parts disagree."""
+    """Let an empty back end go on with the map.
+
+    Raises FileFormatError if its parts disagree, MapError if it has another survey's frame.
+    """
     a = content.arrays
     try:
         fill(back_end.graph, a)
-        back_end.start_from(_keyframes(a), a)
+        back_end.start_from(_keyframes(a), a, survey_of(content))
     except (KeyError, IndexError, ValueError, SolverError) as e:
         raise FileFormatError(f'the parts of the map do not fit together: {e}') from e
 

@@ -6,8 +6,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from rlml_slam.errors import MapError
-from rlml_slam.maps import occupancy, reflector_file
+from rlml_slam.maps import occupancy, reflector_file, survey
 from rlml_slam.maps.saved import SavedMap
+from rlml_slam.maps.survey import Survey
 
 
 class MapFolder:
@@ -25,6 +26,15 @@ class MapFolder:
         if not name or path == self._folder or not path.is_relative_to(self._folder):
             raise MapError(f'map {name!r} is not inside of map_directory, {self._folder}')
         return path
+
+    def survey(self, name: str) -> Survey | None:
+        """Surveyed reflectors; None without a name. MapError or FileFormatError if unusable."""
+        if not name:
+            return None
+        path = (self._folder / name).resolve()
+        if not path.is_relative_to(self._folder):
+            raise MapError(f'survey {name!r} is not inside of map_directory, {self._folder}')
+        return survey.load(path)
 
     def save(self, name: str, saved: SavedMap) -> Path:
         """Write name.csv, and name.pgm with name.yaml where there is a grid.

@@ -62,7 +62,8 @@ class Mapper:
         self._started = False  # whether the last pose was looked at
         if params.node.mode == 'localization':
             self._load(params.node.map_file_name)
-        self.back_end = BackEnd(params)
+        self.back_end = BackEnd(params, self.folder.survey(params.back_end.survey))
+        self._in_plant = False
         self.recovery = Recovery(params)
         self.worker = Worker()
         self.products = MapProducts(node, params.node)
@@ -116,6 +117,7 @@ class Mapper:
                 for closure in update.changed:
                     self._logger.warning(told(closure))
                 if update.optimized:
+                    self._tell_of_plant()
                     self._send_correction()
                     self._send_belief(record)
         self._place_odom(frame)
@@ -124,6 +126,14 @@ class Mapper:
         due = self.saved is None and self.products.is_due(frame.stamp)
         if due and self.worker.backlog < MAX_BACKLOG:
             self.publish_map()
+
+    def _tell_of_plant(self) -> None:
+        """Say so once when the map has entered the frame of the survey."""
+        plant = self.back_end.plant
+        found = plant is not None and plant.found
+        if plant is not None and found and not self._in_plant:
+            self._logger.info(f'the map has the frame of the survey: {plant.why}')
+        self._in_plant = found
 
     def _recover(self, record: Record) -> None:
         """Look for a lost robot, and tell the front end what is found.

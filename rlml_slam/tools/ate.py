@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,19 +80,6 @@ def interpolate(
     return poses, inside | exact
 
 
-def align(points: Array, targets: Array) -> Array:
-    """Pose (3,) T that minimises sum |T points_k - targets_k|^2; both (n, 2), in closed form.
-
-    theta = atan2(sum p x q, sum p . q) over the centred points (Horn/Umeyama in the plane).
-    """
-    p_mean, q_mean = points.mean(axis=0), targets.mean(axis=0)
-    p, q = points - p_mean, targets - q_mean
-    cross = float((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum())
-    theta = math.atan2(cross, float((p * q).sum()))
-    shift = q_mean - se2.rotation(theta) @ p_mean
-    return np.array([shift[0], shift[1], theta])
-
-
 def trajectory_errors(
     estimate: Trajectory, truth: Trajectory, aligned: bool = False, max_gap: int = MAX_GAP
 ) -> TrajectoryErrors:
@@ -106,7 +92,7 @@ def trajectory_errors(
     if not known.any():
         raise InputError('the trajectory and its truth have no time in common')
     poses, at = estimate.poses[known], at[known]
-    T = align(poses[:, :2], at[:, :2]) if aligned else np.zeros(3)
+    T = se2.align(poses[:, :2], at[:, :2]) if aligned else np.zeros(3)
     errors = se2.compose(T, poses) - at
     errors[:, 2] = se2.wrap(errors[:, 2])
     return TrajectoryErrors(

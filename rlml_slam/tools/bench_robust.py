@@ -28,7 +28,6 @@ from rlml_slam.graph.selection import select_closures
 from rlml_slam.graph.solver import optimize, warm_up
 from rlml_slam.graph.table import FactorKind
 from rlml_slam.se2 import Array
-from rlml_slam.tools.ate import align
 from rlml_slam.tools.bench_back_end import read_graphs
 from rlml_slam.tools.bench_rivals import timed
 from rlml_slam.tools.progress import Progress
@@ -166,7 +165,7 @@ def _judge(graph: Graph, method: Method, best: Array, right: int) -> dict[str, f
     """One solver on a copy of a graph."""
     own = copied(graph)
     cpu_ms, accepted = method(own)
-    T = align(own.poses[:, :2], best[:, :2])
+    T = se2.align(own.poses[:, :2], best[:, :2])
     error = np.hypot(*(se2.transform(T, own.poses[:, :2]) - best[:, :2]).T)
     out = {'ate_m': float(np.sqrt(np.mean(error**2))), 'cpu_ms': cpu_ms}
     if accepted is not None:

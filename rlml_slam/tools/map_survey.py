@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """``rlml map survey``: the reflectors of a saved map against where they were surveyed.
 
-The map's frame is found in the plant's by the constellation of all reflectors, ids do not count.
+The map's frame is found in the plant's by ids or by the constellation of all reflectors, unless
+the map was made in it.
 """
 
 from __future__ import annotations
@@ -18,14 +19,11 @@ from rlml_slam import se2
 from rlml_slam.errors import MapError
 from rlml_slam.maps import survey
 from rlml_slam.maps.survey import Survey
-from rlml_slam.matching.constellation import locate
-from rlml_slam.params import Relocalization
+from rlml_slam.matching.plant import pairs_at, place
 from rlml_slam.rlml import stored_map
-from rlml_slam.tools.ate import align
-from rlml_slam.types import Reflectors, Verdict
+from rlml_slam.types import Reflectors
 
 SIGMA = 0.05  # [m] a survey and a map may differ by this besides what the map states
-MATCH = 4.0  # sigmas within which a reflector of the map is one of the survey
 MOVED = 3.0  # [m] one that is missing and one that is new are one that was moved, if this near
 
 
@@ -44,30 +42,29 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare and print."""
-    known = stored_map.saved_map(stored_map.load(args.file))
-    figures = compare(known.reflectors, survey.load(args.survey))
+    content, surveyed = stored_map.load(args.file), survey.load(args.survey)
+    own = stored_map.survey_of(content)
+    in_plant = own is not None and survey.same(own, surveyed)
+    figures = compare(stored_map.saved_map(content).reflectors, surveyed, in_plant)
     print(json.dumps(figures) if args.json else text(figures))
     return 0
 
 
-def compare(found: Reflectors, surveyed: Survey) -> dict[str, Any]:
+def compare(found: Reflectors, surveyed: Survey, in_plant: bool = False) -> dict[str, Any]:
     """Residuals, and what is missing, new or moved. Raises MapError where nothing tells the place.
 
-    ``T_plant_map`` makes the sum of the squared residuals as small as it can be.
+    ``T_plant_map`` makes the sum of the squared residuals as small as it can be; a map that is
+    ``in_plant``, in the frame of the survey, is not moved.
     """
-    cov = np.tile(SIGMA**2 * np.eye(2), (len(surveyed.points), 1, 1))
-    place = locate(found.points, found.cov, surveyed.points, cov, Relocalization())
-    if place.verdict is not Verdict.UNIQUE:
-        raise MapError(f'the map is not found in the survey: {place.why}')
-    T, pairs = place.candidates[0].pose, np.zeros((0, 2), dtype=np.int64)
-    for _ in range(5):  # the first pairs may lack some at the edge, where a turn counts most
-        there = se2.transform(T, found.points)
-        gap = np.linalg.norm(there[:, None] - surveyed.points[None], axis=-1)
-        sigma = np.sqrt(np.linalg.eigvalsh(found.cov)[:, -1] + SIGMA**2)
-        near = (gap < MATCH * sigma[:, None]) & (gap == gap.min(axis=0))
-        near &= gap == gap.min(axis=1)[:, None]
-        pairs = np.argwhere(near)
-        T = align(found.points[pairs[:, 0]], surveyed.points[pairs[:, 1]])
+    if in_plant:
+        T, pairs = np.zeros(3), pairs_at(found, surveyed, np.zeros(3), SIGMA)
+        if not len(pairs):
+            raise MapError('no reflector of the map is where one was surveyed')
+    else:
+        placed = place(found, surveyed, SIGMA)
+        if placed.T_plant_map is None:
+            raise MapError(f'the map is not found in the survey: {placed.why}')
+        T, pairs = placed.T_plant_map, placed.pairs
     there = se2.transform(T, found.points)
     d = there[pairs[:, 0]] - surveyed.points[pairs[:, 1]]
     extra = np.setdiff1d(np.arange(len(found)), pairs[:, 0])
@@ -102,12 +99,13 @@ def compare(found: Reflectors, surveyed: Survey) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def name_of(row: dict[str, Any]) -> str:
+    """What a surveyed reflector is called; one without an id by its row, #1 the first."""
+    return str(row['id']) if row['id'] >= 0 else f'#{row["survey"] + 1}'
+
+
 def text(figures: dict[str, Any]) -> str:
-    """The figures for people; a reflector without an id is named by its row, #1 the first."""
-
-    def name(row: dict[str, Any]) -> str:
-        return str(row['id']) if row['id'] >= 0 else f'#{row["survey"] + 1}'
-
+    """The figures for people."""
     x, y, theta = figures['T_plant_map']
     lines = [
         f'the map lies at x = {x:.4f} m, y = {y:.4f} m, {math.degrees(theta):.3f}° in the survey',
@@ -116,14 +114,20 @@ def text(figures: dict[str, Any]) -> str:
     ]
     for r in figures['residuals']:
         lines.append(
-            f'{name(r):>9} {r["key"]:4d} {1e3 * r["dx_m"]:8.1f} {1e3 * r["dy_m"]:8.1f} '
+            f'{name_of(r):>9} {r["key"]:4d} {1e3 * r["dx_m"]:8.1f} {1e3 * r["dy_m"]:8.1f} '
             f'{1e3 * r["error_m"]:11.1f}'
         )
+    return '\n'.join([*lines, *changes(figures)])
+
+
+def changes(figures: dict[str, Any]) -> list[str]:
+    """A line per reflector that is not where it was surveyed, or was not surveyed."""
+    lines = []
     for r in figures['moved']:
-        lines.append(f'moved: {name(r)} by {r["by_m"]:.2f} m, in the map as {r["key"]}')
+        lines.append(f'moved: {name_of(r)} by {r["by_m"]:.2f} m, in the map as {r["key"]}')
     for r in figures['missing']:
-        lines.append(f'missing: {name(r)} at {r["at"][0]:.2f}, {r["at"][1]:.2f}')
+        lines.append(f'missing: {name_of(r)} at {r["at"][0]:.2f}, {r["at"][1]:.2f}')
     for r in figures['new']:
         seen = f'seen {r["sightings"]} times'
         lines.append(f'new: {r["key"]} of the map at {r["at"][0]:.2f}, {r["at"][1]:.2f}, {seen}')
-    return '\n'.join(lines)
+    return lines

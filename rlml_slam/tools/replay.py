@@ -18,16 +18,19 @@ import numpy as np
 from rlml_slam import warm_up
 from rlml_slam.ekf.slam import EkfSlam
 from rlml_slam.errors import BagError, InputError, MapError, ParameterError
-from rlml_slam.maps import saved
+from rlml_slam.maps import saved, survey
 from rlml_slam.maps.container import Content
 from rlml_slam.maps.saved import SavedMap
+from rlml_slam.maps.survey import Survey
 from rlml_slam.params import EkfParameters, Parameters, from_mapping, read_yaml
 from rlml_slam.rlml import stored_map
+from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.closure_table import closure_table
 from rlml_slam.rlml.slam import Slam
 from rlml_slam.ros.bag import BagReader
 from rlml_slam.ros.feed import Feed
 from rlml_slam.tools.bag_inputs import BagInputs
+from rlml_slam.tools.map_survey import compare
 from rlml_slam.tools.outputs import make_folder, write_outputs
 from rlml_slam.tools.progress import Progress
 from rlml_slam.tools.record import FrameLog, Run, Truth
@@ -67,6 +70,10 @@ def add_parser(subparsers: Any) -> None:
         help='go on mapping with this .rlml file',
     )  # fmt: skip
     parser.add_argument(
+        '--survey', metavar='FILE', type=Path,
+        help='surveyed reflectors (.csv, .json, SICK .imk): their frame becomes that of the map',
+    )  # fmt: skip
+    parser.add_argument(
         '--no-odometry', action='store_true', help='leave out the odometry: as use_odom false'
     )
     parser.add_argument('--json', action='store_true', help='print metrics.json and no more')
@@ -80,13 +87,15 @@ def run(args: argparse.Namespace) -> int:
         params = replace(params, node=replace(params.node, use_odom=False))
     make_folder(args.out)  # before the work, not after it
     truth = Truth(read_tum(args.truth), is_map=False) if args.truth else None
-    if args.map and args.go_on:
-        raise ParameterError('replay: --map and --continue exclude each other')
+    if args.map and (args.go_on or args.survey):
+        raise ParameterError('replay: --map excludes --continue and --survey')
     known = load_known(args.map) if args.map else None
     begun = stored_map.load(args.go_on) if args.go_on else None
+    surveyed = survey.load(args.survey) if args.survey else None
     result = replay(
-        args.bag, params, truth, args.system, quiet=args.json, known=known, begun=begun
-    )
+        args.bag, params, truth, args.system, quiet=args.json, known=known, begun=begun,
+        surveyed=surveyed,
+    )  # fmt: skip
     figures = write_outputs(result, args.out)
     if args.json:
         print(json.dumps(figures))
@@ -112,13 +121,15 @@ def replay(
     quiet: bool = True,
     known: SavedMap | None = None,
     begun: Content | None = None,
+    surveyed: Survey | None = None,
 ) -> Run:
     """Drive the system with a bag's messages in the order of the log.
 
     ``truth`` replaces that of the bag; ``known`` is a map to localize in, from the pose
-    ``map_start_pose`` or from where the robot finds itself, ``begun`` one to go on with. A damaged
-    bag, or one whose clock jumps back, gives what came before, and ``Run.problem`` says so. Raises
-    BagError if there is nothing to use at all.
+    ``map_start_pose`` or from where the robot finds itself, ``begun`` one to go on with;
+    ``surveyed`` reflectors define the frame of the map. A damaged bag, or one whose clock jumps
+    back, gives what came before, and ``Run.problem`` says so. Raises BagError if there is nothing
+    to use at all.
     """
     warm_up.compile_loaded()
     with BagReader(path) as bag:
@@ -130,6 +141,10 @@ def replay(
                 raise ParameterError('replay: --map is for --system rlml')
             slam = Slam(replace(params, node=replace(params.node, mode='localization')))
             slam.use_map(known)
+        if surveyed is not None:
+            if not isinstance(slam, Slam):
+                raise ParameterError('replay: --survey is for --system rlml')
+            slam = Slam(params, parallel=True, survey=surveyed)
         if begun is not None:
             if not isinstance(slam, Slam):
                 raise ParameterError('replay: --continue is for --system rlml')
@@ -151,6 +166,7 @@ def replay(
         result = collect(slam, log, Path(path).resolve().name, truth or inputs.truth())
         if isinstance(slam, Slam) and known is None:
             result.stored = stored_map.content_of(slam.back_end, params, result.grid)
+            result.extra = survey_figures(slam.back_end)
         result.inputs = fates(slam.counts, bag.skipped, inputs.topics)
     result.wall_s = wall
     ended = f'{problem}; the results hold what came before' if problem else ''
@@ -184,6 +200,17 @@ def _drive(
                 done = (log_time - start) * 1e-9
                 factor = done / max(time.perf_counter() - began, 1e-3)
                 progress.update(done, f'{factor:.0f} x real time')
+
+
+def survey_figures(back_end: BackEnd) -> dict[str, Any]:
+    """Of metrics.json: how the map and the survey, if there is one, agree."""
+    plant = back_end.plant
+    if plant is None:
+        return {}
+    if not plant.found:
+        return {'survey': {'found': False, 'why': plant.why}}
+    rows = compare(back_end.reflectors(), plant.survey, in_plant=True)
+    return {'survey': {'found': True, 'why': plant.why, **rows}}
 
 
 def collect(slam: Slam | EkfSlam, log: FrameLog, name: str, truth: Truth | None) -> Run:

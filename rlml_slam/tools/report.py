@@ -9,6 +9,7 @@ from html import escape
 from typing import Any
 
 from rlml_slam import __version__
+from rlml_slam.tools.map_survey import changes, name_of
 from rlml_slam.tools.record import Run
 from rlml_slam.tools.summary import summary_rows
 from rlml_slam.types import Level
@@ -53,6 +54,8 @@ def report_html(run: Run, figures: Mapping[str, Any], pictures: Mapping[str, byt
         parts.append(_section('The results are not whole', escape(run.problem), 'problem'))
     parts += [_picture(name, pictures[name]) for name in ('map', 'errors') if name in pictures]
     parts.append(_section('Figures', _table(summary_rows(figures))))
+    if figures.get('survey', {}).get('found'):
+        parts.append(_section('Reflectors against the survey', _table(_residuals(figures))))
     parts += [_picture(name, pictures[name]) for name in ('health', 'timing') if name in pictures]
     spells = list(bad_spells(run))
     if spells:
@@ -88,6 +91,18 @@ def _cards(f: Mapping[str, Any]) -> Iterator[str]:
     cards.append((f'{f["health"]["OK"]:.1%}', 'of the time OK'))
     for value, name in cards:
         yield f'<div class="card"><b>{escape(value)}</b><span>{escape(name)}</span></div>'
+
+
+def _residuals(f: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """(reflector, where it is against where it was surveyed)."""
+    rows = [
+        (name_of(r), f'dx {1e3 * r["dx_m"]:.1f} mm, dy {1e3 * r["dy_m"]:.1f} mm')
+        for r in f['survey']['residuals']
+    ]
+    for line in changes(f['survey']):
+        kind, _, what = line.partition(': ')
+        rows.append((kind, what))
+    return rows
 
 
 def _picture(name: str, png: bytes) -> str:

@@ -16,7 +16,6 @@ from rlml_slam.ekf.slam import EkfSlam
 from rlml_slam.maps.occupancy import write_atomically
 from rlml_slam.params import EkfParameters, from_mapping, read_yaml
 from rlml_slam.se2 import Array
-from rlml_slam.tools.ate import align
 from rlml_slam.tools.convert_lego import LASER_FRAME, T_BASE_LASER, Lego, read_lego
 from rlml_slam.types import Odometry, Reflectors, Scan
 
@@ -166,7 +165,7 @@ def rms(errors: Array) -> float:
 
 def associate(data: Lego, result: Result) -> np.ndarray[Any, np.dtype[np.int64]]:
     """(k,): the cylinder that each landmark is, -1 for none, by the alignment of the track."""
-    T = align(result.scanner[:, :2], data.track.poses[:, :2])
+    T = se2.align(result.scanner[:, :2], data.track.poses[:, :2])
     gap = np.linalg.norm(
         se2.transform(T, result.reflectors.points)[:, None] - data.landmarks[None], axis=-1
     )
@@ -175,7 +174,7 @@ def associate(data: Lego, result: Result) -> np.ndarray[Any, np.dtype[np.int64]]
 
 def residual(points: Array, targets: Array, scaled: bool = False) -> tuple[float, float]:
     """RMSE [m] after the best rigid alignment (or similarity), and the scale."""
-    T = align(points, targets)
+    T = se2.align(points, targets)
     p = se2.transform(T, points) - targets.mean(axis=0)
     q = targets - targets.mean(axis=0)
     scale = float((p * q).sum() / (p * p).sum()) if scaled else 1.0
@@ -201,13 +200,13 @@ def picture(data: Lego, result: Result) -> bytes:
         (result.dead_reckoning, LIVE, 'dead reckoning'),
         (result.scanner, PATH, 'EKF'),
     ):
-        xy = se2.transform(align(poses[:, :2], track), poses[:, :2])
+        xy = se2.transform(se2.align(poses[:, :2], track), poses[:, :2])
         left.plot(*xy.T, color=colour, lw=1.2, label=name)
     view = camera_view(result.scanner, track)
     right.plot(*view.seen.T, color=PATH, lw=1.2, label='EKF as the camera sees it')
     nearest = associate(data, result)
     found = nearest >= 0
-    T = align(result.reflectors.points[found], data.landmarks[nearest[found]])
+    T = se2.align(result.reflectors.points[found], data.landmarks[nearest[found]])
     R = se2.rotation(T[2])
     points = se2.transform(T, result.reflectors.points)
     for axes in (left, right):

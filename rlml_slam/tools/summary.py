@@ -34,12 +34,22 @@ def summary_rows(f: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows.append(('keyframes', f'{f["keyframes"]}'))
     rows.append(('loop closures', f'{c["accepted"]} accepted, {c["rejected"]} rejected'))
     rows.append(('reflectors', f'{f["reflectors"]}'))
+    if 'survey' in f:
+        rows.append(('survey', survey_row(f['survey'])))
     rows.append(('health', ', '.join(f'{v:.1%} {k}' for k, v in f['health'].items() if v > 0.0)))
     for stream, fate in f['inputs'].items():
         listed = ', '.join(f'{n} {what}' for what, n in fate.items() if n or what == 'used')
         rows.append((f'input {stream}', listed))
     rows.append(('memory', f'{f["peak_rss_mb"]:.0f} MB'))
     return rows + _truth_rows(f)
+
+
+def survey_row(survey: Mapping[str, Any]) -> str:
+    """How the map and its survey agree."""
+    if not survey['found']:
+        return f'the map is not found in it: {survey["why"]}'
+    counts = ', '.join(f'{len(survey[k])} {k}' for k in ('missing', 'moved', 'new'))
+    return f'{survey["why"]}, RMSE {1e3 * survey["rmse_m"]:.1f} mm; {counts}'
 
 
 def _truth_rows(f: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -281,3 +281,22 @@ def test_last_pose_that_is_damaged_or_not_wanted_is_left(make, ear, switched_off
     assert told(ear) == []
     assert 'map.pose: no pose' in ear.warnings[-1]
     assert LastPose(switched_off / 'map.pose').read() is not None  # a new one is kept
+
+
+# --- a survey -------------------------------------------------------------------------------
+
+
+def test_survey_is_taken_from_the_map_directory_alone(ear, tmp_path):
+    (tmp_path / 'maps').mkdir()
+    for folder in (tmp_path, tmp_path / 'maps'):
+        (folder / 'plant.csv').write_text('x,y\n1,2\n')
+    p = Parameters()
+    node = dataclasses.replace(p.node, map_directory=str(tmp_path / 'maps'))
+    for name, why in (('none.csv', 'cannot be read'), ('../plant.csv', 'not inside of')):
+        back_end = dataclasses.replace(p.back_end, survey=name)
+        with pytest.raises(MapError, match=why):
+            Mapper(ear, dataclasses.replace(p, node=node, back_end=back_end))
+    back_end = dataclasses.replace(p.back_end, survey='plant.csv')
+    mapper = Mapper(ear, dataclasses.replace(p, node=node, back_end=back_end))
+    mapper.worker.close()
+    np.testing.assert_array_equal(mapper.back_end.plant.survey.points, [[1.0, 2.0]])
