@@ -163,7 +163,10 @@ def replay(
         if not log.stamps:
             why = problem or slam.sequencer.inputs.last_error or 'no scan and no reflectors'
             raise BagError(f'{path}: nothing in it could be used: {why}')
-        result = collect(slam, log, Path(path).resolve().name, truth or inputs.truth())
+        truth = truth or inputs.truth()
+        if truth is not None and surveyed is not None:
+            truth = replace(truth, is_map=False)  # the bag knows nothing of the survey
+        result = collect(slam, log, Path(path).resolve().name, truth)
         if isinstance(slam, Slam) and known is None:
             result.stored = stored_map.content_of(slam.back_end, params, result.grid)
             result.extra = survey_figures(slam.back_end)
