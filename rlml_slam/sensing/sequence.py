@@ -93,6 +93,7 @@ class Sequencer:
         self._strange: Counter[str] = Counter()
         self._last: int | None = None  # stamp up to which motion is used or carried
         self._carried = STILL
+        self._white = 0.0  # [s] error of the last stamp that is not of the next
         # stamp of the last observation that had, or should have had, scan and detections
         self._paired = -(2**62)
 
@@ -321,9 +322,11 @@ class Sequencer:
         if len(group) == 2:
             self._paired = stamp
         motion = STILL
+        stamp_sigma, white = self._errors_of(group)
         if self._last is not None:
             motion = compose_motion(self._carried, self._motion(self._last, stamp))
-        self._last, self._carried = stamp, STILL
+            motion = widened(motion, stamp - self._last, math.hypot(white, self._white))
+        self._last, self._carried, self._white = stamp, STILL, white
         return Observation(
             stamp,
             motion,
@@ -334,19 +337,20 @@ class Sequencer:
             self.buffer.pose_at(stamp),
             T,
             delta,
-            self._stamp_sigma(group),
+            stamp_sigma,
         )
 
-    def _stamp_sigma(self, group: list[Waiting]) -> float:
-        """Error [s] of what was measured when, against odometry, where stamps jitter."""
-        sources = [(stream, item.frame_id) for _, stream, item, _ in group]
-        # both of one instant have the clock of that which came first
-        measured = max((self._sigma(*source) for source in sources), default=0.0)
-        return math.hypot(measured, self._sigma('odom')) / SECOND
+    def _errors_of(self, group: list[Waiting]) -> tuple[float, float]:
+        """Errors [s] of when it was measured, against odometry, where stamps jitter.
 
-    def _sigma(self, stream: str, source: str = '') -> float:
-        clock = self._clocks.get((stream, source))
-        return 0.0 if clock is None else clock.sigma
+        All of it, and what is of these stamps alone.
+        """
+        sources = [('odom', ''), *((stream, item.frame_id) for _, stream, item, _ in group)]
+        clocks = [c for c in map(self._clocks.get, sources) if c is not None]
+        return (
+            math.hypot(*(c.sigma for c in clocks)) / SECOND,
+            math.hypot(*(c.white for c in clocks)) / SECOND,
+        )
 
     def _carry(self, now: int) -> None:
         """Sum up the motion of a long time without observations before the buffer forgets it."""
@@ -393,6 +397,14 @@ class Sequencer:
             d.ids[near],
             d.diameters[near],
         )
+
+
+def widened(motion: Motion, lasted: int, sigma: float) -> Motion:
+    """The motion of ``lasted`` [ns] between measurements, whose time is wrong by ``sigma`` [s]."""
+    if sigma == 0.0 or not motion.known:
+        return motion
+    gone = motion.delta / (lasted / SECOND) * sigma
+    return dataclasses.replace(motion, cov=motion.cov + np.outer(gone, gone))
 
 
 def believable(cov: Array) -> tuple[Array, bool]:

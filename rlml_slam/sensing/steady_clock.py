@@ -47,7 +47,9 @@ class SteadyClock:
     """The line through the newest stamps of one sensor, in whole nanoseconds."""
 
     def __init__(self) -> None:
-        self.sigma = 0.0  # [ns] of the stamp told last, where jitter shows
+        # [ns] of the stamp told last, where jitter shows, and the part of it that is of this
+        # stamp alone
+        self.sigma = self.white = 0.0
         self._restart()
         self._told: tuple[int, int] | None = None
 
@@ -81,10 +83,15 @@ class SteadyClock:
             limit = UNSTEADY if self._is_steady else STEADY
             self._is_steady = len(self._stamps) >= ENOUGH and line.ratio < limit
             self.sigma = line.sigma if line.sigma > SMALL else 0.0
-            # whether one was lost, or this one is late, the next will tell
-            if self._is_steady and self.sigma and not self._lost:
+        self.white = self.sigma
+        if line is not None and self._is_steady and self.sigma:
+            if self._lost:
+                # whether one was lost, or this one is late, the next will tell
+                self.sigma = self.white = 0.5 * line.period
+            else:
                 out = self._first + round(line.start + line.period * number)
                 self.sigma *= 2.0 / math.sqrt(len(self._stamps))
+                self.white = 0.0
         self._told = (stamp, out)
         return out
 

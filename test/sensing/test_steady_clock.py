@@ -8,9 +8,9 @@ import pytest
 
 from rlml_slam import se2
 from rlml_slam.params import Node, Parameters
-from rlml_slam.sensing.sequence import Sequencer
+from rlml_slam.sensing.sequence import Sequencer, widened
 from rlml_slam.sensing.steady_clock import ENOUGH, WINDOW, SteadyClock
-from rlml_slam.types import ANONYMOUS, Detections, Odometry
+from rlml_slam.types import ANONYMOUS, Detections, Motion, Odometry
 
 MS = 1_000_000
 SECOND = 1000 * MS
@@ -129,3 +129,11 @@ def test_what_is_seen_is_moved_to_its_stamp_and_keeps_it():
     # 20 ms move what is seen by a few centimetres; a fifth of the jitter is left of it
     assert raw.mean() > 0.01
     assert steady.mean() < 0.4 * raw.mean()
+
+
+def test_motion_between_jittered_stamps_is_less_sure():
+    motion = Motion(np.array([0.1, 0.0, 0.05]), 1e-6 * np.eye(3))
+    wider = widened(motion, 100 * MS, 0.02)
+    gone = motion.delta / 0.1 * 0.02
+    np.testing.assert_allclose(wider.cov - motion.cov, np.outer(gone, gone))
+    assert widened(motion, 100 * MS, 0.0) is motion
