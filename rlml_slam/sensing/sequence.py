@@ -105,7 +105,7 @@ class Sequencer:
         """One wheel odometry sample."""
         if not self._node.use_odom:
             return []
-        sample = dataclasses.replace(sample, stamp=self._steady('odom', sample.stamp))
+        sample = dataclasses.replace(sample, stamp=self._steady('odom', '', sample.stamp))
         valid = np.shape(sample.pose) == (3,) and bool(np.all(np.isfinite(sample.pose)))
         if self._accept('odom', sample.stamp, valid, 'pose is not finite'):
             self.buffer.add_odometry(sample)
@@ -117,7 +117,7 @@ class Sequencer:
         """One IMU sample."""
         if not self._node.use_imu:
             return []
-        sample = dataclasses.replace(sample, stamp=self._steady('imu', sample.stamp))
+        sample = dataclasses.replace(sample, stamp=self._steady('imu', '', sample.stamp))
         if self._accept('imu', sample.stamp, np.isfinite(sample.yaw_rate), 'rate is not finite'):
             self.buffer.add_imu(sample)
             self.inputs.count('imu', 'used')
@@ -156,11 +156,15 @@ class Sequencer:
             self._wait(d.stamp, 'reflectors', d)
         return self._release()
 
-    def _steady(self, stream: str, stamp: int, source: str = '') -> int:
+    def _steady(self, stream: str, source: str, stamp: int) -> int:
         """The stamp less its jitter, where the stream is one of a steady sensor."""
         if not self._node.steady_stamps or stamp <= 0:
             return stamp
         return self._clocks.setdefault((stream, source), SteadyClock()).steady(stamp)
+
+    def _clock_of(self, item: Scan | Detections) -> tuple[str, str]:
+        """Both halves of an instant have one clock, whichever comes first."""
+        return 'instant', item.frame_id if len(self._lidars) > 1 else ''
 
     def _measured_later(self, stream: str, item: Scan | Detections) -> int:
         """How much later than its stamp a scan, or set of detections, was measured [ns].
@@ -170,7 +174,7 @@ class Sequencer:
         for stamp, later in self._instants:
             if abs(stamp - item.stamp) <= PAIRING:
                 return later
-        later = self._steady(stream, item.stamp, item.frame_id) - item.stamp
+        later = self._steady(*self._clock_of(item), item.stamp) - item.stamp
         self._instants.append((item.stamp, later))
         return later
 
@@ -345,7 +349,7 @@ class Sequencer:
 
         All of it, and what is of these stamps alone.
         """
-        sources = [('odom', ''), *((stream, item.frame_id) for _, stream, item, _ in group)]
+        sources = [('odom', ''), *(self._clock_of(item) for _, _, item, _ in group[:1])]
         clocks = [c for c in map(self._clocks.get, sources) if c is not None]
         return (
             math.hypot(*(c.sigma for c in clocks)) / SECOND,

@@ -9,7 +9,8 @@ an error of 2 / sqrt(WINDOW) of the jitter; ``sigma`` is the error that is left.
 Whether a sensor is steady is asked of the stamps. White jitter makes the variance of the intervals
 twice that about the line; where the intervals themselves vary, times wander off any line, and the
 variance about it is a multiple of that of the intervals. And jitter as long as the period makes
-stamps overtake one another: where they never do, messages come in bursts. Such stamps stay.
+stamps overtake one another: where they never do, messages come in bursts. Exact stamps overtake
+one another where messages do, and are even once they are sorted. Such stamps stay.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from __future__ import annotations
 import math
 from collections import deque
 from typing import NamedTuple
+
+import numpy as np
 
 WINDOW = 400  # stamps that the line is laid through
 FEW = 8  # stamps through which a line tells whether messages were lost
@@ -26,6 +29,7 @@ STEADY = 0.6
 UNSTEADY = 0.9  # no jitter: that of a clock that was steady is not above it
 SMALL = 5e6  # [ns] at 1 m/s, jitter below this is less than the noise: the stamps stay as they are
 OVERTAKES = 0.5  # of the expected number of stamps earlier than the one before
+EVEN, MOST = 0.1, 0.8  # of stamps that jitter by a period, a fifth would be so even
 OUTLIER = 5.0  # sigmas of the jitter: a stamp farther from the line is not on it
 RESOLVED = 4.0  # sigmas of the jitter in a period: then a lost message shows
 LOST = 0.7  # periods that a stamp is late by at least where one is lost
@@ -126,12 +130,20 @@ class SteadyClock:
 
     def _is_jitter(self, line: Line) -> bool:
         """Whether the stamps may be those of a steady sensor and white jitter."""
-        if line.ratio >= UNSTEADY:
+        if line.ratio >= UNSTEADY or (line.sigma > SMALL and self._is_exact()):
             return False
         # two neighbours' jitter differs by a normal deviate of sqrt(2) sigma
         n = len(self._stamps)
         expected = 0.5 * n * math.erfc(0.5 * line.period / max(line.sigma, SMALL))
         return self._overtakes >= OVERTAKES * expected - 1.0
+
+    def _is_exact(self) -> bool:
+        """Whether the stamps are even; messages were lost, or came in another order."""
+        steps = np.diff(np.sort([stamp for _, stamp in self._stamps]))
+        # some are still to come, so that a step may be of several periods
+        periods = steps / max(float(np.median(steps)), 1.0)
+        even = np.abs(periods - np.maximum(np.rint(periods), 1.0)) < EVEN
+        return float(even.mean()) > MOST
 
     def _add(self, number: int, stamp: int) -> None:
         if not self._stamps:

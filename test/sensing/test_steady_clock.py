@@ -77,6 +77,16 @@ def test_bursts_are_not_jitter():
     np.testing.assert_array_equal(told(true), true)
 
 
+def test_exact_stamps_of_messages_that_overtake_one_another_stay():
+    rng = np.random.default_rng(6)
+    true = ticks(20, 1000)
+    late = np.argsort(true + rng.uniform(0.0, 80.0 * MS, len(true)), kind='stable')
+    clock = SteadyClock()
+    for stamp in true[late]:
+        assert clock.steady(int(stamp)) == stamp
+        assert clock.sigma == 0.0
+
+
 def test_lost_messages_are_counted():
     true = ticks(100, 400)
     kept = np.delete(true, [150, 200, 201, *range(250, 256)])
