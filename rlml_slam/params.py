@@ -401,6 +401,11 @@ class LoopClosure(Group):
     search_window: float = param(3.0, 'half width of the search', 'm', 0.1, 100.0)
     search_angle: float = param(0.5, 'half width of the search', 'rad', 0.01, 3.2)
 
+    @property
+    def searched(self) -> float:
+        """Area [m²] of the search, were it made at all headings: of as many places as it is."""
+        return (2.0 * self.search_window) ** 2 * self.search_angle / math.pi
+
 
 @dataclass(frozen=True)
 class Relocalization(Group):

@@ -36,8 +36,7 @@ class ClosureWatch:
     def __init__(self, params: Parameters, graph: Graph) -> None:
         self._p = params
         self._graph = graph
-        p = params.loop_closure
-        self._wrong = uniform((2.0 * p.search_window) ** 2 * p.search_angle / np.pi)
+        self._wrong = uniform(params.loop_closure.searched)
         self._judged = 0
 
     def review(self, closures: Sequence[Closure], final: bool = False) -> tuple[Closure, ...]:

@@ -2,7 +2,9 @@
 """Scans in the graph: keyframes tied to submaps as they are built, and to finished ones later.
 
 A closure is searched by branch and bound over the whole window, refined, and verified by its score
-and by the lead over the second-best place; what fails is recorded, not used.
+and by the lead over the second-best place. It enters where the graph expects it, or with others
+that agree (closure_entry.py); what fails is recorded, not used, and what agrees with nothing yet
+waits.
 """
 
 from __future__ import annotations
@@ -18,12 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
+from rlml_slam.graph.evidence import uniform
 from rlml_slam.graph.factors import relative_information
 from rlml_slam.graph.graph import Graph, Renumbering
 from rlml_slam.matching import observability, search, thinning
 from rlml_slam.matching.scan_match import linearize, match
 from rlml_slam.matching.submap import Submap
 from rlml_slam.params import Parameters
+from rlml_slam.rlml.closure_entry import may_enter
 from rlml_slam.rlml.keyframes import Keyframe
 from rlml_slam.rlml.submaps import GRID_TURN
 from rlml_slam.se2 import Array
@@ -31,9 +35,12 @@ from rlml_slam.types import EdgeKind
 
 TURN = np.array([0.0, 0.0, GRID_TURN])
 OPEN = 1e-2  # [1/m², 1/rad²] an edge knows its directions to 10 m and 10 rad at the worst
+HELD = 1.0  # [m] a closure holds its place to this in any direction, or may be of another one
 COVERED = 0.8  # share of a submap's walls that a newer one must know to take its place
 RECORDS = 2000  # of closures, kept at most
 NOTES = 50  # changes of the weight of a closure that are remembered
+WAITING = 60  # closures that wait for others to agree with them, the newest
+WAITS = 'waits for others that agree'
 PYRAMIDS = 16  # search pyramids kept: each is several times as large as its submap
 
 
@@ -117,6 +124,29 @@ class KeySubmap:
     T_anchor_grid: Array = field(default_factory=lambda: TURN)
 
 
+@dataclass(frozen=True)
+class _Match:
+    """A keyframe that fits a submap at ``T_grid_key`` (3,), with the information (3, 3) there.
+
+    The others as in Closure.
+    """
+
+    m: KeySubmap
+    key: Keyframe
+    T_grid_key: Array
+    information: Array
+    score: float
+    overlap: float
+    second: float
+
+    def closure(self, why: str, edge: int = -1, number: int = -1) -> Closure:
+        """Its record."""
+        return Closure(
+            self.m.anchor.index, self.key.index, self.T_grid_key, self.score, edge, why,
+            self.overlap, self.second, number,
+        )  # fmt: skip
+
+
 class ScanGraph:
     """Scan edges and loop closures of the back end.
 
@@ -130,6 +160,8 @@ class ScanGraph:
         self._active: list[KeySubmap] = []
         self._finished: list[KeySubmap] = []
         self._pyramids: OrderedDict[KeySubmap, search.Pyramid] = OrderedDict()
+        self._waiting: list[_Match] = []
+        self._wrong = uniform(params.loop_closure.searched)
         self._count = 0
         self._accepted = 0
         self.closures: list[Closure] = []
@@ -188,19 +220,24 @@ class ScanGraph:
     def _edge(
         self, kind: EdgeKind, m: KeySubmap, key: Keyframe, T_grid_key: Array, information: Array
     ) -> int:
-        closure = kind is EdgeKind.CLOSURE
+        self.changed |= kind is EdgeKind.CLOSURE
+        delta, information = self._measured(kind, m, T_grid_key, information)
+        return self._graph.add_edge(kind, m.anchor.index, key.index, delta, information)
+
+    def _measured(
+        self, kind: EdgeKind, m: KeySubmap, T_grid_key: Array, information: Array
+    ) -> tuple[Array, Array]:
+        """A keyframe's place (3,) from the submap's anchor, and the residual's information."""
         # a direction that the scan leaves open still needs a covariance, and a regular one
         cov = np.linalg.inv(information + OPEN * np.eye(3))
         R = np.eye(3)
         R[:2, :2] = se2.rotation(m.T_anchor_grid[2])
         cov = R @ cov @ R.T
         delta = se2.compose(m.T_anchor_grid, T_grid_key)
+        closure = kind is EdgeKind.CLOSURE
         floor2 = self._p.loop_closure.floor2 if closure else self._p.back_end.scan_floor2
         cov[[0, 1, 2], [0, 1, 2]] += floor2
-        self.changed |= closure
-        return self._graph.add_edge(
-            kind, m.anchor.index, key.index, delta, relative_information(delta, cov)
-        )
+        return delta, relative_information(delta, cov)
 
     def _insert(self, key: Keyframe, points: Array) -> None:
         size = self._p.back_end.submap_size
@@ -243,6 +280,9 @@ class ScanGraph:
 
         ``edges`` and ``poses`` map what went to what stands for it, by the numbers until now.
         """
+        self._waiting = [
+            c for c in self._waiting if c.key.index not in poses and c.m in self._finished
+        ]
         kept = []
         for c in self.closures:
             if not c.accepted and (c.i in poses or c.j in poses):
@@ -330,15 +370,47 @@ class ScanGraph:
             distance = float(np.linalg.norm(centre - here))
             if distance < p.max_distance:
                 near.append((distance, k))
-        out = []
-        for _, k in sorted(near)[: p.candidates]:
-            closure = self._try(self._finished[k], key, points)
-            self.closures.append(closure)
+        tried = [
+            self._try(self._finished[k], key, points) for _, k in sorted(near)[: p.candidates]
+        ]
+        fit = [match for match in tried if isinstance(match, _Match)]
+        out = [closure for closure in tried if isinstance(closure, Closure)]
+        if fit:
+            out += self._admit(fit)
+        self.closures += out
+        for closure in out:
             self.tried[closure.accepted] += 1
-            out.append(closure)
         return tuple(out)
 
-    def _try(self, m: KeySubmap, key: Keyframe, points: Array) -> Closure:
+    def _admit(self, fresh: Sequence[_Match]) -> list[Closure]:
+        """Let in what may, of the ``fresh`` ones and those that waited; the others wait."""
+        matches = [*self._waiting, *fresh]
+        measured = [
+            self._measured(EdgeKind.CLOSURE, c.m, c.T_grid_key, c.information) for c in matches
+        ]
+        nodes = np.array([(c.m.anchor.index, c.key.index) for c in matches], dtype=np.int64)
+        covs = np.linalg.inv(np.array([information for _, information in measured]))
+        deltas = np.array([delta for delta, _ in measured])
+        may = may_enter(self._graph, nodes, deltas, covs, self._wrong)
+        out, waited = [], len(self._waiting)
+        for n, (c, enters) in enumerate(zip(matches, may.tolist(), strict=True)):
+            if enters:
+                edge = self._edge(EdgeKind.CLOSURE, c.m, c.key, c.T_grid_key, c.information)
+                why = 'fits' if n >= waited else 'fits, and others agree'
+                out.append(c.closure(why, edge, self._accepted))
+                self._accepted += 1
+            elif n >= waited:
+                out.append(c.closure(WAITS))
+        entered = {(c.i, c.j) for c in out if c.accepted}
+        kept = [c for c in self.closures if c.accepted or (c.i, c.j) not in entered]
+        self.tried[False] -= len(self.closures) - len(kept)
+        self.closures = kept
+        left = [c for c, enters in zip(matches, may.tolist(), strict=True) if not enters]
+        self._waiting = left[-WAITING:]
+        return out
+
+    def _try(self, m: KeySubmap, key: Keyframe, points: Array) -> _Match | Closure:
+        """Search and verify; the record of what failed."""
         p = self._p.loop_closure
         guess = se2.between(self._grid(m), self._pose(key))
         i, j = m.anchor.index, key.index
@@ -359,14 +431,12 @@ class ScanGraph:
         if found.score < p.min_score:
             return rejected('the refined fit is too weak', found.score)
         information = observability.information(m.submap, points, found.pose, self._p.scan_match)
-        edge = self._edge(EdgeKind.CLOSURE, m, key, found.pose, information)
+        if np.linalg.eigvalsh(np.linalg.inv(information + OPEN * np.eye(3))[:2, :2])[1] > HELD**2:
+            return rejected('the scan leaves a direction open', found.score)
         term = linearize(m.submap, points, found.pose)
         second = math.nan if result.second is None else result.second.score / result.best.score
-        self._accepted += 1
-        return Closure(
-            i, j, found.pose, found.score, edge, 'fits', term.inliers / max(term.count, 1), second,
-            self._accepted - 1,
-        )  # fmt: skip
+        overlap = term.inliers / max(term.count, 1)
+        return _Match(m, key, found.pose, information, found.score, overlap, second)
 
     def _pyramid(self, m: KeySubmap) -> search.Pyramid:
         if m not in self._pyramids:
