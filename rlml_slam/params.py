@@ -222,6 +222,10 @@ class Reflector(Group):
     candidate_timeout: float = param(
         20.0, 'a candidate not seen again for this long is dropped', 's', 0.1, 1e4
     )
+    gone: float = param(
+        1e-3, 'probability of still being there below which a reflector leaves the map; 0: never',
+        '', 0.0, 0.1,
+    )  # fmt: skip
     robust_scale: float = param(
         3.0, 'Cauchy scale of the reflector residual, in sigmas', '', 0.5, 100.0
     )

@@ -182,7 +182,7 @@ class Belief:
 
     ``T_map_base`` (3,) and ``points`` (m, 2) with their joint covariance ``cov``
     (3 + 2m, 3 + 2m); ``keys`` (m,) are the front end's, ``aliases`` maps keys of reflectors that
-    were merged to the key that goes on.
+    were merged to the key that goes on, ``gone`` are keys of those that are no longer there.
     """
 
     T_map_base: Array
@@ -190,6 +190,7 @@ class Belief:
     points: Array
     cov: Array
     aliases: dict[int, int]
+    gone: tuple[int, ...] = ()
 
 
 class Verdict(Enum):

@@ -29,7 +29,9 @@ from rlml_slam.rlml.keyframes import Interval, Keyframe
 from rlml_slam.rlml.loop_closure import Closure, ScanGraph
 from rlml_slam.rlml.path import Path
 from rlml_slam.rlml.plant_frame import PlantFrame
+from rlml_slam.rlml.presence import Presence
 from rlml_slam.rlml.reflector_graph import ReflectorGraph
+from rlml_slam.rlml.reflector_states import ReflectorState, reflector_states
 from rlml_slam.rlml.sparsify import Sparsifier
 from rlml_slam.se2 import Array
 from rlml_slam.types import Belief, EdgeKind, Frame, Reflectors
@@ -41,7 +43,7 @@ class Update:
 
     ``known``: how well the keyframe's pose is known with it, None where no one asked the graph.
     ``closures`` were tried with it; ``changed`` are those, of any time, that it had disabled or
-    enabled again.
+    enabled again. ``gone`` are all keys of reflectors that are no longer there.
     """
 
     keyframe: int
@@ -51,6 +53,7 @@ class Update:
     wall_ms: float
     known: Known | None = None
     changed: tuple[Closure, ...] = ()
+    gone: tuple[int, ...] = ()
 
 
 class BackEnd:
@@ -81,6 +84,8 @@ class BackEnd:
         self.deferred = DeferredMatches(p.reflector, self.reflector_graph)
         self.sparsifier = Sparsifier(p, self.graph, self.scans, self.reflector_graph)
         self.path = Path(p.back_end.path_frames)
+        self.presence = Presence(p, self.graph, self.reflector_graph)
+        self._gone: tuple[int, ...] = ()  # since the newest keyframe began
         self.closure_watch = ClosureWatch(p, self.graph)
         self.plant = self._plant_frame(self._survey)
         self._changed: tuple[Closure, ...] = ()  # since the newest keyframe began
@@ -127,7 +132,7 @@ class BackEnd:
         return moved and (frame.stamp - last.stamp) * 1e-9 >= p.minimum_time
 
     def _add_keyframe(self, frame: Frame, began: float) -> Update:
-        self._optimized, self._changed = False, ()
+        self._optimized, self._changed, self._gone = False, (), ()
         key = self._node(frame)
         closures: tuple[Closure, ...] = ()
         if key.points is not None:
@@ -145,6 +150,7 @@ class BackEnd:
             (time.perf_counter() - began) * 1e3,
             self.known,
             self._changed,
+            self._gone,
         )
 
     def _node(self, frame: Frame) -> Keyframe:
@@ -203,6 +209,11 @@ class BackEnd:
         self.reflector_graph.add(pose, interval)
         if self.deferred.decide():
             self._rejoin()
+        self._gone += self.presence.look(self.keyframes, interval)
+        if self._gone and self.plant is not None:
+            self.plant.hold()
+        forgotten = interval.last_look - int(2e9 * self._p.reflector.candidate_timeout)
+        self.reflector_graph.drop_candidates(forgotten, self.deferred.pending)
 
     def _rejoin(self) -> None:
         """Solve after reflectors were joined that stood apart, as far as the drift had gone.
@@ -315,6 +326,10 @@ class BackEnd:
     def reflectors(self) -> Reflectors:
         """The reflector map with marginal covariances, map frame."""
         return self.reflector_graph.reflectors()
+
+    def reflector_states(self) -> list[ReflectorState]:
+        """What has become of each reflector, those that are gone and ghosts among them."""
+        return reflector_states(self.reflector_graph, self._p.reflector)
 
     def occupancy_grid(self) -> OccupancyGrid | None:
         """The map rendered from the keyframes' scans, None without any scan."""

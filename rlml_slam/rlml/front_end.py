@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -200,6 +201,13 @@ class FrontEnd:
         self.state.replace(se2.transform(inverse, belief.points[order]), cov, self.submaps.bias)
         # the state has the covariance of the graph now
         self._correction = Correction(self.T_map_local)
+
+    def forget(self, keys: Iterable[int]) -> None:
+        """Drop reflectors that the back end knows to be gone."""
+        keep = ~np.isin(self.tracks.keys, list(keys))
+        if not keep.all():
+            self.state.remove_landmarks(keep)
+            self.tracks.keep(keep)
 
     def process(self, observation: Observation) -> Frame:
         """The pose at the observation's stamp; never raises for what was measured."""

@@ -35,6 +35,7 @@ class Keyframe:
     points: NDArray[np.float32] | None
     origin: Array | None
     scan_stamp: int
+    looked: bool = False  # for reflectors
 
     def take_scan(self, other: Keyframe, T: Array) -> None:
         """Replace the scan by that of another keyframe, which stood at ``T`` (3,) from here."""
@@ -82,6 +83,9 @@ class Interval:
         self.sightings: dict[int, list[Sighting]] = {}
         self.ids: dict[int, int] = {}
         self.diameters: dict[int, float] = {}
+        self.looked = False  # for reflectors
+        self.first_look = self.last_look = 0  # stamps
+        self.detected: list[tuple[int, Array]] = []  # key or -1, and place, of each detection
 
     def add_motion(self, frame: Frame) -> None:
         """Compose the odometry motion of one more frame."""
@@ -106,6 +110,9 @@ class Interval:
         T = se2.between(self._T_local, frame.T_local_base)
         z = se2.transform(T, d.points)
         R = se2.rotation(T[2])
+        self.looked, self.last_look = True, frame.stamp
+        self.first_look = self.first_look or frame.stamp
+        self.detected += zip(frame.landmarks.tolist(), z, strict=True)
         for k in np.flatnonzero(frame.landmarks >= 0):
             self._tell(int(frame.landmarks[k]), int(d.ids[k]), float(d.diameters[k]))
             J = np.array([[1.0, 0.0, -(z[k, 1] - T[1])], [0.0, 1.0, z[k, 0] - T[0]]])

@@ -56,6 +56,7 @@ class PlantFrame:
         if placed.T_plant_map is None:
             return False
         self._graph.move(placed.T_plant_map)
+        self._reflectors.forget_views()
         self.found = True
         return self._tie()
 

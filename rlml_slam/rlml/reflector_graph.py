@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from rlml_slam.graph.eliminate import Ties, limited
 from rlml_slam.graph.graph import Graph, Renumbering
 from rlml_slam.graph.marginals import Marginals
-from rlml_slam.graph.table import Column
 from rlml_slam.matching.association import gate
 from rlml_slam.params import Reflector
+from rlml_slam.rlml.gone import GoneList
 from rlml_slam.rlml.keyframes import AGREE, Interval
+from rlml_slam.rlml.landmark import LIFE, SIGHTING, VIEW, Landmark, Life
 from rlml_slam.se2 import Array, rotation, transform
 from rlml_slam.types import ANONYMOUS, Belief, Reflectors
 
@@ -29,42 +30,16 @@ MERGE_DISTANCE = 1.5  # [m] pairs farther apart are not looked at
 COMMON2 = np.array([1e-4, 1e-4])
 
 
-# Seen from keyframe ``pose`` at ``z`` (2,) there; ``factor`` of the graph, -1 without one.
-SIGHTING = np.dtype(
-    [
-        ('pose', np.int64),
-        ('factor', np.int64),
-        ('z', np.float64, (2,)),
-        ('information', np.float64, (2, 2)),
-    ]
-)
-
-
-@dataclass
-class _Landmark:
-    """One reflector of the graph; ``beside`` are the keys of those seen with it at one time.
-
-    ``surveyed`` is its row in the survey, -1 where it is not in it.
-    """
-
-    key: int
-    index: int = -1
-    id: int = ANONYMOUS
-    diameter: float = float('nan')
-    count: int = 0
-    sightings: Column = field(default_factory=lambda: Column((), SIGHTING))
-    beside: set[int] = field(default_factory=set)
-    surveyed: int = -1
-
-
 class ReflectorGraph:
     """Sightings (e^R of eq. 12) and landmarks; keys are the front end's."""
 
     def __init__(self, params: Reflector, graph: Graph) -> None:
         self._p = params
         self._graph = graph
-        self._landmarks: dict[int, _Landmark] = {}
+        self._landmarks: dict[int, Landmark] = {}
         self._alias: dict[int, int] = {}
+        self.gone = GoneList()
+        self._given_up: set[int] = set()  # keys that the front end may still have
         self.changed = False
 
     def resolve(self, key: int) -> int:
@@ -77,10 +52,12 @@ class ReflectorGraph:
         """The reflectors seen near keyframe ``pose``."""
         together = {self.resolve(key) for key in interval.sightings}
         for key, s in ((k, s) for k, groups in interval.sightings.items() for s in groups):
-            landmark = self._landmarks.setdefault(self.resolve(key), _Landmark(self.resolve(key)))
+            landmark = self._landmarks.setdefault(self.resolve(key), Landmark(self.resolve(key)))
             landmark.id = interval.ids.get(key, landmark.id)
             landmark.diameter = interval.diameters.get(key, landmark.diameter)
+            self._given_up.discard(landmark.key)
             landmark.count += s.count
+            landmark.life.seen(interval.first_look, interval.last_look)
             landmark.beside |= together
             # errors of a sensor are alike from one message to the next: many do not average out
             worth = 1.0 / (1.0 + self._p.alike * (s.count - 1))
@@ -93,7 +70,7 @@ class ReflectorGraph:
                 landmark.index = self._graph.add_landmark(point)
             self._link_all(landmark)
 
-    def _link_all(self, landmark: _Landmark) -> None:
+    def _link_all(self, landmark: Landmark) -> None:
         """Give a landmark of the graph the factors that it still lacks."""
         if landmark.index >= 0:
             rows = landmark.sightings.view
@@ -113,22 +90,33 @@ class ReflectorGraph:
     @property
     def found(self) -> bool:
         """Whether there is any reflector in the graph."""
-        return bool(self._alive())
+        return bool(self.alive())
 
-    def _alive(self) -> list[_Landmark]:
+    def alive(self) -> list[Landmark]:
+        """The reflectors in the graph."""
         return [m for m in self._landmarks.values() if m.index >= 0]
+
+    def place(self, m: Landmark) -> Array:
+        """Where a reflector of the graph is (2,)."""
+        point: Array = self._graph.landmarks[m.index].copy()
+        return point
 
     def keys(self) -> frozenset[int]:
         """Of the reflectors in the graph."""
-        return frozenset(m.key for m in self._alive())
+        return frozenset(m.key for m in self.alive())
+
+    def forget_views(self) -> None:
+        """The floor lies elsewhere in the map: nothing is known of who is seen from where."""
+        for m in self._landmarks.values():
+            m.views.clear()
 
     def key_of(self, index: int) -> int:
         """Of the reflector that is a landmark of the graph."""
-        return next(m.key for m in self._alive() if m.index == index)
+        return next(m.key for m in self.alive() if m.index == index)
 
     def surveyed(self) -> dict[int, int]:
         """Rows of the survey by key, of the reflectors that are in it."""
-        return {m.key: m.surveyed for m in self._alive() if m.surveyed >= 0}
+        return {m.key: m.surveyed for m in self.alive() if m.surveyed >= 0}
 
     def survey(self, key: int, row: int, id_: int) -> int:
         """A reflector of the graph is one of the survey, or none (-1); its landmark there."""
@@ -148,7 +136,7 @@ class ReflectorGraph:
         Where the two places are uncertain, that could as well be two reflectors, and is left;
         those whose keys are ``pending`` are another's to decide.
         """
-        alive = [m for m in self._alive() if m.key not in pending]
+        alive = [m for m in self.alive() if m.key not in pending]
         if len(alive) < 2:
             return False
         points = self._graph.landmarks[[m.index for m in alive]]
@@ -175,7 +163,7 @@ class ReflectorGraph:
         return bool(merged)
 
     @staticmethod
-    def _distinct(a: _Landmark, b: _Landmark) -> bool:
+    def _distinct(a: Landmark, b: Landmark) -> bool:
         """Whether the two were seen from one keyframe, or tell or were surveyed to be two."""
         return _named_apart(a, b) or b.key in a.beside
 
@@ -185,16 +173,20 @@ class ReflectorGraph:
         The first goes on, or the one that the graph has.
         """
         first, second = (
-            self._landmarks.setdefault(key, _Landmark(key)) for key in map(self.resolve, (a, b))
+            self._landmarks.setdefault(key, Landmark(key)) for key in map(self.resolve, (a, b))
         )
         if first is second or _named_apart(first, second):
             return
         self._absorb(*_first(first, second))
 
-    def _absorb(self, keep: _Landmark, gone: _Landmark) -> None:
+    def _absorb(self, keep: Landmark, gone: Landmark) -> None:
         self._unlink(gone.sightings.view)
         keep.sightings.append(gone.sightings.view)
         self._link_all(keep)
+        keep.life = keep.life.with_other(gone.life)
+        for cell, (hits, misses) in gone.views.items():
+            own = keep.views.get(cell, (0, 0))
+            keep.views[cell] = own[0] + hits, own[1] + misses
         keep.beside |= gone.beside
         for other in self._landmarks.values():
             if gone.key in other.beside:
@@ -204,6 +196,34 @@ class ReflectorGraph:
         keep.diameter = gone.diameter if math.isnan(keep.diameter) else keep.diameter
         self._alias[gone.key] = keep.key
         del self._landmarks[gone.key]
+
+    def give_up(self, landmarks: Iterable[Landmark]) -> tuple[int, ...]:
+        """Let go of reflectors that are no longer there; all keys that any of them had."""
+        keys: list[int] = []
+        for m in landmarks:
+            self.gone.add(m, self._graph.landmarks[m.index])
+            self._unlink(m.sightings.view)
+            priors = self._graph.landmark_priors
+            priors.enabled[priors.nodes[:, 0] == m.index] = False
+            keys += [m.key, *(a for a in self._alias if self.resolve(a) == m.key)]
+            del self._landmarks[m.key]
+            self.changed = True
+        self._given_up.update(keys)
+        for other in self._landmarks.values():
+            other.beside.difference_update(keys)
+        return tuple(keys)
+
+    def drop_candidates(self, before: int, pending: Collection[int] = ()) -> None:
+        """Let go of what was not seen often enough and not since a stamp [ns]: ghosts."""
+        for m in list(self._landmarks.values()):
+            if m.index < 0 and m.life.last < before and m.key not in pending:
+                rows = m.sightings.view
+                if len(rows):
+                    pose = self._graph.poses[rows['pose'][-1]]
+                    self.gone.add(m, transform(pose, rows['z'][-1:])[0])
+                del self._landmarks[m.key]
+                for other in self._landmarks.values():
+                    other.beside.discard(m.key)
 
     def move(self, ties: Mapping[int, tuple[int, Ties]]) -> None:
         """See from other keyframes what was seen from some: pose to (other pose, tie from it).
@@ -238,7 +258,7 @@ class ReflectorGraph:
     def keep_alive(self) -> NDArray[np.bool_]:
         """Which landmarks of the graph (m,) are a reflector's, not one's that another became."""
         kept = np.zeros(len(self._graph.landmarks), dtype=np.bool_)
-        kept[[m.index for m in self._alive()]] = True
+        kept[[m.index for m in self.alive()]] = True
         return kept
 
     def renumber(self, new: Renumbering) -> None:
@@ -262,6 +282,12 @@ class ReflectorGraph:
             'reflector_id': np.array([m.id for m in marks], dtype=np.int64),
             'reflector_diameter': np.array([m.diameter for m in marks], dtype=np.float64),
             'reflector_count': np.array([m.count for m in marks], dtype=np.int64),
+            'reflector_life': np.array([_row(m.life) for m in marks], dtype=LIFE),
+            'reflector_view': np.array(
+                [(m.key, *cell, *counts) for m in marks for cell, counts in m.views.items()],
+                dtype=VIEW,
+            ),
+            **self.gone.arrays(),
             'reflector_surveyed': np.array([m.surveyed for m in marks], dtype=np.int64),
             'reflector_sightings': np.array([len(r) for r in rows], dtype=np.int64),
             'reflector_beside': np.array(beside, dtype=np.int64).reshape(-1, 2),
@@ -274,28 +300,33 @@ class ReflectorGraph:
         a = arrays
         ends = np.cumsum(a['reflector_sightings'])
         surveyed = a.get('reflector_surveyed', np.full(len(a['reflector_key']), -1))
+        lives = a.get('reflector_life', np.zeros(len(a['reflector_key']), dtype=LIFE))
+        self.gone.restore(a)
         for k, key in enumerate(a['reflector_key'].tolist()):
-            landmark = _Landmark(
+            landmark = Landmark(
                 key, int(a['reflector_node'][k]), int(a['reflector_id'][k]),
                 float(a['reflector_diameter'][k]), int(a['reflector_count'][k]),
             )  # fmt: skip
             landmark.surveyed = int(surveyed[k])
+            landmark.life = Life(*lives[k].item())
             landmark.sightings.append(
                 a['sighting'][ends[k] - a['reflector_sightings'][k] : ends[k]]
             )
             self._landmarks[key] = landmark
         for key, other in a['reflector_beside'].tolist():
             self._landmarks[key].beside.add(other)
+        for key, x, y, hits, misses in a.get('reflector_view', np.zeros(0, VIEW)).tolist():
+            self._landmarks[key].views[x, y] = hits, misses
         self._alias = dict(a['reflector_alias'].tolist())
 
     @property
     def next_key(self) -> int:
         """The first key that was never used."""
-        return 1 + max([*self._landmarks, *self._alias], default=-1)
+        return 1 + max([*self._landmarks, *self._alias, *self.gone.keys], default=-1)
 
     def belief(self, pose: int) -> Belief:
         """Pose ``pose`` and all reflectors with their joint covariance."""
-        alive = sorted(self._alive(), key=lambda m: m.key)
+        alive = sorted(self.alive(), key=lambda m: m.key)
         index = [m.index for m in alive]
         return Belief(
             self._graph.poses[pose].copy(),
@@ -303,11 +334,12 @@ class ReflectorGraph:
             self._graph.landmarks[index].reshape(-1, 2),
             Marginals(self._graph).joint([pose], index),
             {key: self.resolve(key) for key in self._alias},
+            tuple(self._given_up),
         )
 
     def reflectors(self) -> Reflectors:
         """The map's reflectors with marginal covariances, sorted by key."""
-        alive = sorted(self._alive(), key=lambda m: m.key)
+        alive = sorted(self.alive(), key=lambda m: m.key)
         index = [m.index for m in alive]
         cov = Marginals(self._graph).landmarks(index) if alive else np.zeros((0, 2, 2))
         return Reflectors(
@@ -354,13 +386,17 @@ def _fused(s: Records) -> Records:
     return np.concatenate([out, others[newest]])
 
 
-def _named_apart(a: _Landmark, b: _Landmark) -> bool:
+def _row(life: Life) -> tuple[float, ...]:
+    return dataclasses.astuple(life)
+
+
+def _named_apart(a: Landmark, b: Landmark) -> bool:
     """Whether the two tell different ids, or are different ones of the survey."""
     named = a.id != ANONYMOUS and b.id != ANONYMOUS and a.id != b.id
     return named or (a.surveyed >= 0 and b.surveyed >= 0 and a.surveyed != b.surveyed)
 
 
-def _first(a: _Landmark, b: _Landmark) -> tuple[_Landmark, _Landmark]:
+def _first(a: Landmark, b: Landmark) -> tuple[Landmark, Landmark]:
     """The one of two that goes on, which the graph or even the survey has, and the other."""
     better = (b.index >= 0, b.surveyed >= 0) > (a.index >= 0, a.surveyed >= 0)
     return (b, a) if better else (a, b)

@@ -183,6 +183,7 @@ class Slam:
         if update is None:
             return False
         self.updates.append(update)
+        self.front_end.forget(update.gone)
         if update.optimized:
             self.front_end.correct(update.T_map_local, update.known)
         return update.optimized

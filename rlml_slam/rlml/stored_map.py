@@ -6,11 +6,12 @@ What maps/container.py writes, by name; n keyframes, m landmarks, lengths in met
     pose (n, 3), pose_fixed (n,), landmark (m, 2), landmark_fixed (m,)     the estimate
     edge_…, sighted_…, pose_prior_…, landmark_prior_… with nodes, measured,
         information, kinds (graph.table.FactorKind), enabled               the factors
-    key_stamp [ns], key_local, key_cov, key_scan_stamp, key_origin, key_points (n,)
+    key_stamp [ns], key_local, key_cov, key_scan_stamp, key_looked, key_origin, key_points (n,)
         -1 where there is no scan, else how many of ``points`` (p, 2) are its  keyframes and scans
     submap_…                        the grids that scans are matched against, cells in one row
-    reflector_…, sighting           reflectors by key; `reflector_map` and `reflector_cov` are what
-                                    a robot localizes with
+    reflector_…, sighting           reflectors by key; `reflector_gone` have left the map;
+                                    `reflector_map` and `reflector_cov` are what a robot
+                                    localizes with
     survey_ids, survey_points, survey_diameters     the survey whose frame the map has, if any
     closure…, path, path_motion     records of closures, the path of all frames
     grid (rows, columns)            the occupancy grid, where there are scans
@@ -92,6 +93,7 @@ def _keys(keys: list[Keyframe]) -> dict[str, NDArray[Any]]:
     return {
         'key_stamp': np.array([k.stamp for k in keys], dtype=np.int64),
         'key_scan_stamp': np.array([k.scan_stamp for k in keys], dtype=np.int64),
+        'key_looked': np.array([k.looked for k in keys]),
         'key_local': np.array([k.T_local for k in keys]),
         'key_cov': np.array([k.cov_local for k in keys]),
         'key_origin': np.array([np.zeros(2) if k.origin is None else k.origin for k in keys]),
@@ -176,5 +178,8 @@ def _keyframes(a: Arrays) -> list[Keyframe]:
     for k, (_, count, end, stamp, T_local, cov, origin, scan_stamp) in enumerate(rows):
         points = a['points'][end - count : end].copy() if count >= 0 else None
         place = origin.copy() if count >= 0 else None
-        out.append(Keyframe(k, stamp, T_local.copy(), cov.copy(), points, place, scan_stamp))
+        looked = bool(a['key_looked'][k]) if 'key_looked' in a else False
+        out.append(
+            Keyframe(k, stamp, T_local.copy(), cov.copy(), points, place, scan_stamp, looked)
+        )
     return out

@@ -20,7 +20,7 @@ from rlml_slam.ros.messages import Make
 from rlml_slam.se2 import Array
 from rlml_slam.types import Belief
 
-POSE, LANDMARK, CORRECTION, ALIAS = range(4)  # field `kind`; an alias maps `key` to `value`
+POSE, LANDMARK, CORRECTION, ALIAS, GONE = range(5)  # `kind`; an alias maps `key` to `value`
 
 
 @dataclass(frozen=True)
@@ -38,18 +38,22 @@ def build_belief(make: Make, stamped: StampedBelief, map_frame: str) -> Any:
     b = stamped.belief
     n = 3 + 2 * len(b.keys)
     rows = np.zeros(
-        n + 3 + len(b.aliases),
+        n + 3 + len(b.aliases) + len(b.gone),
         dtype=[
             ('session', '<u4'), ('kind', 'u1'), ('key', '<i4'), ('value', '<f8'),
             ('cov', '<f8', (n,)),
         ],
     )  # fmt: skip
     rows['session'] = stamped.session
-    rows['kind'] = [POSE] * 3 + [LANDMARK] * (n - 3) + [CORRECTION] * 3 + [ALIAS] * len(b.aliases)
+    rows['kind'] = (
+        [POSE] * 3 + [LANDMARK] * (n - 3) + [CORRECTION] * 3
+        + [ALIAS] * len(b.aliases) + [GONE] * len(b.gone)
+    )  # fmt: skip
     rows['key'] = -1
     rows['key'][3:n] = np.repeat(b.keys, 2)
-    rows['key'][n + 3 :] = list(b.aliases)
-    rows['value'] = [*b.T_map_base, *b.points.ravel(), *stamped.T_map_local, *b.aliases.values()]
+    rows['key'][n + 3 :] = [*b.aliases, *b.gone]
+    values = [*b.T_map_base, *b.points.ravel(), *stamped.T_map_local, *b.aliases.values()]
+    rows['value'][: len(values)] = values
     rows['cov'][:n] = b.cov
     return build_cloud(make, build.header(make, stamped.stamp, map_frame), rows)
 
@@ -76,5 +80,6 @@ def read_belief(msg: Any, topic: str = 'belief') -> StampedBelief:
             value[kind == LANDMARK].reshape(-1, 2),
             cov,
             dict(zip(rows['key'][alias].tolist(), value[alias].astype(int).tolist(), strict=True)),
+            tuple(rows['key'][kind == GONE].tolist()),
         ),
     )

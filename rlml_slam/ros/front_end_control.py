@@ -124,6 +124,7 @@ class FrontEndControl:
         said = read_belief(msg)
         if said.session == self._answers.session:
             self.front_end.correct(said.T_map_local)
+            self.front_end.forget(said.belief.gone)
             fresh = said.stamp == self.front_end.newest
             if fresh and self.front_end.contradicts(said.belief):
                 self.front_end.adopt(said.belief)

@@ -116,6 +116,9 @@ class Mapper:
                 )
                 for closure in update.changed:
                     self._logger.warning(told(closure))
+                if update.gone:
+                    keys = ', '.join(map(str, update.gone))
+                    self._logger.warning(f'no longer seen where they were: reflectors {keys}')
                 if update.optimized:
                     self._tell_of_plant()
                     self._send_correction()

@@ -16,6 +16,7 @@ from rlml_slam.errors import RlmlError
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.closure_table import closure_table
+from rlml_slam.rlml.reflector_states import state_table
 from rlml_slam.ros import build
 from rlml_slam.ros.frames import FrameJoin
 from rlml_slam.ros.mapper import Mapper
@@ -35,6 +36,7 @@ class MapServices:
             (LoadMap, '~/load_map', self.load_map),
             (Trigger, '~/reset', self.reset),
             (Trigger, '~/closures', self.closures),
+            (Trigger, '~/reflectors', self.reflectors),
             (AddDiagnostics, '~/revoke_closure', self.revoke_closure),
             (GetMap, '~/dynamic_map', self.dynamic_map),
             (SetBool, '~/pause_new_measurements', self.pause),
@@ -71,6 +73,11 @@ class MapServices:
         """All loop closures with their records, as a table of comma-separated values."""
         response.success = True
         response.message = closure_table(self._mapper.back_end.scans.closures)
+
+    def reflectors(self, _request: Any, response: Any) -> None:
+        """What has become of each reflector, as a table of comma-separated values."""
+        response.success = True
+        response.message = state_table(self._mapper.back_end.reflector_states())
 
     def revoke_closure(self, request: Any, response: Any) -> None:
         """Take a loop closure out of the map; load_namespace is its number."""

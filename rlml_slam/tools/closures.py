@@ -12,8 +12,7 @@ from typing import Any
 
 from rlml_slam.errors import InputError, MapError
 from rlml_slam.rlml.closure_table import COLUMNS
-
-PATIENCE = 10.0  # [s] in which a running back end answers
+from rlml_slam.tools.ask import ask
 
 
 def add_parser(subparsers: Any) -> None:
@@ -38,9 +37,9 @@ def run(args: argparse.Namespace) -> int:
     if args.revoke is not None:
         if args.folder is not None:
             raise InputError('--revoke works in a running back end; a replay is done')
-        print(_ask(args.node, 'revoke_closure', str(args.revoke)))
+        print(ask(args.node, 'revoke_closure', str(args.revoke)))
         return 0
-    rows = read(args.folder) if args.folder else parse(_ask(args.node, 'closures'), args.node)
+    rows = read(args.folder) if args.folder else parse(ask(args.node, 'closures'), args.node)
     if args.json:
         print(json.dumps({'closures': rows}))
     else:
@@ -78,32 +77,3 @@ def text(rows: list[dict[str, str]], everything: bool) -> str:
     states = [r['state'] for r in rows]
     counts = ', '.join(f'{states.count(s)} {s}' for s in ('active', 'disabled', 'revoked'))
     return '\n'.join([*out, f'{len(rows)} loop closures: {counts}'])
-
-
-def _ask(node: str, service: str, argument: str | None = None) -> str:
-    """The answer of a running back end; InputError with its words where it refuses."""
-    import rclpy
-    from diagnostic_msgs.srv import AddDiagnostics
-    from std_srvs.srv import Trigger
-
-    kind = Trigger if argument is None else AddDiagnostics
-    request = kind.Request()
-    if argument is not None:
-        request.load_namespace = argument
-    rclpy.init()
-    try:
-        asker = rclpy.create_node('rlml_closures')
-        client = asker.create_client(kind, f'{node}/{service}')
-        if not client.wait_for_service(PATIENCE):
-            raise InputError(f'{node}: no such back end is running')
-        future = client.call_async(request)
-        rclpy.spin_until_future_complete(asker, future, timeout_sec=PATIENCE)
-        answer = future.result() if future.done() else None
-        asker.destroy_node()
-    finally:
-        rclpy.shutdown()
-    if answer is None:
-        raise InputError(f'{node}: no answer within {PATIENCE:.0f} s')
-    if not answer.success:
-        raise InputError(str(answer.message))
-    return str(answer.message)

@@ -174,6 +174,8 @@ SERVICES = (
             'forget the map and begin at `map_start_pose`'),
     Service('back_end', '~/closures', 'std_srvs/Trigger',
             'all loop closures: why each was accepted, its residual and weight, its state'),
+    Service('back_end', '~/reflectors', 'std_srvs/Trigger',
+            'what has become of each reflector: present, new, moved, missing or a ghost'),
     Service('back_end', '~/revoke_closure', 'diagnostic_msgs/AddDiagnostics',
             'take a loop closure out of the map; `load_namespace` is its number'),
     Service('back_end', '~/dynamic_map', 'nav_msgs/GetMap', 'the grid as it is now'),

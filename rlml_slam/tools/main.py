@@ -52,6 +52,9 @@ COMMANDS: Table = {
         'saved maps',
         {
             'info': Command('map_info', 'check a saved map and say what is in it'),
+            'reflectors': Command(
+                'map_reflectors', 'which reflectors are there, new, moved, missing or ghosts'
+            ),
             'survey': Command(
                 'map_survey', 'reflectors of a saved map against where they were surveyed'
             ),

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import resource
 import sys
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
@@ -79,6 +80,7 @@ def metrics(run: Run, judged: Judged | None = None) -> dict[str, Any]:
         'keyframes': len(run.keyframes),
         'closures': {'accepted': len(run.closures), 'rejected': run.rejected},
         'reflectors': len(run.reflectors),
+        'reflector_states': dict(Counter(s.state for s in run.reflector_states)),
         'peak_rss_mb': round(peak_rss_mb(), 1),
         'inputs': {stream: dict(counts) for stream, counts in run.inputs.items()},
         'health': {k: round(v, 4) for k, v in run.health_share().items()},

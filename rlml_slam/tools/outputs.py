@@ -13,6 +13,7 @@ import numpy as np
 from rlml_slam.errors import MapError
 from rlml_slam.maps import container, reflector_file
 from rlml_slam.maps.occupancy import UNKNOWN, OccupancyGrid, save, write_atomically
+from rlml_slam.rlml.reflector_states import state_table
 from rlml_slam.tools.metrics import judge, metrics
 from rlml_slam.tools.record import Run
 from rlml_slam.tools.tum import Trajectory, write_tum
@@ -21,9 +22,9 @@ from rlml_slam.tools.tum import Trajectory, write_tum
 def write_outputs(run: Run, folder: str | Path) -> dict[str, Any]:
     """Write all results and pictures of a run into a folder; the figures of metrics.json.
 
-    trajectory.tum, front_end.tum, map.rlml, map.pgm, map.yaml, reflectors.csv and closures.csv
-    depend on the data alone: two replays give the same bytes. Raises MapError if the folder
-    cannot be written.
+    trajectory.tum, front_end.tum, map.rlml, map.pgm, map.yaml, reflectors.csv,
+    reflector_states.csv and closures.csv depend on the data alone: two replays give the same
+    bytes. Raises MapError if the folder cannot be written.
     """
     folder = make_folder(folder)
     write_tum(folder / 'trajectory.tum', run.trajectory)
@@ -34,6 +35,9 @@ def write_outputs(run: Run, folder: str | Path) -> dict[str, Any]:
         container.write(folder / 'map.rlml', run.stored)
     if run.closure_table:
         write_atomically(folder / 'closures.csv', run.closure_table.encode())
+    if run.reflector_states:
+        table = state_table(run.reflector_states)
+        write_atomically(folder / 'reflector_states.csv', table.encode())
     judged = judge(run)
     figures = metrics(run, judged)
     write_atomically(folder / 'metrics.json', (json.dumps(figures, indent=2) + '\n').encode())

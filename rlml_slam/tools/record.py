@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rlml_slam.maps.container import Content
 from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.rlml.reflector_states import ReflectorState
 from rlml_slam.se2 import Array
 from rlml_slam.tools.tum import Trajectory
 from rlml_slam.types import Frame, Health, Level, Reflectors, Status
@@ -78,9 +79,9 @@ class Run:
     ``trajectory`` is the optimised one; ``keyframes`` (k, 3) are poses in the map and
     ``closures`` (c, 2, 2) the ends of the accepted loop closures there, of which
     ``closure_table`` tells all, empty where nothing is known of them. ``back_end_ms`` (k,)
-    has the cost per keyframe. ``problem`` says in one line what ended the run early or what of it
-    is missing, empty without either. ``stored`` is the whole map. ``extra`` goes into metrics.json
-    as it is.
+    has the cost per keyframe, ``reflector_states`` what has become of the reflectors.
+    ``problem`` says in one line what ended the run early or what of it is missing, empty without
+    either. ``stored`` is the whole map. ``extra`` goes into metrics.json as it is.
     """
 
     name: str
@@ -99,6 +100,7 @@ class Run:
     stored: Content | None = None
     extra: Mapping[str, Any] = field(default_factory=dict)
     closure_table: str = ''
+    reflector_states: tuple[ReflectorState, ...] = ()
 
     @property
     def duration_s(self) -> float:

@@ -245,6 +245,7 @@ def collect(slam: Slam | EkfSlam, log: FrameLog, name: str, truth: Truth | None)
         truth=truth,
         problem=problem,
         closure_table=closure_table(tried),
+        reflector_states=tuple(back_end.reflector_states()),
     )
 
 

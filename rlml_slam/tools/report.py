@@ -9,6 +9,7 @@ from html import escape
 from typing import Any
 
 from rlml_slam import __version__
+from rlml_slam.rlml.reflector_states import PRESENT, told
 from rlml_slam.tools.map_survey import changes, name_of
 from rlml_slam.tools.record import Run
 from rlml_slam.tools.summary import summary_rows
@@ -56,6 +57,10 @@ def report_html(run: Run, figures: Mapping[str, Any], pictures: Mapping[str, byt
     parts.append(_section('Figures', _table(summary_rows(figures))))
     if figures.get('survey', {}).get('found'):
         parts.append(_section('Reflectors against the survey', _table(_residuals(figures))))
+    changed = [told(s).partition(': ') for s in run.reflector_states if s.state != PRESENT]
+    if changed:
+        rows = [(kind, what) for kind, _, what in changed]
+        parts.append(_section('Reflectors that are not simply there', _table(rows)))
     parts += [_picture(name, pictures[name]) for name in ('health', 'timing') if name in pictures]
     spells = list(bad_spells(run))
     if spells:

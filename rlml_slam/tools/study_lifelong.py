@@ -22,8 +22,9 @@ from rlml_slam.errors import ParameterError
 from rlml_slam.params import Parameters, SimulatorParameters, from_mapping
 from rlml_slam.rlml.slam import Slam
 from rlml_slam.se2 import Array
+from rlml_slam.simulation.ray_cast import cast
 from rlml_slam.simulation.simulation import GroundTruth, Simulation
-from rlml_slam.simulation.world import ReflectorSet, World
+from rlml_slam.simulation.world import Geometry, ReflectorSet, World
 from rlml_slam.simulation.world_file import load_world
 from rlml_slam.tools.progress import Progress
 from rlml_slam.tools.usage import usage
@@ -32,6 +33,8 @@ from rlml_slam.types import Imu, Odometry, Scan
 HOUR = 3600.0
 POSTS = 13  # reflectors that the hall gets besides its own 17
 MOVED, FAR = 5, 1.5  # [m] how many of the 30 are moved, and how far
+SEEN = 0.1  # share of the route from which a post can be seen
+REACH, CLEARANCE = 20.0, 0.05  # [m] from which, and how far before a wall it stands
 CLOSE = 0.15  # [m] a reflector of the map this near to a true one is that one
 COLUMNS: dict[str, tuple[str, str]] = {
     'keyframes': ('keyframes', 'd'),
@@ -128,7 +131,10 @@ def drive(
 
 
 def loop_of(world: World, rng: np.random.Generator) -> World:
-    """The route up to where it comes back to its start; more reflectors, on posts at walls."""
+    """The route up to where it comes back to its start; more reflectors, on posts at walls.
+
+    Each post can be seen from a good part of the route.
+    """
     back = np.flatnonzero((world.route[1:] == world.route[0]).all(-1))
     route = world.route[: back[0] + 2] if len(back) else np.vstack([world.route, world.route[:1]])
     low, high = world.static.segments[:, :2].min(0), world.static.segments[:, :2].max(0)
@@ -138,7 +144,8 @@ def loop_of(world: World, rng: np.random.Generator) -> World:
         side = rng.integers(4)
         p[side // 2] = (low + 0.1, high - 0.1)[side % 2][side // 2]
         others = np.vstack([points, world.reflectors.points])
-        if np.hypot(*(others - p).T).min() > 2.0 * FAR:
+        apart = np.hypot(*(others - p).T).min() > 2.0 * FAR
+        if apart and in_view(world.static, route, p) > SEEN:
             points = np.vstack([points, p])
     r = world.reflectors
     more = ReflectorSet(
@@ -151,13 +158,30 @@ def loop_of(world: World, rng: np.random.Generator) -> World:
 
 
 def moved_points(world: World, moved: NDArray[np.int64], rng: np.random.Generator) -> Array:
-    """All reflectors, those with indices ``moved`` a way off towards the middle of the hall."""
+    """All reflectors, those with indices ``moved`` a way off, to where they can be seen."""
     points = world.reflectors.points.copy()
-    middle = points.mean(axis=0)
     for k in moved:
-        inwards = np.arctan2(*(middle - points[k])[::-1]) + rng.uniform(-0.7, 0.7)
-        points[k] += FAR * np.array([np.cos(inwards), np.sin(inwards)])
+        for _ in range(1000):
+            way = rng.uniform(-np.pi, np.pi)
+            p = points[k] + FAR * np.array([np.cos(way), np.sin(way)])
+            if in_view(world.static, world.route, p) > SEEN:
+                points[k] = p
+                break
     return points
+
+
+def in_view(static: Geometry, route: Array, point: Array) -> float:
+    """Share of a route (k, 2) from which nothing stands before a point (2,), in range."""
+    legs = np.diff(route, axis=0)
+    steps = [np.linspace(0.0, 1.0, 1 + int(np.hypot(*leg))) for leg in legs]
+    eyes = np.concatenate(
+        [a + s[:, None] * leg for a, s, leg in zip(route[:-1], steps, legs, strict=True)]
+    )
+    d = point - eyes
+    far = np.hypot(*d.T)
+    ranges, _, _ = cast(eyes, np.arctan2(d[:, 1], d[:, 0]), np.zeros(len(d)), static, 1000.0)
+    free = ranges > far + CLEARANCE
+    return float(np.mean(free & (far < REACH)))
 
 
 def resident_mb() -> float:
@@ -199,12 +223,23 @@ def judge(slam: Slam, before: World, after: World, moved: NDArray[np.int64]) -> 
 
     gaps = near(old[still])
     there = gaps[gaps < CLOSE]
+    states = slam.back_end.reflector_states()
+
+    def told(points: Array, *kinds: str) -> int:
+        """How many of ``points`` are told to be of one of some kinds."""
+        at = [s.origin.place if s.origin else s.place for s in states if s.state in kinds]
+        gap = np.linalg.norm(points[:, None] - np.array(at).reshape(-1, 2)[None], axis=-1)
+        return int((gap.min(axis=1, initial=np.inf) < CLOSE).sum())
+
     return {
         'mapped': len(found),
         'unmoved_mapped': len(there),
         'unmoved': len(still),
+        'unmoved_told_to_be_there': told(old[still], 'present'),
         'unmoved_rmse_m': float(np.sqrt(np.mean(there**2))) if len(there) else None,
         'moved_learned_anew': int((near(new[moved]) < CLOSE).sum()),
+        'moved_told': told(old[moved], 'moved'),
+        'moved_still_at_old_place': int((near(old[moved]) < CLOSE).sum()),
         'moved': len(moved),
     }
 
@@ -223,6 +258,8 @@ def text(figures: dict[str, Any]) -> str:
     lines.append(
         f'{r["unmoved_mapped"]} of {r["unmoved"]} reflectors that stayed are in the map{by}; '
         f'{r["moved_learned_anew"]} of {r["moved"]} that were '
-        f'moved are there anew; {r["mapped"]} in all'
+        f'moved are there anew, {r["moved_told"]} told to be moved, '
+        f'{r["moved_still_at_old_place"]} still where they were; {r["mapped"]} in all, '
+        f'{r["unmoved_told_to_be_there"]} of those that stayed without a change'
     )
     return '\n'.join(lines)

@@ -204,7 +204,12 @@ def test_belief_travels_exactly():
     rng = np.random.default_rng(0)
     A = rng.normal(size=(9, 9))
     belief = Belief(
-        rng.normal(size=3), np.array([2, 5, 7]), rng.normal(size=(3, 2)), A @ A.T, {3: 2, 9: 5}
+        rng.normal(size=3),
+        np.array([2, 5, 7]),
+        rng.normal(size=(3, 2)),
+        A @ A.T,
+        {3: 2, 9: 5},
+        (4, 9),
     )
     want = StampedBelief(SECOND, 12345, rng.normal(size=3), belief)
     assert_equal(read_belief(build_belief(make_bag, want, 'map')), want, exact=True)
