@@ -187,22 +187,6 @@ def tf_message(make: Make, transforms: Iterable[Any]) -> Any:
     return make('tf2_msgs/msg/TFMessage', transforms=list(transforms))
 
 
-def path(make: Make, stamp: int, frame_id: str, stamps: Iterable[int], poses: Array) -> Any:
-    """Path of poses (n, 3) with their stamps [ns]."""
-    return make(
-        'nav_msgs/msg/Path',
-        header=header(make, stamp, frame_id),
-        poses=[
-            make(
-                'geometry_msgs/msg/PoseStamped',
-                header=header(make, s, frame_id),
-                pose=pose(make, T),
-            )
-            for s, T in zip(stamps, poses, strict=True)
-        ],
-    )
-
-
 def map_metadata(make: Make, stamp: int, grid: OccupancyGrid) -> Any:
     """MapMetaData."""
     return make(

@@ -67,11 +67,11 @@ class Mapper:
         self.recovery = Recovery(params)
         self.worker = Worker()
         self.products = MapProducts(node, params.node)
-        # stamp and T_map_odom (3,), None at first; two threads use it, so the two come as one
-        self._odom: tuple[int, Array] | None = None
+        self._odom: tuple[int, Array] | None = None  # stamp and T_local_odom (3,) of the newest
         self._has_odometry = False  # in any session: odom is the robot's, not the front end's
         self._newest: Frame | None = None
-        self._session: int | None = None
+        self._session: int | None = None  # of the newest frame that came
+        self._mapped: int | None = None  # and of the newest that the worker has seen
         self._told: int | None = None  # session of a lost front end that knows its place by now
         self._sent = 0
         self._heard = 0.0
@@ -101,12 +101,15 @@ class Mapper:
             if self.saved is None:
                 self._logger.warning('the front end began anew, and so does the map')
             self.worker.submit(self._forget)
+            self._odom = None
         self._session = record.session
         self._heard = time.monotonic()
+        self._place_odom(record.frame)
         self.worker.submit(lambda: self._add(record))
 
     def _add(self, record: Record) -> None:
         frame = self._newest = record.frame
+        self._mapped = record.session
         if self.saved is None and not record.paused:
             update = self.back_end.add(frame)
             if update is not None:
@@ -123,7 +126,6 @@ class Mapper:
                     self._tell_of_plant()
                     self._send_correction()
                     self._send_belief(record)
-        self._place_odom(frame)
         self._recover(record)
         self._use_last_pose(frame)
         due = self.saved is None and self.products.is_due(frame.stamp)
@@ -192,7 +194,7 @@ class Mapper:
             self._tell_pose(frame.stamp, *start)
 
     def _place_odom(self, frame: Frame) -> None:
-        """Map to odom by a frame; one that lacks the odometry there is leaves it as it was."""
+        """Odom in the local frame; a frame without the odometry there is leaves it as it was."""
         T_odom_base = frame.observation.odom_pose
         if T_odom_base is not None:
             self._has_odometry = True
@@ -202,8 +204,7 @@ class Mapper:
             return
         else:  # without any odometry, odom is the front end's local frame
             T_odom_base = frame.T_local_base
-        T_map_base = se2.compose(self.back_end.T_map_local, frame.T_local_base)
-        self._odom = (frame.stamp, se2.compose(T_map_base, se2.inverse(T_odom_base)))
+        self._odom = (frame.stamp, se2.compose(frame.T_local_base, se2.inverse(T_odom_base)))
 
     def _send_correction(self) -> None:
         """The local frame in the map, with the covariance of the pose at this stamp in the map."""
@@ -249,18 +250,23 @@ class Mapper:
         return self.saved is None and self._newest is not None and self.products.stamp < self.stamp
 
     def send_transform(self) -> None:
-        """Publish map to odom at the newest stamp, if it is a new one."""
+        """Publish map to odom at the newest stamp, if it is a new one.
+
+        It waits for no job of the worker, only takes over what the newest one found.
+        """
         self.worker.check()
-        odom = self._odom  # once: the worker may put another one there
-        if odom is not None and odom[0] != self._sent:
-            n = self._p.node
-            self._tf.publish(odom[0], (n.map_frame, n.odom_frame), odom[1])
-            self._sent = odom[0]
+        if self._odom is None or self._odom[0] == self._sent:
+            return
+        self._sent, T = self._odom
+        if self._mapped == self._session:  # else the worker is in another local frame
+            T = se2.compose(self.back_end.T_map_local, T)
+        n = self._p.node
+        self._tf.publish(self._sent, (n.map_frame, n.odom_frame), T)
 
     def _forget(self) -> None:
         self.back_end.reset()
         self.products.restart()
-        self._newest, self._odom = None, None
+        self._newest = None
         self._send_correction()
 
     def start_at(self, pose: Array) -> None:

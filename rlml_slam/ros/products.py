@@ -19,6 +19,7 @@ from rlml_slam.ros.associated import build_reflector_map
 from rlml_slam.ros.markers import graph_markers, reflector_markers
 from rlml_slam.ros.messages import make_rclpy, rclpy_class
 from rlml_slam.ros.sensors import LATCHED
+from rlml_slam.ros.serialized_path import serialized_path
 from rlml_slam.se2 import Array
 from rlml_slam.types import Reflectors
 
@@ -100,7 +101,7 @@ class MapProducts:
         self._send('reflector_map_points', build_reflector_map(make, stamp, frame, reflectors))
         if saved is None:
             stamps, poses = source.trajectory()
-            self._send('trajectory', build.path(make, stamp, frame, stamps.tolist(), poses))
+            self._send('trajectory', serialized_path(stamp, frame, stamps, poses))
             graph = getattr(source, 'graph', None)
             if graph is not None:
                 self._send('graph', graph_markers(make, stamp, frame, graph))

@@ -5,10 +5,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections import defaultdict
+from threading import Event
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from nav_msgs.msg import Path
+from rclpy.serialization import deserialize_message
 
 from rlml_slam import se2
 from rlml_slam.errors import MapError
@@ -78,14 +81,20 @@ def mapper(make, ear, monkeypatch):
     return mapper
 
 
-def give(mapper, k, pose=(0.0, 0.0, 0.0), odometry=ODOMETRY, session=1, **more):
-    """The k-th frame of a robot without sensors, used and told before this returns."""
+def add(mapper, k, pose=(0.0, 0.0, 0.0), odometry=ODOMETRY, session=1, **more):
+    """The k-th frame of a robot without sensors; its stamp."""
     stamp, cov = (k + 1) * SECOND // 10, 1e-4 * np.eye(3)
     observation = Observation(stamp, Motion(np.zeros(3), 1e-6 * np.eye(3)), odom_pose=odometry)
     T = np.array(pose)
     none = np.zeros(0, dtype=np.int64)
     frame = Frame(stamp, observation, T, cov, T, cov, none, none)
     mapper.add(Record(session, frame, False, False, **more))
+    return stamp
+
+
+def give(mapper, k, **frame):
+    """The same, used and told before this returns."""
+    stamp = add(mapper, k, **frame)
     mapper.worker.submit(lambda: None).result()
     mapper.send_transform()
     return stamp
@@ -112,20 +121,34 @@ def test_without_any_odometry_odom_is_the_local_frame(mapper):
     np.testing.assert_allclose(mapper.transforms[-1][2], np.zeros(3), atol=1e-12)
 
 
-def test_map_to_odom_has_the_stamp_of_its_frame(mapper, monkeypatch):
-    """The timer may come while the back end works on a frame: what it sends is the last one's."""
-    first = give(mapper, 0)
-
-    def optimize(frame):
+def test_map_to_odom_waits_for_no_job_of_the_worker(mapper):
+    """It goes on with every frame, by the correction there is, and takes over the next one."""
+    give(mapper, 0)
+    busy = Event()
+    mapper.worker.submit(busy.wait)
+    for k in (1, 2):
+        stamp = add(mapper, k, pose=(0.1 * k, 0.0, 0.0))
         mapper.send_transform()
-        mapper.back_end.T_map_local = np.array([1.0, 0.0, 0.0])
+        assert mapper.transforms[-1][0] == stamp
+    *_, T = mapper.transforms[-1]
+    np.testing.assert_allclose(se2.compose(T, ODOMETRY), [0.2, 0.0, 0.0], atol=1e-12)
+    mapper.worker.submit(lambda: setattr(mapper.back_end, 'T_map_local', np.array([1.0, 0, 0])))
+    busy.set()
+    give(mapper, 3, pose=(0.3, 0.0, 0.0))
+    *_, T = mapper.transforms[-1]
+    np.testing.assert_allclose(se2.compose(T, ODOMETRY), [1.3, 0.0, 0.0], atol=1e-12)
 
-    monkeypatch.setattr(mapper.back_end, 'add', optimize)
-    second = give(mapper, 1)
-    (told, _, before), (stamp, _, after) = mapper.transforms
-    assert (told, stamp) == (first, second)
-    np.testing.assert_allclose(se2.compose(before, ODOMETRY), np.zeros(3), atol=1e-12)
-    np.testing.assert_allclose(se2.compose(after, ODOMETRY), [1.0, 0.0, 0.0], atol=1e-12)
+
+def test_correction_of_one_session_is_not_of_the_next(mapper):
+    give(mapper, 0)
+    mapper.back_end.T_map_local = np.array([1.0, 0.0, 0.0])
+    busy = Event()
+    mapper.worker.submit(busy.wait)
+    add(mapper, 1, pose=(0.5, 0.0, 0.0), session=2)
+    mapper.send_transform()
+    busy.set()
+    *_, T = mapper.transforms[-1]
+    np.testing.assert_allclose(se2.compose(T, ODOMETRY), [0.5, 0.0, 0.0], atol=1e-12)
 
 
 def test_pause_stops_the_map_but_not_map_to_odom(mapper):
@@ -144,7 +167,7 @@ def test_pause_before_the_first_frame_is_survived(mapper, ear):
     give(mapper, 0, paused=True)
     mapper.publish_map()
     assert len(mapper.transforms) == 1
-    assert ear.sent['trajectory'][-1].poses == []
+    assert deserialize_message(ear.sent['trajectory'][-1], Path).poses == []
 
 
 # --- saving ---------------------------------------------------------------------------------

@@ -13,7 +13,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 rclpy = pytest.importorskip('rclpy', reason='needs ROS 2 or its wheels')
 
-from rclpy.serialization import serialize_message  # noqa: E402
+from nav_msgs.msg import Path  # noqa: E402
+from rclpy.serialization import deserialize_message, serialize_message  # noqa: E402
 
 from rlml_slam.maps.occupancy import OccupancyGrid  # noqa: E402
 from rlml_slam.motion import STILL  # noqa: E402
@@ -23,6 +24,7 @@ from rlml_slam.ros import build  # noqa: E402
 from rlml_slam.ros.associated import build_reflector_map  # noqa: E402
 from rlml_slam.ros.frames import build_record  # noqa: E402
 from rlml_slam.ros.messages import make_rclpy as make  # noqa: E402
+from rlml_slam.ros.serialized_path import serialized_path  # noqa: E402
 from rlml_slam.ros.updates import build_update  # noqa: E402
 from rlml_slam.tools.recorder import Recorder  # noqa: E402
 from rlml_slam.types import Detections, Frame, Health, Level, Observation, Scan  # noqa: E402
@@ -93,8 +95,8 @@ def test_scans_outside_the_last_trajectory_have_their_live_poses(recorder):
     for k in range(1, 6):
         recorder.on_pose(pose(k, 10.0 * k))
     stamps = [2 * SECOND, 3 * SECOND]
-    path = build.path(make, 1, 'map', stamps, np.array([[2.0, 0, 0], [3.0, 0, 0]]))
-    recorder.on_trajectory(path)
+    path = serialized_path(1, 'map', np.array(stamps), np.array([[2.0, 0, 0], [3.0, 0, 0]]))
+    recorder.on_trajectory(deserialize_message(path, Path))
     t = recorder.trajectory()
     assert_array_equal(t.stamps, SECOND * np.arange(1, 6))
     assert_allclose(t.poses[:, 0], [10.0, 2.0, 3.0, 40.0, 50.0])
@@ -146,8 +148,8 @@ def test_recorder_waits_for_poses_and_for_the_map(recorder):
     recorder.on_pose(answer)
     assert not recorder.has_caught_up(now)
     for stamp, done in ((9 * SECOND, False), (10 * SECOND + 7, True)):
-        path = build.path(make, stamp, 'map', [stamp], np.zeros((1, 3)))
-        recorder.on_product('trajectory', serialize_message(path))
+        path = serialized_path(stamp, 'map', np.array([stamp]), np.zeros((1, 3)))
+        recorder.on_product('trajectory', path)
         recorder.on_diagnostics(build.diagnostics(make, stamp - 1, 'front_end', Health(), {}))
         assert not recorder.has_caught_up(now)
         recorder.on_diagnostics(build.diagnostics(make, stamp, 'front_end', Health(), {}))
