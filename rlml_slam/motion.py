@@ -22,6 +22,7 @@ from rlml_slam.types import Imu, Motion, Odometry
 
 SECOND = 1_000_000_000
 Stamps = NDArray[np.int64]
+COAST = 0.2  # [s] for which a robot is taken to go on as it went before its odometry ended
 
 
 @kernel
@@ -276,23 +277,45 @@ class MotionBuffer:
                 del column[:k]
 
     def extrapolate(self, start: int, end: int) -> Motion:
-        """Motion from ``start`` to ``end`` where odometry ends in between: the last speed goes on.
+        """Motion from ``start`` to ``end`` where odometry ends before the latter.
 
-        Its covariance is that of an unknown speed change over the part without odometry.
+        The last speed goes on for COAST at most; an IMU that still measures tells the turn. The
+        variance of the rest grows with the square of the time since odometry ended, as one unknown
+        speed's does: that of a part is what it grows by, so parts add up to the whole.
         """
         newest = self.newest
         if newest is None:
             return self.motion(start, end)
-        covered = self.motion(start, min(max(newest, start), end))
-        dt = (end - max(newest, start)) / SECOND
+        covered = self.motion(start, newest)
+        begin = max(newest, start)
+        since, until = (begin - newest) / SECOND, (end - newest) / SECOND
+        unmeasured = self.motion(begin, end)
+        has_gyro = bool(unmeasured.bias_gain.any())
+        coasted = min(until, COAST) - min(since, COAST)
         v, w = self._v[-1], self._w[-1]
         lasted = len(self._stamps) > 1 and self._stamps[-1] - self._stamps[-2] >= SECOND // 100
-        if math.isnan(v) or not lasted or dt > 2.0 * self._noise.interval:
+        if math.isnan(v) or not lasted:
             v = w = 0.0
+        turn = unmeasured.delta[2] if has_gyro else w * coasted
         n = self._noise
-        spread = np.array([n.max_speed / 5.0, n.max_speed / 20.0, n.max_turn_rate / 5.0]) * dt
-        rest = Motion(se2.exp(np.array([v * dt, 0.0, w * dt])), np.diag(spread**2), known=False)
+        cov = np.diag([n.max_speed / 5.0, n.max_speed / 20.0, n.max_turn_rate / 5.0]) ** 2
+        cov *= until**2 - since**2
+        if has_gyro:
+            cov[2, 2] = unmeasured.cov[2, 2]
+        delta = se2.exp(np.array([v * coasted, 0.0, turn]))
+        rest = Motion(delta, cov, known=False, bias_gain=unmeasured.bias_gain)
         return compose_motion(covered, rest)
+
+    def forget_after(self, stamp: int) -> None:
+        """Drop all samples later than a stamp: their clock was wrong."""
+        k = bisect_right(self._stamps, stamp)
+        for column in (self._stamps, self._poses, self._v, self._w):
+            del column[k:]
+        if not self._v:
+            self._v.append(0.0)
+            self._w.append(0.0)
+        k = bisect_right(self._imu_stamps, stamp)
+        del self._imu_stamps[k:], self._rates[k:]
 
     def covers(self, stamp: int) -> bool:
         """Whether odometry before and after the stamp is there."""

@@ -35,6 +35,7 @@ CARRY = 5 * SECOND  # motion older than this is summed up; an observation later 
 MAX_SWEEP = 1.0  # [s] of one scan
 SIGMA = (1e-4, 10.0)  # [m] a detection that claims to be better or worse is believed this much
 INSTANTS = 20  # instants remembered: the other half of one comes soon after
+AHEAD = SECOND  # a stamp this far before all others is strange; sensors lag by less
 PERSISTENT = 10  # inputs in a row: fewer with a strange stamp are faults, more are a new clock
 # stamp, stream, what came, and how much later than its stamp it was measured [ns]
 Waiting: TypeAlias = tuple[int, str, Scan | Detections, int]
@@ -67,8 +68,8 @@ class Sequencer:
     """Collects the inputs of one robot; each ``add_…`` returns the observations that became ready.
 
     An invalid input is counted in ``inputs`` and left out; it costs nothing that was known before.
-    Only one thing raises InputError: a stream whose stamps stay behind by more than the buffer's
-    memory, as a looped bag's do; the caller then starts anew.
+    Only one thing raises InputError: stamps that stay behind, as a looped bag's do; the caller
+    then starts anew.
     """
 
     def __init__(self, params: Parameters) -> None:
@@ -88,9 +89,8 @@ class Sequencer:
         self._lidars: dict[str, tuple[int, int]] = {}  # by frame: newest stamp and period
         self._newest_any = -(2**62)
         self._first_any: int | None = None
-        # where odometry ended before the last observation: (stamp, motion assumed since)
-        self._extrapolated: tuple[int, Array] | None = None
-        self._strange: Counter[str] = Counter()
+        self._step: dict[str, int] = {}  # by stream: between its last two stamps
+        self._num_ahead = self._num_behind = 0  # messages in a row whose stamp is far off
         self._last: int | None = None  # stamp up to which motion is used or carried
         self._carried = STILL
         self._white = 0.0  # [s] error of the last stamp that is not of the next
@@ -209,23 +209,22 @@ class Sequencer:
             error = f'{stream} at {stamp} ns: {why or "stamp is not positive"}'
             self.inputs.count(stream, 'invalid', error)
             return False
-        newest = self._newest.get(stream)
-        newest_of = self._newest_of.get((stream, source))
-        if stamp == newest_of:
+        if stamp == self._newest_of.get((stream, source)):
             self.inputs.count(stream, 'duplicate')
             return False
+        if self._is_ahead(stream, stamp):
+            return False
+        self._look_back(stream, stamp)
+        newest = self._newest.get(stream)
         measured = stream in ('scan', 'reflectors')
         limit = self._last if measured else newest
         if limit is not None and stamp <= limit:
             self.inputs.count(stream, 'late', f'{stream} at {stamp} ns is late')
             if measured and stamp == self._last:
                 self._paired = stamp  # the next one's other half will be waited for
-            self._jumped(stream, self._newest_any - stamp, 'back')
             return False
-        if self._first_any is not None and self._jumped(stream, stamp - self._newest_any, 'ahead'):
-            self.inputs.count(stream, 'future', f'{stream} at {stamp} ns is far in the future')
-            return False
-        self._strange[stream] = 0
+        newest_of = self._newest_of.get((stream, source))
+        self._step[stream] = 0 if newest is None else max(stamp - newest, 0)
         self._newest[stream] = stamp if newest is None else max(newest, stamp)
         self._newest_of[stream, source] = stamp if newest_of is None else max(newest_of, stamp)
         self._newest_any = max(self._newest_any, stamp)
@@ -233,16 +232,50 @@ class Sequencer:
             self._first_any = stamp
         return True
 
-    def _jumped(self, stream: str, by: int, where: str) -> bool:
-        """Whether a stamp is too far off to be believed; a clock that stays back raises."""
-        if by <= self._node.tf_buffer_duration * SECOND:
+    def _is_ahead(self, stream: str, stamp: int) -> bool:
+        """Whether a stamp is too far ahead of all others to be believed.
+
+        One that is believed makes all that come after it late. Where nothing else comes for some
+        messages, time did go on.
+        """
+        ahead = stamp - self._newest_any
+        if self._first_any is None or ahead <= AHEAD + 3 * self._step.get(stream, 0):
+            self._num_ahead = 0
             return False
-        self._strange[stream] += 1
-        if self._strange[stream] < PERSISTENT:
-            return True
-        if where == 'back':
-            raise InputError(f'the clock of {stream} jumped back by {by / SECOND:.1f} s')
-        return False
+        self._num_ahead += 1
+        if self._num_ahead >= PERSISTENT:
+            self._num_ahead = 0
+            return False
+        error = f'{stream} at {stamp} ns is {ahead / SECOND:.1f} s ahead of all other stamps'
+        self.inputs.count(stream, 'future', error)
+        return True
+
+    def _look_back(self, stream: str, stamp: int) -> None:
+        """Find out which is right where stamps are far behind the newest one.
+
+        Where all messages in a row are, that one is wrong: what came with it is forgotten. If it
+        was used already, the clock was set back: raises InputError.
+        """
+        behind = self._newest_any - stamp
+        if self._first_any is None or behind <= AHEAD:
+            self._num_behind = 0
+            return
+        self._num_behind += 1
+        if self._num_behind < PERSISTENT:
+            return
+        self._num_behind = 0
+        if self._last is not None and self._last - stamp > AHEAD:
+            raise InputError(f'the clock of {stream} jumped back by {behind / SECOND:.1f} s')
+        self._forget_after(stamp + AHEAD)
+
+    def _forget_after(self, stamp: int) -> None:
+        for stream in [s for s, newest in self._newest.items() if newest > stamp]:
+            error = f'{stream} at {self._newest.pop(stream)} ns is far ahead of all other stamps'
+            self.inputs.count(stream, 'future', error)
+        self._newest_of = {k: s for k, s in self._newest_of.items() if s <= stamp}
+        self._waiting = [w for w in self._waiting if w[0] <= stamp]
+        self.buffer.forget_after(stamp)
+        self._newest_any = max(self._newest.values(), default=stamp)
 
     def _wait(self, stamp: int, stream: str, item: Scan | Detections) -> None:
         self._waiting.append((stamp, stream, item, self._measured_later(stream, item)))
@@ -365,18 +398,11 @@ class Sequencer:
         self._last = until
 
     def _motion(self, last: int, stamp: int) -> Motion:
-        """Motion since the last observation; what was extrapolated is made good afterwards."""
+        """Motion since the last observation; what that one assumed, measurements have mended."""
         newest = self.buffer.newest
-        start, used = self._extrapolated or (last, None)
         if newest is not None and newest < stamp:
-            motion = self.buffer.extrapolate(start, stamp)
-            self._extrapolated = (start, motion.delta)
-        else:
-            motion = self.buffer.motion(start, stamp)
-            self._extrapolated = None
-        if used is None:
-            return motion
-        return dataclasses.replace(motion, delta=se2.between(used, motion.delta))
+            return self.buffer.extrapolate(last, stamp)
+        return self.buffer.motion(last, stamp)
 
     def _moved(self, start: int, end: int) -> Array:
         """Motion (3,) of base from one stamp to another, or back."""

@@ -289,6 +289,35 @@ def test_clock_that_stays_ahead_is_followed():
     assert [o.stamp for o in out] == [s]
 
 
+@pytest.mark.parametrize('ahead', [5, 12, 25])
+@pytest.mark.parametrize('stream', ['odom', 'imu', 'scan', 'reflectors'])
+def test_one_stamp_ahead_costs_no_observation(ahead, stream):
+    inputs = drive_inputs(imu=True)
+    late = T0 + SECOND + ahead * SECOND
+    bad = {
+        'odom': odometry(late), 'imu': Imu(late, 0.0), 'scan': scan(late),
+        'reflectors': detections(late),
+    }[stream]  # fmt: skip
+    for at in (0, len(inputs) // 2):
+        sequencer = Sequencer(Parameters())
+        out = feed(sequencer, [*inputs[:at], bad, *inputs[at:]]) + sequencer.flush()
+        assert sequencer.inputs.counts[stream]['future'] == 1
+        known = [o for o in out if o.motion.known and o.odom_pose is not None]
+        # of the first message nothing else tells that it is wrong
+        assert len(known) >= 30 - (0 if at else 3)
+        assert max(o.stamp for o in out) < late
+
+
+def test_first_stamp_of_another_clock_is_found_out():
+    """A message stamped by the wall clock before simulated time."""
+    sequencer = Sequencer(Parameters())
+    inputs = [Imu(T0 + 10**9 * SECOND, 0.0), *drive_inputs()]
+    out = feed(sequencer, inputs) + sequencer.flush()
+    assert len(out) >= 28
+    assert all(o.motion.known for o in out[3:])
+    assert sequencer.inputs.counts['imu']['future'] == 1
+
+
 def test_clock_that_stays_back_is_an_error():
     sequencer, t = running(until=T0 + 60 * SECOND)
     feed(sequencer, [scan(t), odometry(t + 20 * MS)])
@@ -322,25 +351,53 @@ def test_motion_carried_over_a_long_time_is_the_direct_motion(gap):
     np.testing.assert_allclose(b.motion.cov, expected.cov, rtol=1e-6, atol=1e-9)
 
 
-def test_late_odometry_makes_the_extrapolation_good():
+def stalled(imu=False):
+    """Observations every 100 ms while odometry stalls, and the first one after it goes on."""
     sequencer, t = running()
     out = feed(sequencer, [scan(t), detections(t), odometry(t + 20 * MS)])
-    # odometry stalls while two scans come, then delivers what it held back
-    stamps = [t + 100 * MS, t + 200 * MS]
+    stamps = [t + k * 100 * MS for k in range(1, 12)]
     for s in stamps:
+        if imu:
+            rates = [Imu(r, TURN) for r in range(s - 100 * MS, s + 20 * MS, 10 * MS)]
+            out += feed(sequencer, rates)
         out += feed(sequencer, [scan(s), detections(s)])
-    out += feed(sequencer, [scan(t + 500 * MS), detections(t + 500 * MS)])
+    out += feed(sequencer, [odometry(t + k * 20 * MS) for k in range(52, 60)])
     assert [o.stamp for o in out] == [t, *stamps]
-    assert not out[1].motion.known
-    assert not out[2].motion.known
-    out += feed(sequencer, [odometry(t + k * 20 * MS) for k in range(2, 27)])
-    assert len(out) == 4
-    total = np.zeros(3)
-    for o in out[1:]:
-        total = se2.compose(total, o.motion.delta)
-    # nothing is counted twice and nothing lost
-    expected = se2.between(pose_at(t), pose_at(t + 500 * MS))
-    np.testing.assert_allclose(total, expected, atol=1e-5)
+    return t, out[1:]
+
+
+def test_motion_after_a_stall_is_that_since_the_last_observation():
+    """What is seen during a stall says where the robot is: nothing of it is to be made good."""
+    _, out = stalled()
+    known = [o.motion.known for o in out]
+    assert known == sorted(known)
+    assert 2 <= sum(known) <= len(known) - 3
+    for before, o in itertools.pairwise(out):
+        moved = se2.between(pose_at(before.stamp), pose_at(o.stamp))
+        if o.motion.known:
+            np.testing.assert_allclose(o.motion.delta, moved, atol=1e-3)
+        else:
+            assert 0.0 <= o.motion.delta[0] < 1.01 * moved[0]
+
+
+def test_uncertainty_of_a_stall_grows_with_its_length_alone():
+    """One unknown speed: the deviation grows with time, in however many parts it is counted."""
+    t, out = stalled()
+    parts = [o.motion for o in out if not o.motion.known]
+    total = np.sum([m.cov[:2, :2] for m in parts], axis=0)
+    whole = running()[0].buffer
+    whole = whole.extrapolate(t, t + len(parts) * 100 * MS).cov[:2, :2]
+    np.testing.assert_allclose(np.trace(total), np.trace(whole), rtol=0.1)
+
+
+def test_imu_tells_the_turn_while_odometry_stalls():
+    _, without = stalled()
+    _, out = stalled(imu=True)
+    stall = [o.motion for o in out if not o.motion.known][2:]
+    for m in stall:
+        assert m.delta[2] == pytest.approx(0.1 * TURN, rel=1e-6)
+        assert m.bias_gain[2] == pytest.approx(-0.1)
+        assert m.cov[2, 2] < 0.01 * without[4].motion.cov[2, 2]
 
 
 def test_imu_refines_the_motion_between_observations():
