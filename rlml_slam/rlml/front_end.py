@@ -26,6 +26,7 @@ from rlml_slam.rlml.doubt import Doubt, consents
 from rlml_slam.rlml.grid_fix import Fix, SavedGrid
 from rlml_slam.rlml.health import Evidence, HealthMonitor, weak_direction
 from rlml_slam.rlml.joint_state import BIAS, JointState
+from rlml_slam.rlml.map_window import MapWindow
 from rlml_slam.rlml.reflector_update import use_reflectors
 from rlml_slam.rlml.relocalize import is_mapped
 from rlml_slam.rlml.scan_update import fuse, prior_of
@@ -79,6 +80,7 @@ class FrontEnd:
         self._since: tuple[int, Array] | None = None
         self._has_odometry = False
         self._map: SavedMap | None = None
+        self._window: MapWindow | None = None
         self._unconfirmed = False
         self._last_fit = 0
         self._reach = 0.0
@@ -95,11 +97,8 @@ class FrontEnd:
         if not self.state.pose_cov.any():
             self.state.widen(np.diag(START_SIGMA**2))
         self._unconfirmed = True
-        for k in range(len(reflectors)):
-            self.state.fix_landmark(reflectors.points[k], reflectors.cov[k])
-            self.tracks.append(
-                0, int(reflectors.ids[k]), float(reflectors.diameters[k]), surveyed=True
-            )
+        self._window = MapWindow(reflectors, self._p.reflector.max_range)
+        self._window.follow(self.state, self.tracks)
 
     def use_grid(self, grid: OccupancyGrid | None) -> None:
         """Localise against a grid as well, or no longer."""
@@ -213,6 +212,8 @@ class FrontEnd:
         """The pose at the observation's stamp; never raises for what was measured."""
         began = time.perf_counter()
         self.state.predict(self._motion(observation), self._bias_walk(observation.stamp))
+        if self._window is not None:
+            self._window.follow(self.state, self.tracks)
         matched = _Matched.none(observation.detections)
         self._use_reflectors(observation, matched)
         evidence = self._use_scan(observation, matched)

@@ -160,14 +160,14 @@ class JointState:
         self.x, self.P = x, P
         return (n - LANDMARKS) // 2
 
-    def fix_landmark(self, point: Array, cov: Array) -> int:
-        """Append a reflector of a given map, independent of the rest; its index."""
-        n = len(self.x)
-        P = np.zeros((n + 2, n + 2))
+    def fix_landmarks(self, points: Array, cov: Array) -> None:
+        """Append reflectors (k, 2) of a given map with covariances (k, 2, 2), all independent."""
+        n, k = len(self.x), len(points)
+        P = np.zeros((n + 2 * k, n + 2 * k))
         P[:n, :n] = self.P
-        P[n:, n:] = cov
-        self.x, self.P = np.concatenate([self.x, point]), P
-        return (n - LANDMARKS) // 2
+        at = n + 2 * np.arange(k)[:, None] + np.arange(2)
+        P[at[:, :, None], at[:, None, :]] = cov
+        self.x, self.P = np.concatenate([self.x, points.ravel()]), P
 
     def remove_landmarks(self, keep: NDArray[np.bool_]) -> None:
         """Marginalise out the reflectors where ``keep`` (m,) is false."""

@@ -65,5 +65,5 @@ def use_reflectors(x: Array, P: Array, index: NDArray[np.int64], z: Array, noise
 def warm_up() -> None:
     """Compile the kernel with the signature that is used at run time."""
     state = JointState(np.zeros(3), np.eye(3), 0.1)
-    state.fix_landmark(np.ones(2), np.eye(2))
+    state.fix_landmarks(np.ones((1, 2)), np.eye(2)[None])
     use_reflectors(state.x, state.P, np.zeros(1, dtype=np.int64), np.ones((1, 2)), np.eye(2)[None])

@@ -56,6 +56,18 @@ class Tracks:
         self.doubles = np.append(self.doubles, 0)
         return key
 
+    def survey(self, keys: NDArray[np.int64], ids: NDArray[np.int64], diameters: Array) -> None:
+        """Reflectors (k,) of a given map, under keys of their own."""
+        k = len(keys)
+        self.keys = np.append(self.keys, keys)
+        self.ids = np.append(self.ids, ids)
+        self.sightings = np.append(self.sightings, np.zeros(k, dtype=np.int64))
+        self.last_seen = np.append(self.last_seen, np.zeros(k, dtype=np.int64))
+        self.surveyed = np.append(self.surveyed, np.ones(k, dtype=np.bool_))
+        self.diameters = np.append(self.diameters, diameters)
+        self.spread2 = np.append(self.spread2, np.zeros(k))
+        self.doubles = np.append(self.doubles, np.zeros(k, dtype=np.int64))
+
     def see(self, index: NDArray[np.int64], stamp: int, ids: NDArray[np.int64]) -> None:
         """The reflectors at ``index`` were seen again; an id, once told, is kept."""
         self.sightings[index] += 1

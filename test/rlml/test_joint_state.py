@@ -119,10 +119,14 @@ def test_new_landmark_has_the_covariance_of_its_inverse_observation():
 def test_surveyed_landmark_is_independent_of_all():
     state = made(5)
     n = len(state.x)
-    assert state.fix_landmark(np.array([1.0, 2.0]), 1e-4 * np.eye(2)) == 3
+    cov = np.array([[[1e-4, 2e-5], [2e-5, 2e-4]], 3e-4 * np.eye(2)])
+    before = state.P.copy()
+    state.fix_landmarks(np.array([[1.0, 2.0], [3.0, 4.0]]), cov)
+    np.testing.assert_array_equal(state.P[:n, :n], before)
     np.testing.assert_array_equal(state.P[n:, :n], 0.0)
-    np.testing.assert_array_equal(state.landmark_covs()[3], 1e-4 * np.eye(2))
-    np.testing.assert_array_equal(state.landmarks()[3], [1.0, 2.0])
+    np.testing.assert_array_equal(state.P[n : n + 2, n + 2 :], 0.0)
+    np.testing.assert_array_equal(state.landmark_covs()[3:], cov)
+    np.testing.assert_array_equal(state.landmarks()[3:], [[1.0, 2.0], [3.0, 4.0]])
 
 
 def test_clone_is_the_pose_with_all_its_correlations():
