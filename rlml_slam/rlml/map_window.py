@@ -17,7 +17,7 @@ MARGIN = 10.0  # [m] beyond reach, so that the part changes seldom
 
 
 class MapWindow:
-    """Keeps the reflectors within ``reach`` [m] in a state; the key of one is its row of the map."""
+    """Keeps the reflectors within ``reach`` [m] in a state; keys are rows of the map."""
 
     def __init__(self, reflectors: Reflectors, reach: float) -> None:
         self._map = reflectors
