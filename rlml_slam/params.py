@@ -126,6 +126,10 @@ class Node(Group):
     )
     map_directory: str = param('maps', 'the only folder that maps are saved to and loaded from')
     map_file_name: str = param('map', 'name of the saved map inside map_directory, no suffix')
+    continue_map: bool = param(
+        False,
+        'while mapping, go on with map_file_name.rlml where it is there',
+    )
     map_start_pose: tuple[float, ...] = param(
         (0.0, 0.0, 0.0), 'start pose in the map', 'm, m, rad'
     )

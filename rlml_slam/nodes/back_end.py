@@ -79,6 +79,7 @@ class BackEndNode(Node):
             'closures accepted': tried[True],
             'closures rejected': tried[False],
             **fates(self.mapper.back_end.scans.closures),
+            **self.mapper.continued,
             **({} if plant is None else {'survey': plant.why}),
             'frames waiting for the worker': self.mapper.worker.backlog,
             'frames without their points or detections': self.join.incomplete,

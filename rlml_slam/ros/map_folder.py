@@ -9,6 +9,9 @@ from rlml_slam.errors import MapError
 from rlml_slam.maps import occupancy, reflector_file, survey
 from rlml_slam.maps.saved import SavedMap
 from rlml_slam.maps.survey import Survey
+from rlml_slam.rlml import stored_map
+
+SUFFIXES = ('.rlml', '.yaml', '.csv', '.pgm')
 
 
 class MapFolder:
@@ -20,7 +23,7 @@ class MapFolder:
     def path(self, name: str) -> Path:
         """The path of a map without its suffixes; MapError if it lies outside of the folder."""
         name = name.removeprefix('file://')
-        for suffix in ('.yaml', '.csv', '.pgm'):
+        for suffix in SUFFIXES:
             name = name.removesuffix(suffix)
         path = (self._folder / name).resolve()
         if not name or path == self._folder or not path.is_relative_to(self._folder):
@@ -58,9 +61,19 @@ class MapFolder:
                 raise MapError(f'{old}: of an older map, cannot be removed: {e.strerror}') from e
         return path
 
-    def load(self, name: str) -> SavedMap:
-        """Read what save wrote; MapError or FileFormatError says what is wrong with which file."""
+    def whole(self, name: str) -> Path:
+        """The path of the one file that has everything of a map."""
         path = self.path(name)
+        return path.with_name(path.name + '.rlml')
+
+    def load(self, name: str) -> SavedMap:
+        """Read name.rlml where it is there, else name.csv and name.yaml; a suffix says which.
+
+        MapError or FileFormatError says what is wrong with which file.
+        """
+        path = self.path(name)
+        if name.endswith('.rlml') or (not name.endswith(SUFFIXES) and self.whole(name).exists()):
+            return stored_map.saved_map(stored_map.load(self.whole(name)))
         reflectors = reflector_file.load(path.with_name(path.name + '.csv'))
         meta = path.with_name(path.name + '.yaml')
         return SavedMap(reflectors, occupancy.load(meta) if meta.exists() else None)

@@ -23,6 +23,7 @@ from rlml_slam.rlml.recovery import Recovery
 from rlml_slam.ros import build
 from rlml_slam.ros.associated import build_reflector_map
 from rlml_slam.ros.beliefs import StampedBelief, build_belief
+from rlml_slam.ros.continued import Continued
 from rlml_slam.ros.frames import Record
 from rlml_slam.ros.last_pose import LastPose, verified
 from rlml_slam.ros.map_folder import MapFolder
@@ -63,6 +64,7 @@ class Mapper:
         if params.node.mode == 'localization':
             self._load(params.node.map_file_name)
         self.back_end = BackEnd(params, self.folder.survey(params.back_end.survey))
+        self._continued: Continued | None = None
         self._in_plant = False
         self.recovery = Recovery(params)
         self.worker = Worker()
@@ -88,6 +90,8 @@ class Mapper:
         self._localization = node.create_publisher(cloud, 'localization_map', LATCHED)
         if self.saved is not None:
             self.worker.submit(self._use_saved)
+        elif params.node.continue_map and self.folder.whole(params.node.map_file_name).exists():
+            self._continue(params.node.map_file_name)
 
     @property
     def stamp(self) -> int:
@@ -98,9 +102,9 @@ class Mapper:
     def add(self, record: Record) -> None:
         """Give one frame to the worker; another session of the front end begins another map."""
         if self._session not in (None, record.session):
-            if self.saved is None:
+            if self.saved is None and not self._enters:
                 self._logger.warning('the front end began anew, and so does the map')
-            self.worker.submit(self._forget)
+            self.worker.submit(self._begin_session)
             self._odom = None
         self._session = record.session
         self._heard = time.monotonic()
@@ -109,9 +113,12 @@ class Mapper:
 
     def _add(self, record: Record) -> None:
         frame = self._newest = record.frame
+        if not self._enter(frame):
+            return
         self._mapped = record.session
         if self.saved is None and not record.paused:
-            update = self.back_end.add(frame)
+            known = self._continued
+            update = self.back_end.add(frame if known is None else known.to_map(frame))
             if update is not None:
                 place = self.back_end.graph.poses[update.keyframe, :2]
                 self._updates.publish(
@@ -131,6 +138,34 @@ class Mapper:
         due = self.saved is None and self.products.is_due(frame.stamp)
         if due and self.worker.backlog < MAX_BACKLOG:
             self.publish_map()
+
+    @property
+    def _enters(self) -> bool:
+        """Whether a saved map is to be gone on with, in which the robot's place is not known."""
+        return self.saved is None and self._continued is not None and not self._continued.entered
+
+    @property
+    def continued(self) -> dict[str, str]:
+        """For /diagnostics: why a saved map is not gone on with yet."""
+        known = self._continued
+        return {'saved map not entered': known.why} if known is not None and self._enters else {}
+
+    def _enter(self, frame: Frame) -> bool:
+        """Whether a frame is in the map to go on with; where not, its place is looked for."""
+        if self._continued is None or not self._enters:
+            return True
+        found = self._continued.enter(frame)
+        if found is not None and found.pose is not None and found.cov is not None:
+            self._logger.info(f'goes on in the saved map: {found.why}')
+            self._tell_pose(frame.stamp, found.pose, found.cov)
+        return not self._enters
+
+    def _begin_session(self) -> None:
+        """In the worker: the front end began anew, and so does the map, if it was in it."""
+        if self._continued is not None and self._enters:
+            self._continued.begin_session()
+        else:
+            self._forget()
 
     def _tell_of_plant(self) -> None:
         """Say so once when the map has entered the frame of the survey."""
@@ -218,6 +253,8 @@ class Mapper:
         belief = self.back_end.belief()
         if belief is None:
             return
+        if self._continued is not None:
+            belief = self._continued.to_session(belief)
         stamped = StampedBelief(
             record.frame.stamp, record.session, self.back_end.T_map_local, belief
         )
@@ -255,7 +292,7 @@ class Mapper:
         It waits for no job of the worker, only takes over what the newest one found.
         """
         self.worker.check()
-        if self._odom is None or self._odom[0] == self._sent:
+        if self._odom is None or self._odom[0] == self._sent or self._enters:
             return
         self._sent, T = self._odom
         if self._mapped == self._session:  # else the worker is in another local frame
@@ -265,6 +302,7 @@ class Mapper:
 
     def _forget(self) -> None:
         self.back_end.reset()
+        self._continued = None
         self.products.restart()
         self._newest = None
         self._send_correction()
@@ -287,10 +325,10 @@ class Mapper:
         if current.grid is None and len(current.reflectors) == 0:
             raise MapError(self.products.undrawn or 'there is no map yet')
         why = f', no grid: {self.products.undrawn}' if self.products.undrawn else ''
-        path = self.folder.save(name, current)
         if self.back_end.keyframes:
             whole = stored_map.content_of(self.back_end, self._p, current.grid)
-            container.write(path.with_name(path.name + '.rlml'), whole)
+            container.write(self.folder.whole(name), whole)
+        path = self.folder.save(name, current)
         return f'{path}: {_content(current)}{why}'
 
     def current(self) -> SavedMap:
@@ -300,13 +338,26 @@ class Mapper:
         return SavedMap(self.back_end.reflectors(), self.products.grid(self.back_end))
 
     def load(self, name: str) -> SavedMap:
-        """In the worker: localise in another saved map. Raises MapError."""
+        """In the worker: localise in another saved map, or go on mapping with it.
+
+        Raises MapError or FileFormatError; then all is as it was, but for a map in the making
+        that turned out not to fit together.
+        """
         if self.saved is None:
-            raise MapError('load_map needs mode:=localization')
+            self._continue(name)
+            return self.current()
         self._started = True  # the robot is where it is, not where it was last in that map
         self._load(name)
         self._use_saved()
         return self.saved
+
+    def _continue(self, name: str) -> None:
+        """Go on with the whole map of a file; what was made until now is forgotten."""
+        content = stored_map.load(self.folder.whole(name))
+        self._continued = Continued(self._p, content, self.back_end)
+        self.products.restart()
+        self._logger.info(f'{self.folder.whole(name)}: {self._continued.why}')
+        self.worker.submit(self.publish_map)
 
     def _load(self, name: str) -> None:
         self.saved = self._loaded = self.folder.load(name)

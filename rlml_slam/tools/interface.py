@@ -167,9 +167,9 @@ TOPICS = (
 
 SERVICES = (
     Service('back_end', '~/save_map', 'std_srvs/Trigger',
-            'write `map_directory`/`map_file_name`: reflectors and grid'),
+            'write `map_directory`/`map_file_name`: everything as `.rlml`, reflectors and grid'),
     Service('back_end', '~/load_map', 'nav_msgs/LoadMap',
-            'in localization mode, use another map of `map_directory`'),
+            'localize in another map of `map_directory`, or while mapping go on with it'),
     Service('back_end', '~/reset', 'std_srvs/Trigger',
             'forget the map and begin at `map_start_pose`'),
     Service('back_end', '~/closures', 'std_srvs/Trigger',
