@@ -175,10 +175,14 @@ def test_services_answer_in_words(live, tmp_path):
     grid = live.call(GetMap, 'back_end/dynamic_map', GetMap.Request()).map
     assert grid.info.width * grid.info.height == len(grid.data) > 0
 
-    refused = live.call(LoadMap, 'back_end/load_map', LoadMap.Request(map_url='map'))
-    assert refused.result != LoadMap.Response.RESULT_SUCCESS
-
     keyframes = len(back.mapper.back_end.keyframes)
+    load = LoadMap.Request
+    refused = live.call(LoadMap, 'back_end/load_map', load(map_url='none'))
+    assert refused.result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
+    answer = live.call(LoadMap, 'back_end/load_map', load(map_url='map'))
+    assert answer.result == LoadMap.Response.RESULT_SUCCESS
+    assert len(back.mapper.back_end.keyframes) == keyframes
+
     answer = live.call(SetBool, 'back_end/pause_new_measurements', SetBool.Request(data=True))
     assert answer.success
     assert back.join.paused
