@@ -317,6 +317,9 @@ class HealthLimits(Group):
     confirm_time: float = param(
         5.0, 'LOST when nothing matches the saved map for this long', 's', 0.0, 600.0
     )
+    confirm_distance: float = param(
+        5.0, 'DEGRADED when the saved map has not confirmed the pose for this far', 'm', 0.0, 1e4
+    )
     weak_sigma: float = param(
         0.15, 'a scan that holds a direction worse leaves it open', 'm', 1e-3, 10.0
     )

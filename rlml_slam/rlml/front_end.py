@@ -21,6 +21,7 @@ from rlml_slam.maps.saved import SavedMap
 from rlml_slam.matching import association, observability, thinning
 from rlml_slam.matching.scan_match import match
 from rlml_slam.params import Parameters
+from rlml_slam.rlml.confirmation import Confirmation
 from rlml_slam.rlml.correction import Correction, Known
 from rlml_slam.rlml.doubt import Doubt, consents
 from rlml_slam.rlml.grid_fix import Fix, SavedGrid
@@ -81,7 +82,7 @@ class FrontEnd:
         self._has_odometry = False
         self._map: SavedMap | None = None
         self._window: MapWindow | None = None
-        self._unconfirmed = False
+        self.confirmation = Confirmation(self._p)
         self._last_fit = 0
         self._reach = 0.0
         self._last_stamp: int | None = None
@@ -96,7 +97,7 @@ class FrontEnd:
         self.use_grid(grid)
         if not self.state.pose_cov.any():
             self.state.widen(np.diag(START_SIGMA**2))
-        self._unconfirmed = True
+        self.confirmation.begin()
         self._window = MapWindow(reflectors, self._p.reflector.max_range)
         self._window.follow(self.state, self.tracks)
 
@@ -211,7 +212,8 @@ class FrontEnd:
     def process(self, observation: Observation) -> Frame:
         """The pose at the observation's stamp; never raises for what was measured."""
         began = time.perf_counter()
-        self.state.predict(self._motion(observation), self._bias_walk(observation.stamp))
+        motion = self._motion(observation)
+        self.state.predict(motion, self._bias_walk(observation.stamp))
         if self._window is not None:
             self._window.follow(self.state, self.tracks)
         matched = _Matched.none(observation.detections)
@@ -224,6 +226,10 @@ class FrontEnd:
         self._map_reflectors(observation, matched, doubtful)
         self._map_scan(observation, evidence, doubtful and evidence.misfit)
         self._remember_velocity(observation.stamp)
+        self.confirmation.judge(
+            observation.stamp, math.hypot(motion.delta[0], motion.delta[1]), len(matched.status),
+            matched.num_used, matched.agrees, self._fix,
+        )  # fmt: skip
         health = self._judge(observation, matched, evidence)
         frame = self._frame(observation, matched, evidence, health, doubtful, began)
         self._jumped = False
@@ -438,7 +444,6 @@ class FrontEnd:
         return self.doubt.lasts(stamp, self._p.health.lost_time)
 
     def _judge(self, observation: Observation, matched: _Matched, evidence: Evidence) -> Health:
-        unconfirmed = self._is_unconfirmed(matched)
         due = self._due(observation, matched)
         used = matched.keys[matched.status == Status.USED]
         return self.health.judge(
@@ -448,8 +453,9 @@ class FrontEnd:
             detections=None if observation.detections is None else len(observation.detections),
             used=matched.num_used,
             cov=self.in_map(self.state.pose, self.state.pose_cov)[1],
-            unconfirmed=unconfirmed,
-            contradicted=self._lasts(observation.stamp) and not unconfirmed,
+            unconfirmed=self.confirmation.reason,
+            lost=self.confirmation.is_lost,
+            contradicted=self._lasts(observation.stamp) and not self.confirmation.is_pending,
             expected=int(due.sum()),
             seen=int(np.isin(self.tracks.keys[due], used).sum()),
         )
@@ -468,21 +474,6 @@ class FrontEnd:
             self._reach,
         )  # fmt: skip
         return due
-
-    def _is_unconfirmed(self, matched: _Matched) -> bool:
-        """Whether the pose in a given map is still the one that was told or assumed.
-
-        Two reflectors that are most of what is seen confirm it, where the scan does not say
-        otherwise; so does a scan that fits the grid and holds every direction.
-        """
-        if self._unconfirmed:
-            n, least = matched.num_used, self._p.loop_closure.min_score
-            seen = n >= 2 and 2 * n >= len(matched.status)
-            fits = self._fix.score >= least
-            self._unconfirmed = not (
-                (seen and not self._fix.score < least) or (fits and self._fix.held)
-            )
-        return self._unconfirmed
 
     def _frame(
         self,
@@ -511,7 +502,7 @@ class FrontEnd:
             chi2=float(np.nansum(matched.distance2[used])) if used.any() else 0.0,
             iterations=evidence.iterations,
             wall_ms=(time.perf_counter() - began) * 1e3,
-            doubtful=doubtful or self._unconfirmed,
+            doubtful=doubtful or self.confirmation.is_pending,
             jumped=self._jumped,
         )
 

@@ -19,20 +19,25 @@ from rlml_slam.matching.association import gate
 from rlml_slam.matching.scan_match import match
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.joint_state import JointState
-from rlml_slam.rlml.relocalize import submap_of
+from rlml_slam.rlml.relocalize import possible, submap_of
 from rlml_slam.se2 import Array
 
 OUTLIER = 0.9999  # probability of the gate of a fix against the prior
+FEW = 4  # every so many-th beam of a scan that does not fit is followed through the grid
 POSE = np.arange(3)
 
 
 @dataclass(frozen=True)
 class Fix:
-    """One match against the grid: its score, whether it moved the pose and held all of it."""
+    """One match against the grid: its score, whether it moved the pose and held all of it.
+
+    It ``contradicts`` where the scan does not fit what the grid knows there.
+    """
 
     score: float
     used: bool = False
     held: bool = False
+    contradicts: bool = False
 
 
 class SavedGrid:
@@ -65,7 +70,8 @@ class SavedGrid:
             searched = match(self._submap, points, prior, strength, p)
             found = searched if searched.score > found.score else found
         if found.score < p.min_score:
-            return Fix(found.score)
+            may_be = possible(self._submap, points[::FEW], found.pose, found.score, p.good_score)
+            return Fix(found.score, contradicts=may_be < p.min_score)
         information = observability.information(self._submap, points, found.pose, p)
         # the error of the map at this place, which more beams do not lower
         information = np.asarray(

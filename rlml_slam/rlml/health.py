@@ -52,24 +52,22 @@ class HealthMonitor:
         detections: int | None,
         used: int,
         cov: Array,
-        unconfirmed: bool = False,
+        unconfirmed: str = '',
+        lost: bool = False,
         contradicted: bool = False,
         expected: int = 0,
         seen: int = 0,
     ) -> Health:
         """Health at ``stamp`` [ns]; ``detections`` is None where none were looked for.
 
-        ``unconfirmed``: the pose in a given map is one that nothing measured agrees with so far;
-        ``contradicted``: all that was seen for a while contradicts the map; ``seen``: so many of
-        the ``expected`` reflectors of the map were.
+        ``unconfirmed``: why the map that it localizes in does not agree with the pose, empty where
+        it does; ``lost``: for too long; ``contradicted``: all that was seen for a while
+        contradicts the map; ``seen``: so many of the ``expected`` reflectors of the map were.
         """
-        reasons: list[str] = []
-        if unconfirmed:
-            reasons.append('nothing has matched the saved map yet')
+        reasons = [unconfirmed] if unconfirmed else []
         if self._first is None:
             self._first = stamp
             return Health(Level.DEGRADED if reasons else Level.OK, tuple(reasons))
-        lost = unconfirmed and stamp - self._first > self._limits.confirm_time * 1e9
         if contradicted:
             lost = True
             reasons.append('what is seen contradicts the map: was the robot carried away?')

@@ -82,7 +82,7 @@ def relocalize(
     pose, score = places[0]
     second = places[1][1] if len(places) > 1 else 0.0
     if not complete and second:
-        second = _possible(submap, points, places[1][0], second, score)
+        second = possible(submap, points, places[1][0], second, score)
     cov = _covariance(submap, points, pose, p)
     sigma = float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]))
     verdict, why = Verdict.UNIQUE, f'score {score:.2f}, the next best place {second:.2f}'
@@ -107,7 +107,7 @@ def scan_fits(grid: OccupancyGrid, points: Array, poses: Array, p: Parameters) -
     points = thinning.thin(points, p.scan_match.voxel, p.scan_match.max_points)
     places = [_refined(submap, points, pose, p) for pose in poses]
     best = max(score for _, score in places)
-    return np.array([[s, _possible(submap, points, pose, s, best)] for pose, s in places])
+    return np.array([[s, possible(submap, points, pose, s, best)] for pose, s in places])
 
 
 def submap_of(grid: OccupancyGrid, parameters: params.Submap) -> Submap:
@@ -141,7 +141,7 @@ def _refined(submap: Submap, points: Array, near: Array, p: Parameters) -> tuple
     return result.pose, result.score
 
 
-def _possible(submap: Submap, points: Array, pose: Array, score: float, best: float) -> float:
+def possible(submap: Submap, points: Array, pose: Array, score: float, best: float) -> float:
     """The score at a pose if end points where nothing is mapped fitted as at the best place.
 
     A map in the making has one half of a symmetric hall before the other: that the known half

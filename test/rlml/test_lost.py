@@ -8,7 +8,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_worlds import FIRST, OTHER_ROOM, ROOM, STEP, drive, errors, observations
+from made_worlds import (
+    FIRST,
+    OTHER_ROOM,
+    ROOM,
+    STEP,
+    TinyWorld,
+    drive,
+    errors,
+    observations,
+    polygon,
+)
 
 from rlml_slam import se2
 from rlml_slam.maps.occupancy import render
@@ -186,6 +196,65 @@ def test_grid_of_a_saved_map_holds_the_pose_where_no_reflector_is_seen():
     assert distance.max() < 0.05
     assert turn.max() < 0.02
     assert {f.health.level for f in frames[5:]} == {Level.OK}
+
+
+def hall(seed, half=3.0, begin=-4.0, end=40.0):
+    """Walls (n, 4) of a hall, 2 ``half`` wide, with boxes at random along both sides."""
+    rng = np.random.default_rng(seed)
+    walls = [polygon((begin, -half), (end, -half), (end, half), (begin, half))]
+    for x in np.arange(begin + 1.0, end - 1.0, 1.5):
+        y, side = rng.choice([-1, 1]) * (half - rng.uniform(0.4, 1.2)), rng.uniform(0.2, 0.4)
+        x += rng.uniform(-0.5, 0.5)
+        low, high = (x - side, y - side), (x + side, y + side)
+        walls.append(polygon(low, (high[0], low[1]), high, (low[0], high[1])))
+    return np.vstack(walls)
+
+
+def in_hall(mapped, real, mapped_to):
+    """Frames of a drive through one hall in the map of another, and their errors."""
+    path, none = drive((1.0, 0.0, 26.0)), np.zeros((0, 2))
+    seen = path[path[:, 0] < mapped_to][::3]
+    scans = observations(TinyWorld(mapped, none), seen)
+    grid = render(seen, [o.points for o in scans], [o.origin for o in scans])
+    slam = localizing(SavedMap(room_map(none).reflectors, grid))
+    rng = np.random.default_rng(0)
+    frames, _ = run(observations(TinyWorld(real, none), path, rng=rng), slam)
+    return frames, errors(np.array([f.T_map_base for f in frames]), path)[0]
+
+
+def test_robot_that_drives_out_of_its_map_is_degraded_and_goes_on():
+    """Nothing contradicts a pose out there, but nothing confirms it either."""
+    frames, distance = in_hall(hall(0), hall(0), 4.0)
+    levels = [f.health.level for f in frames]
+    assert set(levels[5:150]) == {Level.OK}
+    assert levels[-1] is Level.DEGRADED
+    (reason,) = frames[-1].health.reasons
+    assert re.fullmatch(r'the saved map has not confirmed the pose for 1\d m', reason)
+    assert Level.LOST not in levels
+    assert distance.max() < 0.1
+
+
+def test_map_of_a_hall_that_was_rebuilt_is_no_place_to_be_sure_of():
+    """Beyond the gate at 10 m, the walls of the map are gone and others stand farther out."""
+    rebuilt = np.vstack([hall(0, 3.0, -4.0, 10.0), hall(1, 8.0, 10.0)])
+    shut = (rebuilt[:, 0] == 10.0) & (rebuilt[:, 2] == 10.0)
+    gate = np.array([[10.0, -3.0, 10.0, -8.0], [10.0, 3.0, 10.0, 8.0]])
+    frames, _ = in_hall(hall(0), np.vstack([rebuilt[~shut], gate]), 26.0)
+    levels = [f.health.level for f in frames]
+    assert set(levels[5:100]) == {Level.OK}
+    assert levels[-1] is Level.LOST
+    assert levels.index(Level.DEGRADED) < levels.index(Level.LOST)
+    assert 'and the scan contradicts it' in frames[-1].health.reasons[0]
+
+
+def test_without_the_map_to_localize_in_nothing_is_sure():
+    slam = Slam(Parameters(node=Node(mode='localization')))
+    frames, _ = run(observations(ROOM, LOOP[:70], rng=np.random.default_rng(4)), slam)
+    assert {f.health.reasons[0] for f in frames} == {'no map to localize in has come'}
+    levels, t = np.array([f.health.level for f in frames]), seconds(frames, ())
+    assert (levels == np.where(t > 5.0, Level.LOST, Level.DEGRADED)).all()
+    assert all(f.doubtful for f in frames)
+    assert len(slam.reflectors()) == len(slam.front_end.reflectors()) == 0
 
 
 # --- the parts ---------------------------------------------------------------------------------
