@@ -208,14 +208,14 @@ class BackEnd:
         self.deferred.see(interval)
         self.reflector_graph.add(pose, interval)
         if self.deferred.decide():
-            self._rejoin()
+            self.rejoin()
         self._gone += self.presence.look(self.keyframes, interval)
         if self._gone and self.plant is not None:
             self.plant.hold()
         forgotten = interval.last_look - int(2e9 * self._p.reflector.candidate_timeout)
         self.reflector_graph.drop_candidates(forgotten, self.deferred.pending)
 
-    def _rejoin(self) -> None:
+    def rejoin(self) -> None:
         """Solve after reflectors were joined that stood apart, as far as the drift had gone.
 
         To the robust losses such a joint looks like an outlier: they come second.
@@ -284,7 +284,7 @@ class BackEnd:
             self._interval = Interval(self.keyframes[-1].T_local)
             self.scans.finish()
             if self.deferred.decide(final=True):
-                self._rejoin()
+                self.rejoin()
             self.optimize(final=True)
 
     def start_from(

@@ -183,7 +183,15 @@ class ScanGraph:
         self._count += 1
         if not self._p.loop_closure.enabled or self._count % self._p.loop_closure.every:
             return ()
-        return self._close(key, points)
+        return self._close(key, points, self._finished)
+
+    def link(self, key: Keyframe, before: int) -> tuple[Closure, ...]:
+        """Closures of a keyframe with finished submaps that begin before keyframe ``before``."""
+        if key.points is None or len(key.points) < self._p.scan_match.min_points:
+            return ()
+        p, whole = self._p.scan_match, key.points.astype(np.float64)
+        among = [m for m in self._finished if m.anchor.index < before]
+        return self._close(key, thinning.thin(whole, p.voxel, p.max_points), among)
 
     def begin_piece(self) -> None:
         """Complete the submaps that are being built: the robot goes on from elsewhere."""
@@ -360,19 +368,19 @@ class ScanGraph:
         rejected, accepted = a['closures_tried'].tolist()
         self.tried = {True: accepted, False: rejected}
 
-    def _close(self, key: Keyframe, points: Array) -> tuple[Closure, ...]:
-        """Try the finished submaps near the keyframe, the nearest first."""
+    def _close(
+        self, key: Keyframe, points: Array, among: Sequence[KeySubmap]
+    ) -> tuple[Closure, ...]:
+        """Try those ``among`` finished submaps that are near the keyframe, the nearest first."""
         p = self._p.loop_closure
         here = self._pose(key)[:2]
         near = []
-        for k, m in enumerate(self._finished):
+        for k, m in enumerate(among):
             centre = se2.transform(self._grid(m), m.centre[None])[0]
             distance = float(np.linalg.norm(centre - here))
             if distance < p.max_distance:
                 near.append((distance, k))
-        tried = [
-            self._try(self._finished[k], key, points) for _, k in sorted(near)[: p.candidates]
-        ]
+        tried = [self._try(among[k], key, points) for _, k in sorted(near)[: p.candidates]]
         fit = [match for match in tried if isinstance(match, _Match)]
         out = [closure for closure in tried if isinstance(closure, Closure)]
         if fit:

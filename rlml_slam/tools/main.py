@@ -52,6 +52,7 @@ COMMANDS: Table = {
         'saved maps',
         {
             'info': Command('map_info', 'check a saved map and say what is in it'),
+            'merge': Command('map_merge', 'two saved maps as one'),
             'reflectors': Command(
                 'map_reflectors', 'which reflectors are there, new, moved, missing or ghosts'
             ),
