@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -22,7 +23,10 @@ from rlml_slam.ekf.matching import Matcher
 from rlml_slam.ekf.models import POINT, line_model
 from rlml_slam.maps.occupancy import OccupancyGrid, render
 from rlml_slam.params import EkfParameters
+from rlml_slam.rlml.confirmation import START_SIGMA, Confirmation
 from rlml_slam.rlml.deferred import SLIP2
+from rlml_slam.rlml.doubt import consents
+from rlml_slam.rlml.grid_fix import Fix
 from rlml_slam.rlml.health import Evidence, HealthMonitor
 from rlml_slam.se2 import Array
 from rlml_slam.types import Frame, Observation, Reflectors, Status
@@ -52,6 +56,7 @@ class Estimator:
         filter_ = Filter(pose, cov, self._p.motion.imu_bias, self.model, invariant)
         self.branches = [Branch(self._p, self._matcher, filter_)]
         self.health = HealthMonitor(self._p.health)
+        self.confirmation = Confirmation(self._p)
         self.fates: Counter[str] = Counter()
         self._mapping = self._p.node.mode == 'mapping'
         self._last_stamp: int | None = None
@@ -66,7 +71,13 @@ class Estimator:
         return self.branches[0].filter
 
     def use_map(self, reflectors: Reflectors) -> None:
-        """Localise against given landmarks (map frame); no others are added from now on."""
+        """Localise against given landmarks (map frame); no others are added from now on.
+
+        A start pose with no covariance is only assumed, and has that of a person's guess.
+        """
+        if not self.filter.pose_cov.any():
+            self.reset(self.filter.pose, np.diag(START_SIGMA**2))
+        self.confirmation.begin()
         self._mapping = False
         for branch in self.branches:
             branch.use_map(reflectors)
@@ -139,13 +150,19 @@ class Estimator:
         keys, statuses = looked.keys, looked.statuses
         if seen is not None:  # keys and statuses are of what was measured
             observation = dataclasses.replace(observation, detections=seen.detections)
+        n, used = len(statuses), int((statuses == Status.USED).sum())
+        gone = float(np.hypot(*observation.motion.delta[:2]))
+        in_map = self.confirmation
+        in_map.judge(observation.stamp, gone, n, used, consents(n, used), Fix(math.nan))
         health = self.health.judge(
             observation.stamp,
             Evidence(),
             odometry=observation.motion.known,
-            detections=None if seen is None else len(statuses),
-            used=int((statuses == Status.USED).sum()),
+            detections=None if seen is None else n,
+            used=used,
             cov=cov,
+            unconfirmed=in_map.reason,
+            lost=in_map.is_lost,
         )
         return Frame(
             stamp=observation.stamp,
@@ -157,6 +174,7 @@ class Estimator:
             landmarks=keys,
             statuses=statuses,
             health=health,
+            doubtful=in_map.is_pending,
             chi2=looked.chi2,
             wall_ms=(time.perf_counter() - began) * 1e3,
         )

@@ -10,7 +10,7 @@ import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 
-from rlml_slam import se2, warm_up
+from rlml_slam import warm_up
 from rlml_slam.ekf.estimator import Estimator
 from rlml_slam.maps.saved import SavedMap
 from rlml_slam.params import EkfParameters
@@ -20,12 +20,13 @@ from rlml_slam.ros.declare import declare
 from rlml_slam.ros.ekf_services import EkfServices
 from rlml_slam.ros.feed import STREAMS
 from rlml_slam.ros.health import HealthPublisher
+from rlml_slam.ros.odom_frame import OdomFrame
 from rlml_slam.ros.products import TOPICS, MapProducts
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensors import RELIABLE, Sensors, checked
 from rlml_slam.ros.tf import TransformPublisher
 from rlml_slam.se2 import Array
-from rlml_slam.types import Frame, Observation
+from rlml_slam.types import Observation
 
 
 class EkfSlamNode(Node):
@@ -41,6 +42,7 @@ class EkfSlamNode(Node):
         self.answers = FramePublisher(self, n)
         self.products = MapProducts(self, n, TOPICS)
         self.tf = TransformPublisher(self)
+        self.odom = OdomFrame()  # in the map, which is the filter's local frame
         self.sensors = Sensors(self, self.params, STREAMS, self.process, self.restart)
         self.health = HealthPublisher(self, self.sensors)
         start = checked(self, self.start_at)
@@ -52,7 +54,9 @@ class EkfSlamNode(Node):
         frame, n = self.estimator.process(observation), self.params.node
         self.answers.publish(frame)
         self.health.update(frame)
-        self.tf.publish(frame.stamp, (n.map_frame, n.odom_frame), map_to_odom(frame))
+        self.odom.follow(frame)
+        if self.odom.newest is not None:
+            self.tf.publish(frame.stamp, (n.map_frame, n.odom_frame), self.odom.newest[1])
         if self.products.is_due(frame.stamp):
             self.products.publish(self.estimator, None, frame.stamp)
 
@@ -74,15 +78,8 @@ class EkfSlamNode(Node):
         if saved is not None:
             self.estimator.use_map(saved.reflectors)
         self.answers.begin_session()
+        self.odom.restart()
         self.products.restart()
-
-
-def map_to_odom(frame: Frame) -> Array:
-    """T_map_odom (3,) at a frame; without odometry, odom is the map."""
-    T_odom_base = frame.observation.odom_pose
-    if T_odom_base is None:
-        return np.zeros(3)
-    return se2.compose(frame.T_map_base, se2.inverse(T_odom_base))
 
 
 def main() -> int:

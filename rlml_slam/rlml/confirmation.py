@@ -7,8 +7,13 @@ well for a while: what matters is how far the robot has gone on them alone.
 
 from __future__ import annotations
 
+import numpy as np
+
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.grid_fix import Fix
+
+# [m, m, rad] what RViz says of a pose set by hand: a start that is only assumed is no better
+START_SIGMA = np.array([0.5, 0.5, 0.26])
 
 
 class Confirmation:

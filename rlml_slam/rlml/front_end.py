@@ -21,7 +21,7 @@ from rlml_slam.maps.saved import SavedMap
 from rlml_slam.matching import association, observability, thinning
 from rlml_slam.matching.scan_match import match
 from rlml_slam.params import Parameters
-from rlml_slam.rlml.confirmation import Confirmation
+from rlml_slam.rlml.confirmation import START_SIGMA, Confirmation
 from rlml_slam.rlml.correction import Correction, Known
 from rlml_slam.rlml.doubt import Doubt, consents
 from rlml_slam.rlml.grid_fix import Fix, SavedGrid
@@ -49,7 +49,6 @@ from rlml_slam.types import (
 )
 
 BURST = 50_000_000  # [ns] between two scans that tell a velocity
-START_SIGMA = np.array([0.5, 0.5, 0.26])  # [m, m, rad] what RViz says of a pose set by hand
 
 
 class FrontEnd:

@@ -28,6 +28,7 @@ from rlml_slam.ros.frames import Record
 from rlml_slam.ros.last_pose import LastPose, verified
 from rlml_slam.ros.map_folder import MapFolder
 from rlml_slam.ros.messages import make_rclpy, rclpy_class
+from rlml_slam.ros.odom_frame import OdomFrame
 from rlml_slam.ros.products import MapProducts
 from rlml_slam.ros.sensors import LATCHED
 from rlml_slam.ros.tf import TransformPublisher
@@ -69,8 +70,7 @@ class Mapper:
         self.recovery = Recovery(params)
         self.worker = Worker()
         self.products = MapProducts(node, params.node)
-        self._odom: tuple[int, Array] | None = None  # stamp and T_local_odom (3,) of the newest
-        self._has_odometry = False  # in any session: odom is the robot's, not the front end's
+        self._odom = OdomFrame()
         self._newest: Frame | None = None
         self._session: int | None = None  # of the newest frame that came
         self._mapped: int | None = None  # and of the newest that the worker has seen
@@ -105,10 +105,10 @@ class Mapper:
             if self.saved is None and not self._enters:
                 self._logger.warning('the front end began anew, and so does the map')
             self.worker.submit(self._begin_session)
-            self._odom = None
+            self._odom.restart()
         self._session = record.session
         self._heard = time.monotonic()
-        self._place_odom(record.frame)
+        self._odom.follow(record.frame)
         self.worker.submit(lambda: self._add(record))
 
     def _add(self, record: Record) -> None:
@@ -228,19 +228,6 @@ class Mapper:
             self._logger.info(why)
             self._tell_pose(frame.stamp, *start)
 
-    def _place_odom(self, frame: Frame) -> None:
-        """Odom in the local frame; a frame without the odometry there is leaves it as it was."""
-        T_odom_base = frame.observation.odom_pose
-        if T_odom_base is not None:
-            self._has_odometry = True
-        elif self._has_odometry:
-            if self._odom is not None:
-                self._odom = (frame.stamp, self._odom[1])
-            return
-        else:  # without any odometry, odom is the front end's local frame
-            T_odom_base = frame.T_local_base
-        self._odom = (frame.stamp, se2.compose(frame.T_local_base, se2.inverse(T_odom_base)))
-
     def _send_correction(self) -> None:
         """The local frame in the map, with the covariance of the pose at this stamp in the map."""
         frame, T = self._p.node.map_frame, self.back_end.T_map_local
@@ -292,9 +279,10 @@ class Mapper:
         It waits for no job of the worker, only takes over what the newest one found.
         """
         self.worker.check()
-        if self._odom is None or self._odom[0] == self._sent or self._enters:
+        odom = self._odom.newest
+        if odom is None or odom[0] == self._sent or self._enters:
             return
-        self._sent, T = self._odom
+        self._sent, T = odom
         if self._mapped == self._session:  # else the worker is in another local frame
             T = se2.compose(self.back_end.T_map_local, T)
         n = self._p.node

@@ -11,8 +11,16 @@ from rlml_slam import se2
 from rlml_slam.ekf.estimator import Estimator
 from rlml_slam.ekf.filter import Filter
 from rlml_slam.ekf.models import POINT
-from rlml_slam.params import EkfParameters, from_mapping
-from rlml_slam.types import ANONYMOUS, Detections, Motion, Observation, Status
+from rlml_slam.params import EkfParameters, Node, from_mapping
+from rlml_slam.types import (
+    ANONYMOUS,
+    Detections,
+    Level,
+    Motion,
+    Observation,
+    Reflectors,
+    Status,
+)
 
 LANDMARKS = np.array(
     [[3.0, 2.0], [6.0, -2.0], [9.0, 3.0], [6.0, 7.0], [1.0, 7.0], [-2.0, 4.0], [4.0, 4.5]]
@@ -170,3 +178,52 @@ def test_500_landmarks_take_less_than_20_ms_per_update():
     )
     assert quick < 0.02
     assert quick < 0.2 * slow
+
+
+# --- a given map ---------------------------------------------------------------------------------
+
+
+def given(start, p=None):
+    """An estimator in a map of the landmarks, at a start pose that is only assumed."""
+    n = len(LANDMARKS)
+    estimator = Estimator(p or EkfParameters(node=Node(mode='localization')))
+    estimator.reset(np.array(start), np.zeros((3, 3)))
+    landmarks = Reflectors(
+        np.arange(n), LANDMARKS, np.tile(1e-4 * np.eye(2), (n, 1, 1)), np.full(n, -1),
+        np.full(n, 9), np.full(n, np.nan),
+    )  # fmt: skip
+    estimator.use_map(landmarks)
+    return estimator
+
+
+def look(estimator, k, pose, seen=True):
+    """A frame of a robot that stands still."""
+    stamp = k * 100_000_000
+    found = detections(stamp, pose, False) if seen else None
+    motion = Motion(np.zeros(3), 1e-8 * np.eye(3))
+    return estimator.process(Observation(stamp, motion, detections=found))
+
+
+def test_assumed_start_in_a_map_is_as_good_as_a_persons_guess():
+    estimator, pose = given([0.0, 0.0, 0.0]), np.array([0.3, 0.2, 0.1])
+    for k in range(1, 20):
+        frame = look(estimator, k, pose)
+    assert np.abs(se2.between(pose, frame.T_map_base)).max() < 0.02
+    assert (frame.health.level, frame.doubtful) == (Level.OK, False)
+    assert len(estimator.reflectors()) == len(LANDMARKS)
+
+
+def test_start_that_nothing_confirms_is_degraded_and_then_lost():
+    estimator = given([0.0, 0.0, 0.0])
+    levels = []
+    for k in range(1, 80):
+        frame = look(estimator, k, np.zeros(3), seen=False)
+        levels.append(frame.health.level)
+        assert frame.health.reasons[0] == 'nothing has matched the saved map yet'
+        assert frame.doubtful
+    assert levels == [Level.DEGRADED] * 51 + [Level.LOST] * 28
+
+
+def test_without_the_map_to_localize_in_nothing_is_sure():
+    estimator = Estimator(EkfParameters(node=Node(mode='localization')))
+    assert look(estimator, 1, np.zeros(3)).health.reasons == ('no map to localize in has come',)

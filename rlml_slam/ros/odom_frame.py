@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the frame of the odometry lies, so that /tf can tell it."""
+
+from __future__ import annotations
+
+from rlml_slam import se2
+from rlml_slam.se2 import Array
+from rlml_slam.types import Frame
+
+
+class OdomFrame:
+    """Follows the frames; ``newest`` is the stamp [ns] of the last one and T_local_odom (3,).
+
+    It is None before the first that tells.
+    """
+
+    def __init__(self) -> None:
+        self.newest: tuple[int, Array] | None = None
+        self._has_odometry = False  # in any session: odom is the robot's, not the front end's
+
+    def restart(self) -> None:
+        """The local frame is another one from now on."""
+        self.newest = None
+
+    def follow(self, frame: Frame) -> None:
+        """Take the next frame; one without the odometry there is leaves odom where it was."""
+        T_odom_base = frame.observation.odom_pose
+        if T_odom_base is not None:
+            self._has_odometry = True
+        elif self._has_odometry:
+            if self.newest is not None:
+                self.newest = (frame.stamp, self.newest[1])
+            return
+        else:  # without any odometry, odom is the local frame
+            T_odom_base = frame.T_local_base
+        T_local_odom = se2.compose(frame.T_local_base, se2.inverse(T_odom_base))
+        self.newest = (frame.stamp, T_local_odom)
