@@ -3,7 +3,7 @@
 
 The second map is put where the constellation of its reflectors fits that of the first, if it fits
 in one place and no other; reflectors that are the same become one, its scans are matched with the
-first one's submaps, and the whole graph is solved. The path of the frames stays with the files.
+first one's submaps, and the whole graph is solved.
 """
 
 from __future__ import annotations
@@ -35,9 +35,13 @@ Arrays = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True)
 class Merged:
-    """The map of two; ``T_first_second`` (3,) is where the second one lay before the solve."""
+    """The map of two; ``T_first_second`` (3,) is where the second one lay before the solve.
+
+    ``content`` is what is saved of it, the paths of both maps included.
+    """
 
     back_end: BackEnd
+    content: Content
     T_first_second: Array
     why: str
     joined: int
@@ -69,7 +73,11 @@ def merge_maps(first: Content, second: Content, params: Parameters) -> Merged:
     if params.loop_closure.enabled:
         accepted = _close(back_end, len(first.arrays['pose']), params.loop_closure.every)
     back_end.optimize(final=True)
-    return Merged(back_end, best.pose, stars.why, len(hits), accepted)
+    grid = back_end.occupancy_grid()
+    made = stored_map.content_of(back_end, params, grid)
+    paths = {name: arrays[name] for name in ('path', 'path_motion')}
+    content = Content({**made.arrays, **paths}, made.description)
+    return Merged(back_end, content, best.pose, stars.why, len(hits), accepted)
 
 
 def _tie(back_end: BackEnd, begin: int) -> None:
@@ -114,7 +122,10 @@ def _joined(a: Arrays, b: Arrays, keys: int) -> Arrays:
     poses, landmarks = len(a['pose']), len(a['landmark'])
     edges, sightings = len(a['edge_nodes']), len(a['sighted_nodes'])
     numbers = 1 + int(a['closure_fate'][:, 0].max(initial=-1))
-    sighting, gone, fate = (b[n].copy() for n in ('sighting', 'reflector_gone', 'closure_fate'))
+    sighting, gone, fate, path = (
+        b[n].copy() for n in ('sighting', 'reflector_gone', 'closure_fate', 'path')
+    )
+    path['key'] += poses
     sighting['pose'] += poses
     sighting['factor'] = _behind(sighting['factor'], sightings)
     gone['key'] += keys
@@ -142,17 +153,16 @@ def _joined(a: Arrays, b: Arrays, keys: int) -> Arrays:
         for name, array in a.items()
         if name not in skipped and not name.startswith(('survey_', 'reflector_map'))
     }
+    path = np.concatenate([a['path'], path])
     between = se2.between(a['pose'][-1:], b['pose'][:1])
     own = {name: array for name, array in a.items() if name.startswith('survey_')}
-    return (
-        out
-        | own
-        | {
-            'path': a['path'],
-            'path_motion': np.concatenate([a['path_motion'], between, b['path_motion']]),
-            'closures_tried': a['closures_tried'] + b['closures_tried'],
-        }
-    )
+    return {
+        **out,
+        **own,
+        'path': path[np.argsort(path['stamp'], kind='stable')],
+        'path_motion': np.concatenate([a['path_motion'], between, b['path_motion']]),
+        'closures_tried': a['closures_tried'] + b['closures_tried'],
+    }
 
 
 def _behind(index: NDArray[np.int64], offset: int) -> NDArray[np.int64]:

@@ -41,12 +41,25 @@ from rlml_slam.maps.survey import Survey
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.keyframes import Keyframe
+from rlml_slam.rlml.loop_closure import Closure
 from rlml_slam.types import Reflectors
 
 FORMAT, VERSION = 'rlml_slam map', 1
 COLUMNS = ('nodes', 'measured', 'information', 'kinds', 'enabled')
 MADE = ('keys', 'ids', 'sightings', 'diameters')
 Arrays = Mapping[str, NDArray[Any]]
+
+
+def parameters_of(content: Content) -> Parameters:
+    """Those that a map was made with; what this program does not know is left out."""
+    told = content.description['parameters']
+    groups: dict[str, Any] = {}
+    for group in dataclasses.fields(Parameters):
+        kind: Any = type(group.default)
+        known = {f.name for f in dataclasses.fields(kind)}
+        values = told.get(group.name, {})
+        groups[group.name] = kind(**{k: v for k, v in values.items() if k in known})
+    return Parameters(**groups)
 
 
 def tables(graph: Graph) -> dict[str, FactorTable]:
@@ -148,6 +161,21 @@ def restore(content: Content, back_end: BackEnd) -> None:
         back_end.start_from(_keyframes(a), a, survey_of(content))
     except (KeyError, IndexError, ValueError, SolverError) as e:
         raise FileFormatError(f'the parts of the map do not fit together: {e}') from e
+
+
+def revoked(content: Content, number: int) -> tuple[Content, Closure]:
+    """A map without one of its loop closures, solved anew, and what became of that.
+
+    Raises SolverError if there is no such one.
+    """
+    params = parameters_of(content)
+    back_end = BackEnd(params)
+    restore(content, back_end)
+    closure = back_end.revoke(number)
+    grid = back_end.occupancy_grid() if 'grid' in content.arrays else None
+    out = content_of(back_end, params, grid)
+    kept = {name: content.arrays[name] for name in ('path', 'path_motion')}
+    return Content({**out.arrays, **kept}, out.description), closure
 
 
 def fill(graph: Graph, a: Arrays) -> None:

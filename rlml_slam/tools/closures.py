@@ -10,8 +10,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+from rlml_slam import warm_up
 from rlml_slam.errors import InputError, MapError
-from rlml_slam.rlml.closure_table import COLUMNS
+from rlml_slam.maps import container
+from rlml_slam.params import Parameters
+from rlml_slam.rlml import stored_map
+from rlml_slam.rlml.back_end import BackEnd
+from rlml_slam.rlml.closure_table import COLUMNS, closure_table, told
 from rlml_slam.tools.ask import ask
 
 
@@ -21,7 +26,11 @@ def add_parser(subparsers: Any) -> None:
         'closures', help='loop closures of a replay or of a running back end; revoke one'
     )
     parser.add_argument(
-        'folder', metavar='DIR', type=Path, nargs='?', help='what a replay wrote (closures.csv)'
+        'folder',
+        metavar='DIR',
+        type=Path,
+        nargs='?',
+        help='what a replay wrote (closures.csv), or a saved map (map.rlml)',
     )
     parser.add_argument(
         '--node', metavar='NAME', default='/back_end',
@@ -35,9 +44,12 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """List, or revoke."""
     if args.revoke is not None:
-        if args.folder is not None:
-            raise InputError('--revoke works in a running back end; a replay is done')
-        print(ask(args.node, 'revoke_closure', str(args.revoke)))
+        if args.folder is None:
+            print(ask(args.node, 'revoke_closure', str(args.revoke)))
+        elif args.folder.is_file():
+            print(revoke(args.folder, args.revoke))
+        else:
+            raise InputError('--revoke works in a running back end or a saved map: name its file')
         return 0
     rows = read(args.folder) if args.folder else parse(ask(args.node, 'closures'), args.node)
     if args.json:
@@ -47,8 +59,20 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def revoke(path: Path, number: int) -> str:
+    """Take a closure out of a saved map; the map before stays beside it."""
+    warm_up.compile_loaded()
+    content, closure = stored_map.revoked(stored_map.load(path), number)
+    container.write(path, content)
+    return told(closure)
+
+
 def read(folder: Path) -> list[dict[str, str]]:
-    """The rows of a folder's closures.csv; MapError if there is none."""
+    """The rows of a folder's closures.csv, or of a saved map; MapError if there is none."""
+    if folder.is_file():
+        back_end = BackEnd(Parameters())
+        stored_map.restore(stored_map.load(folder), back_end)
+        return parse(closure_table(back_end.scans.closures), str(folder))
     path = folder / 'closures.csv'
     try:
         return parse(path.read_text(encoding='utf-8'), str(path))

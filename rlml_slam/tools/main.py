@@ -101,6 +101,9 @@ COMMANDS: Table = {
             'detector': Command(
                 'study_detector', 'bias, false detections and reach of the reflector detector'
             ),
+            'store': Command(
+                'study_store', 'map files that are cut off, flipped, or killed while saved'
+            ),
             'victoria-park': Command(
                 'study_victoria_park', 'dead reckoning, EKF and RLML among trees, against GPS'
             ),

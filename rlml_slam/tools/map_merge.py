@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rlml_slam import warm_up
+from rlml_slam.maps import container
 from rlml_slam.params import Parameters, from_mapping, read_yaml
 from rlml_slam.rlml import stored_map
 from rlml_slam.rlml.merge_maps import merge_maps
@@ -37,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     warm_up.compile_loaded()
     first, second = stored_map.load(args.first), stored_map.load(args.second)
     merged = merge_maps(first, second, params)
-    stored_map.save(args.out, merged.back_end, params)
+    container.write(args.out, merged.content)
     figures = {
         'T_first_second': merged.T_first_second.tolist(),
         'why': merged.why,

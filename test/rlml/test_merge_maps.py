@@ -15,6 +15,7 @@ from rlml_slam.params import Parameters, Relocalization
 from rlml_slam.rlml import stored_map
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.merge_maps import APART, merge_maps
+from rlml_slam.rlml.path import poses_of
 from rlml_slam.rlml.slam import Slam
 from rlml_slam.tools.main import main
 from rlml_slam.types import Detections, Odometry, Scan, Verdict
@@ -66,6 +67,17 @@ def test_what_both_have_seen_is_there_once(two, merged):
     # of what both know: better than either
     alone = stored_map.saved_map(two[0]).reflectors
     assert np.trace(found.cov.sum(axis=0)) < np.trace(alone.cov.sum(axis=0))
+
+
+def test_frames_of_both_are_kept(two, merged):
+    path = merged.content.arrays['path']
+    assert len(path) == sum(len(c.arrays['path']) for c in two)
+    assert (np.diff(path['stamp']) >= 0).all()
+    poses = poses_of(path, merged.content.arrays['path_motion'], merged.back_end.graph.poses)
+    of = (path['stamp'] - 1_000_000_000) // 100_000_000
+    second = path['key'] >= len(two[0].arrays['pose'])
+    assert errors(poses[~second], CURVE[of[~second]])[0].max() < 0.05
+    assert errors(poses[second], AGAIN[of[second]])[0].max() < 0.05
 
 
 def test_graph_is_one_and_at_its_optimum(two, merged):

@@ -6,16 +6,20 @@ import numpy as np
 import pytest
 from made_worlds import ROOM, drive, errors, messages, observations
 
+from rlml_slam import se2
 from rlml_slam.errors import FileFormatError, MapError
+from rlml_slam.graph.solver import optimize
 from rlml_slam.maps import container
 from rlml_slam.maps.container import Content
 from rlml_slam.params import Parameters
 from rlml_slam.rlml import stored_map
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.front_end import FrontEnd
+from rlml_slam.rlml.loop_closure import Closure
 from rlml_slam.rlml.slam import Slam
 from rlml_slam.tools import map_export, map_info
-from rlml_slam.types import Odometry, Scan
+from rlml_slam.tools.main import main
+from rlml_slam.types import EdgeKind, Odometry, Scan
 
 PARAMS = Parameters()
 CURVE = drive((0.6, 0.0, 3.0), (0.6, 0.6, 4.0), (0.5, -0.7, 2.0))
@@ -142,3 +146,39 @@ def test_export_is_what_the_map_says(mapped, saved, tmp_path):
     assert len([r for r in rows if not r.startswith('#')]) == len(mapped.trajectory()[0])
     graph = (tmp_path / 'out' / 'graph.g2o').read_text()
     assert graph.count('VERTEX_SE2 ') == figures['keyframes']
+
+
+def test_closure_is_revoked_in_a_saved_map(mapped, tmp_path, capsys):
+    back_end = BackEnd(PARAMS)
+    stored_map.restore(stored_map.content_of(mapped.back_end, PARAMS, None), back_end)
+    graph = back_end.graph
+    i, j = 1, len(graph.poses) - 2
+    delta = se2.compose(se2.between(graph.poses[i], graph.poses[j]), (0.3, 0.0, 0.0))  # wrong
+    edge = graph.add_edge(EdgeKind.CLOSURE, i, j, delta, 1e8 * np.eye(3))
+    number = 1 + max((c.number for c in back_end.scans.closures), default=-1)
+    back_end.scans.closures.append(Closure(i, j, delta, 0.7, edge, 'fits', number=number))
+    right = graph.poses.copy()
+    optimize(graph, PARAMS.solver)
+    assert np.abs(graph.poses - right).max() > 0.01
+    path = stored_map.save(tmp_path / 'a.rlml', back_end, PARAMS)
+    assert main(['closures', str(path), '--all']) == 0
+    assert f'{number}' in capsys.readouterr().out
+    assert main(['closures', str(path), '--revoke', str(number)]) == 0
+    assert f'loop closure {number}' in capsys.readouterr().out
+    content = stored_map.load(path)
+    np.testing.assert_allclose(content.arrays['pose'], right, atol=1e-3)
+    assert main(['closures', str(path), '--json']) == 0
+    rows = json.loads(capsys.readouterr().out)['closures']
+    assert [r['state'] for r in rows if int(r['number']) == number] == ['revoked']
+    stored_map.load(f'{path}.previous')  # as it was before
+    assert main(['closures', str(path), '--revoke', str(number)]) == 1
+    assert 'revoked already' in capsys.readouterr().err
+
+
+def test_parameters_of_a_map_are_those_it_was_made_with(mapped):
+    params = replace(PARAMS, solver=replace(PARAMS.solver, max_iterations=33))
+    content = stored_map.content_of(mapped.back_end, params, None)
+    content = Content(content.arrays, json.loads(json.dumps(content.description)))
+    assert stored_map.parameters_of(content) == params
+    content.description['parameters']['solver']['of_another_version'] = 1
+    assert stored_map.parameters_of(content) == params
