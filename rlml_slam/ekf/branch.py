@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
+from rlml_slam.ekf.association import compatible_ids
 from rlml_slam.ekf.candidates import Candidates
 from rlml_slam.ekf.extraction import Measured
 from rlml_slam.ekf.filter import Filter
@@ -273,16 +274,17 @@ class Branch:
     def _same_as(self, key: int) -> int | None:
         """The landmark that ``key`` is as well; where both are uncertain, it could be two."""
         f, p = self.filter, self._p
-        local_keys = self.tracks.keys[f.local]
+        local_keys, ids = self.tracks.keys[f.local], self.tracks.ids[f.local]
         slot = np.flatnonzero(local_keys == key)
         if not len(slot):
             return None
         s = int(slot[0])
+        may_be = compatible_ids(ids[[s]], ids)[0]
         d = f.points - f.points[s]
         gap = np.hypot(d[:, 0], d[:, 1])
         for o in np.flatnonzero(gap < MERGE_DISTANCE).tolist():
             other = int(local_keys[o])
-            if o == s or (min(key, other), max(key, other)) in self.apart:
+            if o == s or not may_be[o] or (min(key, other), max(key, other)) in self.apart:
                 continue
             cov = f.difference_cov(s, o) + 1e-6 * np.eye(2)
             peak = 1.0 / (2.0 * math.pi * math.sqrt(np.linalg.det(cov)))

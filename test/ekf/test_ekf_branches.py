@@ -12,7 +12,7 @@ from rlml_slam.ekf.estimator import Estimator
 from rlml_slam.ekf.filter import Filter
 from rlml_slam.ekf.models import POINT
 from rlml_slam.params import EkfParameters, from_mapping
-from rlml_slam.types import Motion
+from rlml_slam.types import Detections, Motion, Observation
 
 LOOP = drive((0.5, 0.0, 4.0), (0.5, 1.2, 5.2), (0.5, 0.0, 6.0), (0.5, 1.2, 5.2), (0.5, 0.0, 3.0))
 BLIND = slice(60, 110)
@@ -91,3 +91,20 @@ def test_covariance_tells_that_another_branch_may_be_right():
     twin.weight = branch.weight
     # half of the weight stands 2 m away
     assert estimator.pose_cov[0, 0] == pytest.approx(branch.filter.P[0, 0] + 2.0, abs=1e-9)
+
+
+def test_close_landmarks_that_tell_different_ids_are_never_made_one():
+    pair = np.array([[3.0, 0.0], [3.15, 0.1]])
+    estimator = Estimator(from_mapping({'ekf.association': 'deferred'}, EkfParameters))
+    R = np.diag([0.05, 0.05]) ** 2
+    for k in range(40):
+        # never both at once
+        seen = Detections(
+            (k + 1) * 100_000_000, 'base_link', pair[[k % 2]], R[None], np.array([k % 2 + 7]),
+            np.full(1, np.nan),
+        )  # fmt: skip
+        still = Motion(np.zeros(3), np.zeros((3, 3)))
+        estimator.process(Observation(seen.stamp, still, detections=seen))
+    found = estimator.reflectors()
+    assert sorted(found.ids) == [7, 8]
+    assert found.points[np.argsort(found.ids)] == pytest.approx(pair, abs=1e-6)
