@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rlml_slam.params import Ransac
 from rlml_slam.se2 import Array
+from rlml_slam.sensing.consensus import find_lines, fit
 
 
 @dataclass(frozen=True)
@@ -33,23 +34,19 @@ def extract(points: Array, origin: Array, params: Ransac) -> Lines:
 
     Deterministic: the same points and seed give the same lines.
     """
-    rng = np.random.default_rng(params.seed)
-    angle = np.arctan2(points[:, 1] - origin[1], points[:, 0] - origin[0])
+    p = np.asarray(points, dtype=np.float64)
+    angle = np.arctan2(p[:, 1] - origin[1], p[:, 0] - origin[0])
     order = np.argsort(angle, kind='stable')
-    p, angle = np.asarray(points, dtype=np.float64)[order], angle[order]
-    rows = []
-    for _ in range(params.max_trials):  # N
-        if len(p) < params.consensus:
-            break
-        members = _trial(p, angle, params, rng)
-        if members is None:
-            continue
-        line = _line(p[members], params)
-        if line is not None:
-            rows.append(line)
-        keep = np.ones(len(p), dtype=np.bool_)
-        keep[members] = False
-        p, angle = p[keep], angle[keep]
+    p = p[order]
+    draws = np.random.default_rng(params.seed).random((params.max_trials, 1 + params.samples))
+    line_of = find_lines(
+        p, angle[order], draws, params.sample_angle, params.tolerance, params.consensus,
+        params.max_gap,
+    )  # fmt: skip
+    found = (
+        _line(p, np.flatnonzero(line_of == k), params) for k in range(line_of.max(initial=-1) + 1)
+    )
+    rows = [line for line in found if line is not None]
     if not rows:
         return Lines(
             np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.int64), np.zeros((0, 2, 2))
@@ -58,58 +55,12 @@ def extract(points: Array, origin: Array, params: Ransac) -> Lines:
     return Lines(np.array(lines), np.array(covs), np.array(readings), np.array(ends))
 
 
-def _trial(
-    p: Array, angle: Array, params: Ransac, rng: np.random.Generator
-) -> NDArray[np.int64] | None:
-    """Readings of one line that reaches the consensus, None if this trial finds none."""
-    n = len(p)
-    first = int(rng.integers(n))
-    # readings within D of the first one; the order is by angle
-    low = int(np.searchsorted(angle, angle[first] - params.sample_angle))
-    high = int(np.searchsorted(angle, angle[first] + params.sample_angle, side='right'))
-    if high - low <= params.samples:
-        return None
-    sample = np.append(rng.integers(low, high, params.samples), first)
-    rho, normal = _fit(p[sample])
-    near = np.abs(p @ normal - rho) <= params.tolerance
-    if int(near.sum()) < params.consensus:
-        return None
-    # least squares again, with all readings on the old line
-    rho, normal = _fit(p[near])
-    members = np.flatnonzero(np.abs(p @ normal - rho) <= params.tolerance)
-    members = _together(p, members, normal, first, params.max_gap)
-    return members if len(members) >= params.consensus else None
-
-
-def _together(
-    p: Array, members: NDArray[np.int64], normal: Array, first: int, max_gap: float
-) -> NDArray[np.int64]:
-    """The part without gaps that holds the first reading: a wall, not all that is in its line."""
-    along = p[members] @ np.array([-normal[1], normal[0]])
-    order = np.argsort(along, kind='stable')
-    part = np.concatenate([[0], np.cumsum(np.diff(along[order]) > max_gap)])
-    parts = np.empty(len(members), dtype=np.int64)
-    parts[order] = part
-    here = np.flatnonzero(members == first)
-    if not len(here):
-        return members[:0]
-    out: NDArray[np.int64] = members[parts == parts[here[0]]]
-    return out
-
-
-def _fit(p: Array) -> tuple[float, Array]:
-    """Total least squares line: distance of the origin (of either sign) and unit normal (2,)."""
-    mean = p.mean(axis=0)
-    d = p - mean
-    xx, xy, yy = d[:, 0] @ d[:, 0], d[:, 0] @ d[:, 1], d[:, 1] @ d[:, 1]
-    a = 0.5 * np.arctan2(-2.0 * xy, yy - xx)
-    normal = np.array([np.cos(a), np.sin(a)])
-    return float(mean @ normal), normal
-
-
-def _line(p: Array, params: Ransac) -> tuple[Array, Array, int, Array] | None:
+def _line(
+    points: Array, members: NDArray[np.int64], params: Ransac
+) -> tuple[Array, Array, int, Array] | None:
     """(rho, alpha), its covariance, number of readings and ends; None where it is too short."""
-    rho, normal = _fit(p)
+    rho, alpha = fit(points, members)
+    p, normal = points[members], np.array([np.cos(alpha), np.sin(alpha)])
     if rho < 0.0:
         rho, normal = -rho, -normal
     t = np.array([-normal[1], normal[0]])
