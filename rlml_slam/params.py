@@ -569,10 +569,15 @@ class Spikes(Group):
     threshold: float = param(0.5, 'range difference that makes a spike', 'm', 1e-3, 100.0)
     reach: int = param(1, 'sum test: neighbours are this many valid beams away', '', 1, 100)
     min_beams: int = param(1, 'fewer beams are no spike', '', 1, 1000)
-    max_width: float = param(0.5, 'wider objects are no landmarks', 'm', 1e-3, 10.0)
+    max_width: float = param(
+        0.3, 'wider objects are no landmarks; a person is wider', 'm', 1e-3, 10.0
+    )
     max_range: float = param(25.0, 'farther spikes are not used', 'm', 0.1, 1000.0)
+    round: bool = param(
+        True, 'spikes are cylinders: the centre is pi/8 of the width behind the mean of its ranges'
+    )  # fmt: skip
     offset: float = param(
-        0.0, "from the mean of its ranges to a spike's centre; pi/8 of a cylinder's diameter",
+        0.0, "added to a spike's range, against an error that the laser makes on such objects",
         'm', -1.0, 1.0,
     )  # fmt: skip
     sigma_range: float = param(0.03, 'range noise of a spike', 'm', 1e-4, 10.0)

@@ -116,10 +116,17 @@ def _spike(
 ) -> tuple[float, float] | None:
     """Mean range and mean beam of a span, None if it is too wide, too far or too few beams."""
     r = float(ranges.mean())
-    width = abs(scan.angle_increment) * float(beams[-1] - beams[0]) * r
-    if len(beams) < params.min_beams or width > params.max_width or r > params.max_range:
+    step, steps = abs(scan.angle_increment), float(beams[-1] - beams[0])
+    if (
+        len(beams) < params.min_beams
+        or r > params.max_range
+        or step * steps * r > params.max_width
+    ):
         return None
-    return r + params.offset, float(beams.mean())
+    # A cylinder at r + depth is as wide as the beams that hit it, in the mean of many; averaged
+    # over its width, its surface lies pi/8 of the diameter before its centre.
+    share = math.pi / 8.0 * step * (steps + 1.0) if params.round else 0.0
+    return r / (1.0 - min(share, 0.5)) + params.offset, float(beams.mean())
 
 
 def _extracted(scan: Scan, params: Spikes, rows: Array) -> Extracted:

@@ -17,15 +17,18 @@ from rlml_slam.maps.occupancy import write_atomically
 from rlml_slam.params import EkfParameters, from_mapping, read_yaml
 from rlml_slam.se2 import Array
 from rlml_slam.tools.convert_lego import LASER_FRAME, T_BASE_LASER, Lego, read_lego
+from rlml_slam.tools.lego_scale import fit_scale, ranges_of
 from rlml_slam.types import Odometry, Reflectors, Scan
 
-# what the robot and its laser are like; OFFSET makes the mapped cylinders as far apart as true
+# what the robot and its laser are like; the offset, which holds the cylinder's radius and an error
+# of this laser, makes the mapped cylinders as far apart as the true ones
 PARAMETERS: dict[str, Any] = {
     'ekf.extractor': 'spikes',
     'ekf.sightings': 6,
     'ekf.min_separation': 0.35,
     'spikes.threshold': 0.1,
     'spikes.offset': 0.115,
+    'spikes.round': False,
     'spikes.max_width': 0.15,
     'spikes.max_range': 2.0,
     'spikes.min_beams': 3,
@@ -66,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the system, print the figures, draw the picture."""
     data = read_lego(args.folder)
     result = drive(data, read_yaml(args.config) if args.config else {})
-    figures = judge(data, result)
+    figures = judge(data, result) | judge_scale(data, result)
     if args.out is not None:
         write_atomically(args.out, picture(data, result))
     if args.json:
@@ -126,6 +129,26 @@ def judge(data: Lego, result: Result) -> dict[str, Any]:
         'camera_scale': round(view.scale, 4),
         'camera_point_m': [round(float(v), 4) for v in view.point],
         'arena_scale': round(map_scale, 4),
+    }
+
+
+def judge_scale(data: Lego, result: Result) -> dict[str, Any]:
+    """How large the camera's track is by the ranges to the true cylinders, without any filter.
+
+    ``position_rmse_by_ranges_m`` is what the places that fit the ranges best have to the track.
+    """
+    params: EkfParameters = from_mapping(PARAMETERS, EkfParameters)
+    track = data.track.poses[:, :2]
+    ranges = ranges_of(data, result.scanner, params.spikes)
+    free, rigid = (fit_scale(track, data.landmarks, ranges, r) for r in (False, True))
+    return {
+        'ranges': len(ranges.measured),
+        'track_scale_by_ranges': round(1.0 / free.scale, 4),
+        'track_scale_sigma': round(free.sigma / free.scale**2, 4),
+        'range_offset_m': round(free.offset, 4),
+        'range_rms_m': round(free.rms, 4),
+        'range_rms_without_scale_m': round(rigid.rms, 4),
+        'position_rmse_by_ranges_m': round(residual(free.places, track)[0], 4),
     }
 
 

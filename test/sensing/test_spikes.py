@@ -16,16 +16,35 @@ def scan(ranges, increment=0.01, first=-0.5):
 def test_jump_finds_what_is_nearer_than_both_neighbours():
     r = np.full(100, 5.0)
     r[40:43] = 3.0
-    found = extract(scan(r), Spikes(offset=0.1))
+    found = extract(scan(r), Spikes(offset=0.1, round=False))
     assert found.beams.tolist() == [41.0]
     angle = -0.5 + 0.41
     assert found.points[0] == pytest.approx([3.1 * np.cos(angle), 3.1 * np.sin(angle)], abs=1e-6)
 
 
+@pytest.mark.parametrize('diameter', [0.05, 0.1, 0.2])
+def test_centre_of_a_cylinder_is_found_whatever_its_size(diameter):
+    rng = np.random.default_rng(4)
+    increment, errors = 0.25 * np.pi / 180.0, []
+    for _ in range(200):
+        distance, bearing = rng.uniform(2.0, 6.0), rng.uniform(-0.4, 0.4)
+        angle = -0.5 + increment * np.arange(230)
+        across = distance * np.sin(angle - bearing)
+        hit = np.abs(across) < 0.5 * diameter
+        r = np.full(len(angle), 9.0)
+        depth = np.sqrt(0.25 * diameter**2 - across[hit] ** 2)
+        r[hit] = distance * np.cos(angle[hit] - bearing) - depth
+        found = extract(scan(r, increment), Spikes())
+        errors.append(np.linalg.norm(found.points[0]) - distance)
+    # a beam more or less is 8 mm at most of the depth, as often one as the other: 200 of them
+    assert abs(np.mean(errors)) < 0.001
+    assert np.std(errors) < 0.01
+
+
 def test_sum_finds_one_near_beam_and_its_covariance_is_polar():
     r = np.full(100, 5.0)
     r[60] = 2.0
-    p = Spikes(test='sum', sigma_range=0.05, sigma_bearing=0.01)
+    p = Spikes(test='sum', sigma_range=0.05, sigma_bearing=0.01, round=False)
     found = extract(scan(r), p)
     assert found.beams.tolist() == [60.0]
     u = found.points[0] / 2.0

@@ -21,6 +21,7 @@ from rlml_slam.tools.convert_lego import (
     WHEEL_BASE,
     read_lego,
 )
+from rlml_slam.tools.lego_scale import Ranges, fit_scale
 from rlml_slam.tools.main import main
 from rlml_slam.tools.study_lego import camera_view
 
@@ -86,6 +87,26 @@ def test_camera_view_finds_scale_and_point():
     assert_allclose(view.seen, track, atol=1e-12)
 
 
+@pytest.mark.parametrize('scale', [0.9, 1.0])
+def test_ranges_alone_tell_how_large_the_track_is(scale):
+    rng = np.random.default_rng(2)
+    landmarks, true = rng.uniform(-1.0, 1.0, (6, 2)), rng.uniform(-1.0, 1.0, (80, 2))
+    T = np.array([0.2, -0.1, 0.3])
+    track = (se2.transform(T, true) - true.mean(axis=0)) / scale
+    k, j = np.divmod(np.arange(80 * 6), 6)
+    d = np.hypot(*(landmarks[j] - true[k]).T)
+    ranges = Ranges(d - 0.09 + 0.01 * rng.standard_normal(len(d)), j, k)
+    free = fit_scale(track, landmarks, ranges)
+    assert free.scale == pytest.approx(scale, abs=4.0 * free.sigma)
+    assert free.sigma < 0.005
+    assert free.offset == pytest.approx(0.09, abs=0.005)
+    assert_allclose(free.places, true, atol=0.01)
+    # 1 cm of noise; a track of the wrong size cannot be fitted as well
+    rigid = fit_scale(track, landmarks, ranges, rigid=True)
+    assert free.rms == pytest.approx(0.01, rel=0.15)
+    assert rigid.rms > 2.0 * free.rms if scale != 1.0 else rigid.rms < 1.01 * free.rms
+
+
 @real_data
 def test_all_cylinders_and_no_other_are_found(tmp_path, capsys):
     out = tmp_path / 'lego.png'
@@ -94,7 +115,9 @@ def test_all_cylinders_and_no_other_are_found(tmp_path, capsys):
     assert figures['cylinders_found'] == figures['cylinders'] == 6
     assert figures['landmarks_false'] == 0
     assert figures['landmark_rmse_m'] <= 0.02
-    # rigidly 6.5 cm: the camera's metre is larger than that of laser, wheels and map (docs)
+    # rigidly 6.4 cm: the camera's metre is larger than that of laser, wheels and map (docs)
+    assert figures['track_scale_by_ranges'] - 1.0 > 20.0 * figures['track_scale_sigma']
+    assert figures['position_rmse_by_ranges_m'] > 0.05
     assert figures['position_rmse_as_camera_m'] <= 0.03
     assert abs(figures['arena_scale'] - 1.0) < 0.01
     assert figures['camera_scale'] > 1.07
