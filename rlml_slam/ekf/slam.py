@@ -12,49 +12,25 @@ from rlml_slam.ekf.estimator import Estimator
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import EkfParameters
 from rlml_slam.se2 import Array
-from rlml_slam.sensing.sequence import Sequencer
-from rlml_slam.types import Detections, Frame, Imu, Observation, Odometry, Reflectors, Scan
+from rlml_slam.sensing.driven import Driven
+from rlml_slam.types import Frame, Observation, Reflectors
 
 
-class EkfSlam:
-    """Sequencer and filter; each ``add_…`` returns the frames that became ready."""
+class EkfSlam(Driven):
+    """Sequencer and filter."""
 
     def __init__(self, params: EkfParameters) -> None:
-        self.sequencer = Sequencer(params)
+        super().__init__(params)
         self.estimator = Estimator(params)
-
-    @property
-    def counts(self) -> dict[str, dict[str, int]]:
-        """What became of the inputs, by stream."""
-        return self.sequencer.inputs.totals()
-
-    def set_sensor_pose(self, frame_id: str, T_base_sensor: Array) -> None:
-        """Where a sensor sits on the robot (3,)."""
-        self.sequencer.set_sensor_pose(frame_id, T_base_sensor)
-
-    def add_odometry(self, sample: Odometry) -> list[Frame]:
-        """One wheel odometry sample."""
-        return self._process(self.sequencer.add_odometry(sample))
-
-    def add_imu(self, sample: Imu) -> list[Frame]:
-        """One IMU sample."""
-        return self._process(self.sequencer.add_imu(sample))
-
-    def add_scan(self, scan: Scan) -> list[Frame]:
-        """One sweep of the laser."""
-        return self._process(self.sequencer.add_scan(scan))
-
-    def add_detections(self, detections: Detections) -> list[Frame]:
-        """The reflectors seen at one instant."""
-        return self._process(self.sequencer.add_detections(detections))
 
     def finish(self) -> list[Frame]:
         """Everything that still waits."""
-        frames = self._process(self.sequencer.flush())
+        frames = self.process(self.sequencer.flush())
         self.estimator.filter.settle()
         return frames
 
-    def _process(self, observations: Iterable[Observation]) -> list[Frame]:
+    def process(self, observations: Iterable[Observation]) -> list[Frame]:
+        """What the sequencer made of the inputs."""
         return [self.estimator.process(o) for o in observations]
 
     def trajectory(self) -> tuple[NDArray[np.int64], Array]:

@@ -23,24 +23,20 @@ from rlml_slam.rlml.find_place import find_place
 from rlml_slam.rlml.front_end import FrontEnd
 from rlml_slam.rlml.recovery import Recovery
 from rlml_slam.se2 import Array
-from rlml_slam.sensing.sequence import Sequencer
+from rlml_slam.sensing.driven import Driven
 from rlml_slam.types import (
-    Detections,
     Frame,
-    Imu,
     Level,
     Observation,
-    Odometry,
     Reflectors,
-    Scan,
     Verdict,
 )
 
 AHEAD = 200  # frames that the front end may be ahead of the back end
 
 
-class Slam:
-    """Sequencer, front end and back end; each ``add_…`` returns the frames that became ready.
+class Slam(Driven):
+    """Sequencer, front end and back end.
 
     With ``parallel`` the back end works in a thread of its own, up to AHEAD frames behind, and
     frames come later by as many; they are the same to the last bit. The front end's local frame
@@ -53,7 +49,7 @@ class Slam:
     def __init__(
         self, params: Parameters, parallel: bool = False, survey: Survey | None = None
     ) -> None:
-        self.sequencer = Sequencer(params)
+        super().__init__(params)
         self.front_end = FrontEnd(params)
         self.back_end = BackEnd(params, survey)
         self.recovery = Recovery(params)
@@ -91,39 +87,15 @@ class Slam:
         self.front_end.tracks.next_key = self.back_end.reflector_graph.next_key
         self._begin_in = None
 
-    @property
-    def counts(self) -> dict[str, dict[str, int]]:
-        """What became of the inputs, by stream."""
-        return self.sequencer.inputs.totals()
-
-    def set_sensor_pose(self, frame_id: str, T_base_sensor: Array) -> None:
-        """Where a sensor sits on the robot (3,)."""
-        self.sequencer.set_sensor_pose(frame_id, T_base_sensor)
-
-    def add_odometry(self, sample: Odometry) -> list[Frame]:
-        """One wheel odometry sample."""
-        return self._process(self.sequencer.add_odometry(sample))
-
-    def add_imu(self, sample: Imu) -> list[Frame]:
-        """One IMU sample."""
-        return self._process(self.sequencer.add_imu(sample))
-
-    def add_scan(self, scan: Scan) -> list[Frame]:
-        """One sweep of the laser."""
-        return self._process(self.sequencer.add_scan(scan))
-
-    def add_detections(self, detections: Detections) -> list[Frame]:
-        """The reflectors seen at one instant."""
-        return self._process(self.sequencer.add_detections(detections))
-
     def finish(self) -> list[Frame]:
         """Everything that still waits; then the last optimisation."""
-        frames = self._process(self.sequencer.flush()) + self._take_turns()
+        frames = self.process(self.sequencer.flush()) + self._take_turns()
         if self._saved is None:
             self.back_end.finish()
         return frames
 
-    def _process(self, observations: Iterable[Observation]) -> list[Frame]:
+    def process(self, observations: Iterable[Observation]) -> list[Frame]:
+        """What the sequencer made of the inputs."""
         frames = []
         for observation in observations:
             if self._saved is not None or observation.detections:

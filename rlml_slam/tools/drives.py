@@ -9,13 +9,15 @@ import numpy as np
 
 from rlml_slam import warm_up
 from rlml_slam.ekf.slam import EkfSlam
-from rlml_slam.params import SimulatorParameters
+from rlml_slam.params import Parameters, SimulatorParameters
 from rlml_slam.rlml.slam import Slam
+from rlml_slam.ros.feed import Out, Target
+from rlml_slam.sensing.sequence import Sequencer
 from rlml_slam.simulation.simulation import GroundTruth, Message, Simulation
 from rlml_slam.simulation.world_file import load_world
 from rlml_slam.tools.record import Truth
 from rlml_slam.tools.tum import Trajectory
-from rlml_slam.types import Frame, Imu, Odometry, Scan
+from rlml_slam.types import Frame, Imu, Observation, Odometry, Scan
 
 
 def simulate(parameters: SimulatorParameters, seed: int) -> tuple[list[Message], Truth]:
@@ -33,15 +35,29 @@ def simulate(parameters: SimulatorParameters, seed: int) -> tuple[list[Message],
 def feed(slam: Slam | EkfSlam, messages: Sequence[Message]) -> list[list[Frame]]:
     """All messages in order of arrival; the frames that they gave."""
     warm_up.compile_loaded()
-    out = []
-    for message in messages:
-        if isinstance(message, Odometry):
-            out.append(slam.add_odometry(message))
-        elif isinstance(message, Imu):
-            out.append(slam.add_imu(message))
-        elif isinstance(message, Scan):
-            out.append(slam.add_scan(message))
-        elif not isinstance(message, GroundTruth):
-            out.append(slam.add_detections(message))
-    out.append(slam.finish())
-    return out
+    return [*(_add(slam, m) for m in messages), slam.finish()]
+
+
+def observe(
+    messages: Sequence[Message], params: Parameters, simulator: SimulatorParameters
+) -> list[Observation]:
+    """What a system's sequencer makes of all messages: the same for every system."""
+    sequencer = Sequencer(params)
+    sequencer.set_sensor_pose(simulator.node.laser_frame, np.array(simulator.node.laser_pose))
+    return [o for m in messages for o in _add(sequencer, m)] + sequencer.flush()
+
+
+def process(slam: Slam | EkfSlam, observations: Sequence[Observation]) -> list[list[Frame]]:
+    """All observations in order; the frames that they gave."""
+    warm_up.compile_loaded()
+    return [*(slam.process([o]) for o in observations), slam.finish()]
+
+
+def _add(target: Target[Out], message: Message) -> list[Out]:
+    if isinstance(message, Odometry):
+        return target.add_odometry(message)
+    if isinstance(message, Imu):
+        return target.add_imu(message)
+    if isinstance(message, Scan):
+        return target.add_scan(message)
+    return [] if isinstance(message, GroundTruth) else target.add_detections(message)

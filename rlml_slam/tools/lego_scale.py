@@ -17,7 +17,6 @@ from rlml_slam import se2
 from rlml_slam.params import Spikes
 from rlml_slam.se2 import Array
 from rlml_slam.sensing import spikes
-from rlml_slam.tools.ate import align
 from rlml_slam.tools.convert_lego import T_BASE_LASER, Lego
 
 NEAR = 0.25  # [m] a spike farther from every cylinder is of something else
@@ -50,7 +49,7 @@ class ScaleFit:
 def ranges_of(data: Lego, scanner: Array, params: Spikes) -> Ranges:
     """Ranges to the cylinders; the estimated ``scanner`` poses (n, 3) tell which is which."""
     heading = -T_BASE_LASER[2]
-    T = align(scanner[:, :2], data.track.poses[:, :2])
+    T = se2.align(scanner[:, :2], data.track.poses[:, :2])
     T_arena_laser = se2.compose(se2.compose(T, scanner), np.array([0.0, 0.0, -heading]))
     rows = []
     for k, scan in enumerate(data.scans):

@@ -13,9 +13,10 @@ from matplotlib.figure import Figure
 
 from rlml_slam.maps.occupancy import write_atomically
 from rlml_slam.tools import page
+from rlml_slam.tools import study_ekf_drives as drives
+from rlml_slam.tools import study_ekf_speed as speed
 from rlml_slam.tools.outputs import make_folder
 from rlml_slam.tools.pictures import CLOSURE, LIVE, PATH, TRUTH, png
-from rlml_slam.tools.study_ekf import COLUMNS, drive_rows
 from rlml_slam.tools.study_ekf_consistency import CASES, HEADER, SYSTEMS, Series, rows
 
 COLORS = {'additive': LIVE, 'invariant': CLOSURE, 'rlml': PATH}
@@ -30,9 +31,9 @@ def write_report(folder: Path, summary: Mapping[str, Any], series: Mapping[str, 
         page.heading('Drives'),
         page.paragraph(
             'Anonymous detections, the odometry and IMU of the simulator, default parameters; '
-            'mean over the seeds (worst seed).'
+            'mean ± standard deviation over the seeds (worst seed).'
         ),
-        page.table(['world, system', *(c[0] for c in COLUMNS.values())], drive_rows(summary)),
+        page.table(drives.HEADER, drives.rows(summary['drives'])),
         page.picture(pictures['errors'], 'Position RMSE as published live, every seed'),
     ]
     if series:
@@ -52,6 +53,7 @@ def write_report(folder: Path, summary: Mapping[str, Any], series: Mapping[str, 
                 'RMS heading error',
             ),
         ]
+    parts += [page.heading('Speed'), *map(page.paragraph, speed.lines(summary['speed']))]
     for name, data in pictures.items():
         write_atomically(folder / f'{name}.png', data)
     write_atomically(folder / 'results.json', (json.dumps(summary, indent=1) + '\n').encode())

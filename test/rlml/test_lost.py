@@ -48,7 +48,7 @@ def kidnapping(path=LOOP, after=AFTER, world=ROOM, elsewhere=ROOM, **kw):
 def run(observed, slam=None):
     """Frames of a system that is given observations, and the system."""
     slam = slam or Slam(Parameters())
-    frames = [frame for o in observed for frame in slam._process([o])]
+    frames = [frame for o in observed for frame in slam.process([o])]
     return frames, slam
 
 
