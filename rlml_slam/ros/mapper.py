@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -76,6 +77,7 @@ class Mapper:
         self._mapped: int | None = None  # and of the newest that the worker has seen
         self._told: int | None = None  # session of a lost front end that knows its place by now
         self._sent = 0
+        self._written: int | None = None  # stamp of the newest keyframe that is in a file
         self._heard = 0.0
         self._tf = TransformPublisher(node)
         kind = rclpy_class('geometry_msgs/msg/PoseWithCovarianceStamped')
@@ -164,8 +166,27 @@ class Mapper:
         """In the worker: the front end began anew, and so does the map, if it was in it."""
         if self._continued is not None and self._enters:
             self._continued.begin_session()
+            return
+        if self.saved is None:
+            self._keep()
+        self._forget()
+
+    def _keep(self) -> None:
+        """Write the map in the making under a name of its own, for nothing leads back to it."""
+        keys, name = self.back_end.keyframes, self._p.node.map_file_name
+        if len(keys) < 2 or keys[-1].stamp == self._written:
+            return
+        path = self.folder.whole(f'{name}.lost-{keys[-1].stamp // 1_000_000_000}')
+        try:
+            self._write(path, self.products.grid(self.back_end))
+        except MapError as e:
+            self._logger.warning(f'the map until now is lost: {e}')
         else:
-            self._forget()
+            self._logger.warning(f'the map until now is kept: {path}')
+
+    def _write(self, path: Path, grid: OccupancyGrid | None) -> None:
+        container.write(path, stored_map.content_of(self.back_end, self._p, grid))
+        self._written = self.back_end.keyframes[-1].stamp
 
     def _tell_of_plant(self) -> None:
         """Say so once when the map has entered the frame of the survey."""
@@ -254,6 +275,8 @@ class Mapper:
         """
         if not number.isdecimal():
             raise MapError(f'{number!r} is not the number of a loop closure')
+        if self.saved is not None:
+            raise MapError('the map that is localized in does not change')
         closure = self.back_end.revoke(int(number))
         self._logger.warning(told(closure))
         self._send_correction()
@@ -289,8 +312,11 @@ class Mapper:
         self._tf.publish(self._sent, (n.map_frame, n.odom_frame), T)
 
     def _forget(self) -> None:
-        self.back_end.reset()
-        self._continued = None
+        """The local frame is another one; so is the map, but for one that is localized in."""
+        if self.saved is None:
+            self.back_end.reset()
+            self._continued = None
+        self.back_end.T_map_local, self.back_end.known = np.zeros(3), None
         self.products.restart()
         self._newest = None
         self._send_correction()
@@ -314,8 +340,7 @@ class Mapper:
             raise MapError(self.products.undrawn or 'there is no map yet')
         why = f', no grid: {self.products.undrawn}' if self.products.undrawn else ''
         if self.back_end.keyframes:
-            whole = stored_map.content_of(self.back_end, self._p, current.grid)
-            container.write(self.folder.whole(name), whole)
+            self._write(self.folder.whole(name), current.grid)
         path = self.folder.save(name, current)
         return f'{path}: {_content(current)}{why}'
 
@@ -342,7 +367,9 @@ class Mapper:
     def _continue(self, name: str) -> None:
         """Go on with the whole map of a file; what was made until now is forgotten."""
         content = stored_map.load(self.folder.whole(name))
+        self._keep()
         self._continued = Continued(self._p, content, self.back_end)
+        self._written = self.back_end.keyframes[-1].stamp
         self.products.restart()
         self._logger.info(f'{self.folder.whole(name)}: {self._continued.why}')
         self.worker.submit(self.publish_map)
@@ -381,6 +408,8 @@ class Mapper:
         header = build.header(make_rclpy, self.stamp, self._p.node.map_frame)
         # without fields: no map to localize in
         self._localization.publish(make_rclpy('sensor_msgs/msg/PointCloud2', header=header))
+        self._keep()
+        self._forget()
         return 'maps: a new map begins where the robot is, in the axes of the old one'
 
     def relocalize(self) -> tuple[bool, str]:

@@ -260,8 +260,9 @@ def test_robot_that_was_carried_away_finds_itself_in_its_map(live, tmp_path):
     assert switched.success
     assert 'reflectors and a grid' in switched.message
     live.spin_until(lambda: front.front_end._p.node.mode == 'localization')
+    keys = len(back.mapper.back_end.keyframes)
     drive(live, front, back, start=6.0, end=9.0)
-    assert back.mapper.back_end.keyframes == []
+    assert len(back.mapper.back_end.keyframes) == keys
 
     wrong = se2.compose(front.last.T_map_base, np.array([1.0, -0.8, 2.0]))
     front.control.start_at(
@@ -290,7 +291,7 @@ def test_robot_that_was_carried_away_finds_itself_in_its_map(live, tmp_path):
     assert back_to_mapping.success
     live.spin_until(lambda: front.front_end._p.node.mode == 'mapping')
     drive(live, front, back, start=10.0, end=12.0)
-    assert back.mapper.back_end.keyframes
+    assert 0 < len(back.mapper.back_end.keyframes) < keys
 
 
 def test_place_that_cannot_be_told_is_told_as_such(live):

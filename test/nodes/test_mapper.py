@@ -205,6 +205,63 @@ def test_map_made_here_can_be_saved_while_it_is_localized_in(make, tmp_path):
         mapper.save('again')
 
 
+def drives(mapper, ks, **more):
+    for k in ks:
+        give(mapper, k, pose=(0.1 * k, 0.0, 0.0), **more)
+
+
+def lost(folder):
+    """Names and numbers of keyframes of the maps that were kept."""
+    return {
+        path.name: len(stored_map.load(path).arrays['pose'])
+        for path in sorted(folder.glob('*.lost-*'))
+    }
+
+
+def test_map_is_kept_when_the_front_end_begins_anew(make, ear, tmp_path):
+    mapper = make(map_directory=str(tmp_path))
+    drives(mapper, range(21))
+    keys = len(mapper.back_end.keyframes)
+    assert keys > 5
+    give(mapper, 21, session=2)
+    assert lost(tmp_path) == {'map.lost-2.rlml': keys}
+    assert ear.warnings[-1].startswith('the map until now is kept: ')
+    # nothing is in the new map, and what is in a file already is not kept twice
+    drives(mapper, range(22, 44), session=2)
+    mapper.back_end.reflectors = lambda: posts(5)
+    mapper.save('map')
+    give(mapper, 44, session=3)
+    assert len(lost(tmp_path)) == 1
+
+
+def test_map_that_cannot_be_kept_does_not_stop_the_next_one(make, ear, tmp_path):
+    (tmp_path / 'file').touch()
+    mapper = make(map_directory=str(tmp_path / 'file'))
+    drives(mapper, range(21))
+    give(mapper, 21, session=2)
+    assert ear.warnings[-1].startswith('the map until now is lost: ')
+    assert len(mapper.back_end.keyframes) == 1
+
+
+def test_map_made_here_stays_whole_while_it_is_localized_in(make, ear, tmp_path):
+    """The front end begins anew in it, and the graph can be saved all the same."""
+    mapper = make(map_directory=str(tmp_path))
+    drives(mapper, range(21))
+    keys, found = len(mapper.back_end.keyframes), mapper.back_end.reflectors
+    mapper.back_end.reflectors = lambda: posts(5)
+    mapper.localize(True)
+    mapper.back_end.reflectors = found
+    drives(mapper, range(21, 30), session=2)
+    np.testing.assert_array_equal(mapper.back_end.T_map_local, np.zeros(3))
+    mapper.save('map')
+    assert len(stored_map.load(tmp_path / 'map.rlml').arrays['pose']) == keys
+    with pytest.raises(MapError, match='does not change'):
+        mapper.revoke('0')
+    mapper.localize(False)
+    assert mapper.back_end.keyframes == []
+    assert lost(tmp_path) == {}  # it is in a file
+
+
 # --- a grid that is too large ---------------------------------------------------------------
 
 
