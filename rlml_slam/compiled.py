@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba
+from llvmlite import ir
 from numba.extending import intrinsic
 
 F = TypeVar('F', bound=Callable[..., Any])
@@ -41,3 +42,24 @@ def _load_word(_typing: Any, array: Any, _at: Any) -> Any:
 # load8(bytes, at): the eight bytes of a contiguous uint8 array from ``at`` on as one word, the
 # first one lowest (little-endian); for kernels only, and not checked
 load8: Any = intrinsic(_load_word)
+
+
+def _fetch_line(_typing: Any, array: Any, _at: Any, _offset: Any) -> Any:
+    """Typing and code of fetch: a hint to the processor."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        byte, flag = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte, flag, flag, flag])
+        hint = builder.module.declare_intrinsic('llvm.prefetch', [byte], kind)
+        place = builder.bitcast(builder.gep(data, [args[1]]), byte)
+        # to be read, to be kept near, data
+        builder.call(hint, [builder.gep(place, [args[2]]), flag(0), flag(3), flag(1)])
+        return context.get_dummy_value()
+
+    return numba.void(array, numba.int64, numba.int64), generate
+
+
+# fetch(array, at, offset): bring near the line of memory that holds the byte ``offset`` of an
+# element, which is needed soon; for kernels only
+fetch: Any = intrinsic(_fetch_line)

@@ -19,8 +19,9 @@ ALLOWED = {
     'nodes': {'core', 'ros', 'nodes'},
     'tools': {'core', 'ros', 'tools'},
 }
-# third-party modules of the core: numbers, and YAML for parameters, worlds and maps
-CORE_NEEDS = {'numba', 'numpy', 'scipy', 'yaml'}
+# third-party modules of the core: numbers, and YAML for parameters, worlds and maps; llvmlite is
+# what numba itself is made with
+CORE_NEEDS = {'llvmlite', 'numba', 'numpy', 'scipy', 'yaml'}
 # what an offline command must work without
 ROS_MODULES = ('rclpy', 'tf2_msgs', 'sensor_msgs', 'nav_msgs', 'geometry_msgs', 'std_msgs')
 MODULES = sorted(PACKAGE.rglob('*.py'))

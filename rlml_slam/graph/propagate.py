@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rlml_slam.compiled import part
+from rlml_slam.compiled import fetch, part
 from rlml_slam.graph.increments import STEP, State
 from rlml_slam.graph.linearize import wrapped
 from rlml_slam.graph.structure import Ints, Records
@@ -104,6 +104,12 @@ def _solve(
     at, width, height = clique['panel'], clique['width'], clique['height']
     tall = height + 1
     first = clique['block']
+    # a tree that is larger than the cache waits for memory longer than it computes
+    for k in range(at, at + width * tall, 8):
+        fetch(pool, k, 0)
+    for p in range(first, first + clique['own']):
+        fetch(unknowns, numbers[p], 0)
+        fetch(unknowns, numbers[p], 64)
     w = width
     for p in range(first + clique['own'], first + clique['members']):
         u = unknowns[numbers[p]]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rlml_slam.compiled import part
+from rlml_slam.compiled import fetch, part
 from rlml_slam.graph.dense import partial_cholesky, rank_update
 from rlml_slam.graph.fronts import SINGULAR, highest
 from rlml_slam.graph.increments import (
@@ -142,6 +142,8 @@ def _assemble(
         f, end = link // 2, link % 2
         z = state.factors[f]
         link = z['next_a'] if end == 0 else z['next_b']
+        for k in range(0, 256, 64):  # all of the next record
+            fetch(state.factors, link // 2, k)
         other = z['b'] if end == 0 else z['a']
         m = n
         if other >= 0:
@@ -259,6 +261,8 @@ def _extend(
     rows[w] = height
     below = w + 1
     source = clique['panel'] + clique['width'] * (clique['height'] + 1)
+    for k in range(source, source + below * below, 8):
+        fetch(pool, k, 0)
     for j in range(w):
         t = rows[j]
         to = column[t]

@@ -19,7 +19,7 @@ import math
 
 import numpy as np
 
-from rlml_slam.compiled import part
+from rlml_slam.compiled import fetch, part
 from rlml_slam.graph.increments import (
     EDGES,
     FACTORS,
@@ -270,6 +270,10 @@ def judge(
     worst = 0.0
     for n in range(len(moved)):
         u = state.unknowns[moved[n]]
+        # the factors of one a little further on are on their way meanwhile
+        soon = state.unknowns[moved[min(n + 4, len(moved) - 1)]]['head'] // 2
+        fetch(state.factors, soon, 0)
+        fetch(state.factors, soon, 64)
         if not robust and u['size'] == 2:
             continue
         link = u['head']
