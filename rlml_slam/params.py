@@ -382,6 +382,16 @@ class BackEnd(Group):
     place_distance: float = param(0.5, 'keyframes nearer than this are of one place', 'm', 0.01,
                                   100.0)  # fmt: skip
     place_heading: float = param(0.6, 'and turned by less than this', 'rad', 0.01, 3.2)
+    correction_speed: float = param(
+        0.0, 'a correction moves the robot in map to odom no faster than this; 0: at once', 'm/s',
+        0.0, 100.0,
+    )  # fmt: skip
+    correction_turn_rate: float = param(
+        0.1, 'and turns it no faster than this', 'rad/s', 0.001, 100.0
+    )
+    jump_distance: float = param(
+        0.05, 'a correction that moves the robot by more is told on jumps', 'm', 0.0, 100.0
+    )
     survey: str = param(
         '',
         'survey of reflectors (.csv, .json, SICK .imk) in map_directory; the map gets its frame',

@@ -32,6 +32,7 @@ from rlml_slam.ros.messages import make_rclpy, rclpy_class
 from rlml_slam.ros.odom_frame import OdomFrame
 from rlml_slam.ros.products import MapProducts
 from rlml_slam.ros.sensors import LATCHED
+from rlml_slam.ros.steady_odom import SteadyOdom
 from rlml_slam.ros.tf import TransformPublisher
 from rlml_slam.ros.updates import build_update
 from rlml_slam.ros.worker import Worker
@@ -82,6 +83,8 @@ class Mapper:
         self._tf = TransformPublisher(node)
         kind = rclpy_class('geometry_msgs/msg/PoseWithCovarianceStamped')
         self._correction = node.create_publisher(kind, 'correction', LATCHED)
+        self._jumps = node.create_publisher(kind, 'jumps', 10)
+        self._steady = SteadyOdom(params.back_end, self._tell_jump)
         cloud = rclpy_class('sensor_msgs/msg/PointCloud2')
         self._belief = node.create_publisher(cloud, 'belief', 5)
         self._updates = node.create_publisher(cloud, 'updates', 50)
@@ -308,8 +311,14 @@ class Mapper:
         self._sent, T = odom
         if self._mapped == self._session:  # else the worker is in another local frame
             T = se2.compose(self.back_end.T_map_local, T)
+        T = self._steady.follow(self._sent, T, self._odom.T_odom_base)
         n = self._p.node
         self._tf.publish(self._sent, (n.map_frame, n.odom_frame), T)
+
+    def _tell_jump(self, stamp: int, jump: Array) -> None:
+        base = self._p.node.base_frame
+        none = np.zeros((3, 3))
+        self._jumps.publish(build.pose_with_covariance(make_rclpy, stamp, base, jump, none))
 
     def _forget(self) -> None:
         """The local frame is another one; so is the map, but for one that is localized in."""

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from rlml_slam import se2
 from rlml_slam.se2 import Array
 from rlml_slam.types import Frame
@@ -16,6 +18,7 @@ class OdomFrame:
 
     def __init__(self) -> None:
         self.newest: tuple[int, Array] | None = None
+        self.T_odom_base = np.zeros(3)  # of the newest frame that has it
         self._has_odometry = False  # in any session: odom is the robot's, not the front end's
 
     def restart(self) -> None:
@@ -33,5 +36,6 @@ class OdomFrame:
             return
         else:  # without any odometry, odom is the local frame
             T_odom_base = frame.T_local_base
+        self.T_odom_base = T_odom_base
         T_local_odom = se2.compose(frame.T_local_base, se2.inverse(T_odom_base))
         self.newest = (frame.stamp, T_local_odom)

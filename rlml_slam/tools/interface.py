@@ -94,6 +94,8 @@ TOPICS = (
           'tells the front end of a reset, and while localizing where it is'),
     Topic('back_end', OUT, '/tf', 'tf2_msgs/TFMessage', RELIABLE,
           'map to odom only; without tf2_msgs on `~/map_to_odom` (TransformStamped)'),
+    Topic('back_end', OUT, 'jumps', POSE, RELIABLE,
+          'where a correction puts the robot, as seen from where it was believed (`base_frame`)'),
     Topic('back_end', OUT, 'map', 'nav_msgs/OccupancyGrid', LATCHED, 'the map of the scans'),
     Topic('back_end', OUT, 'map_metadata', 'nav_msgs/MapMetaData', LATCHED, 'its size and place'),
     Topic('back_end', OUT, 'trajectory', 'nav_msgs/Path', LATCHED,

@@ -151,6 +151,18 @@ def test_correction_of_one_session_is_not_of_the_next(mapper):
     np.testing.assert_allclose(se2.compose(T, ODOMETRY), [0.5, 0.0, 0.0], atol=1e-12)
 
 
+def test_correction_that_moves_the_robot_is_told(mapper, ear):
+    give(mapper, 0)
+    give(mapper, 1)
+    assert ear.sent['jumps'] == []
+    mapper.back_end.T_map_local = np.array([0.3, 0.0, 0.0])
+    stamp = give(mapper, 2)
+    (jump,) = ear.sent['jumps']
+    assert jump.header.frame_id == 'base_link'
+    assert jump.header.stamp.sec * SECOND + jump.header.stamp.nanosec == stamp
+    assert jump.pose.pose.position.x == pytest.approx(0.3, abs=1e-9)
+
+
 def test_pause_stops_the_map_but_not_map_to_odom(mapper):
     used = []
     add = mapper.back_end.add
