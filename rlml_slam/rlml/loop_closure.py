@@ -37,7 +37,7 @@ TURN = np.array([0.0, 0.0, GRID_TURN])
 OPEN = 1e-2  # [1/m², 1/rad²] an edge knows its directions to 10 m and 10 rad at the worst
 HELD = 1.0  # [m] a closure holds its place to this in any direction, or may be of another one
 COVERED = 0.8  # share of a submap's walls that a newer one must know to take its place
-RECORDS = 2000  # of closures, kept at most
+RECORDS = 2000  # of closures; beyond, the oldest rejected ones go
 NOTES = 50  # changes of the weight of a closure that are remembered
 WAITING = 60  # closures that wait for others to agree with them, the newest
 WAITS = 'waits for others that agree'
@@ -303,7 +303,10 @@ class ScanGraph:
             edge = int(new.edges[edge]) if c.accepted else -1
             same = (i, j, edge) == (c.i, c.j, c.edge)
             kept.append(c if same else replace(c, i=i, j=j, edge=edge))
-        self.closures = kept[-RECORDS:]
+        # only of a rejected one is the record all there is: of the others, an edge is in the graph
+        rejected = [k for k, c in enumerate(kept) if not c.accepted]
+        gone = set(rejected[: max(len(kept) - RECORDS, 0)])
+        self.closures = [c for k, c in enumerate(kept) if k not in gone]
 
     def _pose(self, key: Keyframe) -> Array:
         pose: Array = self._graph.poses[key.index]

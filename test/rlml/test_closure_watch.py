@@ -11,13 +11,14 @@ from numpy.testing import assert_allclose
 
 from rlml_slam import se2
 from rlml_slam.errors import InputError, MapError, SolverError
-from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.graph import Graph, Renumbering
 from rlml_slam.graph.robust import Loss, Losses, LossKind
 from rlml_slam.graph.solver import optimize
 from rlml_slam.params import Parameters
+from rlml_slam.rlml import loop_closure
 from rlml_slam.rlml.closure_table import closure_table, told, weight
 from rlml_slam.rlml.closure_watch import ClosureWatch
-from rlml_slam.rlml.loop_closure import NOTES, Closure, State
+from rlml_slam.rlml.loop_closure import NOTES, Closure, ScanGraph, State
 from rlml_slam.tools import closures as command
 from rlml_slam.tools.main import main
 from rlml_slam.types import EdgeKind
@@ -69,6 +70,24 @@ def drive():
     out = Drive()
     out.drive(3 * PER_LAP)
     return out
+
+
+def test_record_of_a_closure_stays_as_long_as_its_edge(monkeypatch):
+    """Without it, nobody would know that the closure was revoked, and it would come back."""
+    monkeypatch.setattr(loop_closure, 'RECORDS', 4)
+    scans = ScanGraph(Parameters(), Graph())
+    edges = [0, -1, -1, 1, -1, 2, -1, 3]
+    scans.closures = [Closure(k, k + 9, np.zeros(3), 0.7, e, '') for k, e in enumerate(edges)]
+    same = [np.arange(n) for n in (20, 0, 4, 0)]
+    scans.renumber(Renumbering(*same), {}, {})
+    assert [c.i for c in scans.closures] == [0, 3, 5, 7]
+    monkeypatch.setattr(loop_closure, 'RECORDS', 3)
+    scans.renumber(Renumbering(*same), {}, {})
+    assert len(scans.closures) == 4
+    monkeypatch.setattr(loop_closure, 'RECORDS', 6)
+    scans.closures = [Closure(k, k + 9, np.zeros(3), 0.7, e, '') for k, e in enumerate(edges)]
+    scans.renumber(Renumbering(*same), {}, {})
+    assert [c.i for c in scans.closures] == [0, 3, 4, 5, 6, 7]  # the oldest went
 
 
 def test_right_closures_are_noted_once_and_stay(drive):
