@@ -78,6 +78,10 @@ def _checked(group: str, f: dataclasses.Field[Any], value: Any) -> Any:
             return tuple(value)
         if not all(_is_number(v) and math.isfinite(v) for v in value):
             raise refuse('is not a list of finite numbers')
+        if len(value) != len(f.default):
+            raise refuse(f'is not a list of {len(f.default)} numbers')
+        if not all(m['low'] <= v <= m['high'] for v in value):
+            raise refuse(f'has a number outside [{m["low"]:g}, {m["high"]:g}]')
         return tuple(float(v) for v in value)
     if not _is_number(value) or not math.isfinite(value):
         raise refuse('is not a finite number')
@@ -253,11 +257,15 @@ class Submap(Group):
         (1e-4, 1e-4, 2.25e-6),
         "variance of a submap's own error, common to its scans",
         'm², m², rad²',
+        0.0,
+        100.0,
     )
     grid_bias2: tuple[float, ...] = param(
         (4e-4, 4e-4, 9e-6),
         'variance of a fix in the grid of a saved map, common to its beams',
         'm², m², rad²',
+        0.0,
+        100.0,
     )
     size: int = param(90, 'insertions that complete a submap', '', 2, 10000)
     min_travel: float = param(0.1, 'travel between two insertions', 'm', 0.0, 10.0)
@@ -280,8 +288,9 @@ class ScanMatch(Group):
     )
     min_points: int = param(20, 'scans with fewer end points are not used', '', 3, 10000)
     floor2: tuple[float, ...] = param(
-        (1e-6, 1e-6, 1e-7), 'variance of a match that more beams do not lower', 'm², m², rad²'
-    )
+        (1e-6, 1e-6, 1e-7), 'variance of a match that more beams do not lower', 'm², m², rad²',
+        0.0, 100.0,
+    )  # fmt: skip
     min_score: float = param(
         0.3, 'mean hit probability below which a match is not used', '', 0.0, 1.0
     )
@@ -351,18 +360,22 @@ class BackEnd(Group):
         choices=('relative', 'sum'),
     )  # fmt: skip
     edge_floor2: tuple[float, ...] = param(
-        (1e-6, 1e-6, 1e-7), 'variance added to every odometry edge', 'm², m², rad²'
+        (1e-6, 1e-6, 1e-7), 'variance added to every odometry edge', 'm², m², rad²', 0.0, 100.0
     )
     scan_floor2: tuple[float, ...] = param(
         (1e-4, 1e-4, 4e-6),
         'variance added to a scan edge: of what the keyframes of one submap have in common',
         'm², m², rad²',
+        0.0,
+        100.0,
     )
     submap_size: int = param(40, 'keyframes that complete a submap', '', 2, 1000)
     match_sigma: tuple[float, ...] = param(
         (0.05, 0.05, 0.02),
         "prior of a keyframe's place in its submap, from the front end",
         'm, m, rad',
+        1e-4,
+        10.0,
     )
     scan_robust_scale: float = param(3.0, 'Cauchy scale of scan edges, in sigmas', '', 0.5, 1e3)
     optimize_every: int = param(
@@ -415,8 +428,9 @@ class LoopClosure(Group):
     min_score: float = param(0.55, 'mean hit probability that a closure must reach', '', 0.1, 1.0)
     every: int = param(3, 'try every n-th keyframe', '', 1, 1000)
     floor2: tuple[float, ...] = param(
-        (1e-4, 1e-4, 1e-5), 'variance of a closure that more beams do not lower', 'm², m², rad²'
-    )
+        (1e-4, 1e-4, 1e-5), 'variance of a closure that more beams do not lower', 'm², m², rad²',
+        0.0, 100.0,
+    )  # fmt: skip
     candidates: int = param(3, 'submaps tried per keyframe, nearest first', '', 1, 100)
     max_second: float = param(0.95, 'score of the second place relative to the best', '', 0.1, 1.0)
     search_window: float = param(3.0, 'half width of the search', 'm', 0.1, 100.0)
@@ -487,7 +501,7 @@ class Deformable(Group):
         1.0, 'a feature with few sightings is dropped sooner', 's', 0.05, 1e4
     )
     start_sigma: tuple[float, ...] = param(
-        (1e-3, 1e-3, 1e-4), 'uncertainty of the first pose', 'm, m, rad'
+        (1e-3, 1e-3, 1e-4), 'uncertainty of the first pose', 'm, m, rad', 0.0, 100.0
     )
     max_iterations: int = param(5, 'Gauss-Newton iterations per update at most', '', 1, 100)
     tolerance: float = param(
@@ -611,7 +625,7 @@ class Ransac(Group):
     sigma: float = param(0.01, 'noise of a reading across its line', 'm', 1e-4, 10.0)
     sigma_floor: tuple[float, ...] = param(
         (0.01, 0.004), "error of a line's distance and direction that more readings do not lower",
-        'm, rad',
+        'm, rad', 0.0, 10.0,
     )  # fmt: skip
 
 
@@ -865,7 +879,7 @@ class Carrier(Group):
     common_drift: float = param(0.05, 'random walk of the whole carrier', 'm/sqrt(s)', 0.0, 10.0)
     odometry_sigma: tuple[float, ...] = param(
         (0.01, 0.01, 0.004), 'odometry noise along, across per speed, and of the heading',
-        'm/sqrt(s), sqrt(s), rad/sqrt(s)',
+        'm/sqrt(s), sqrt(s), rad/sqrt(s)', 0.0, 10.0,
     )  # fmt: skip
     sigma: float = param(0.02, 'noise of a detection per axis', 'm', 1e-9, 10.0)
     max_range: float = param(8.0, 'farther features are not detected', 'm', 0.5, 500.0)
@@ -900,6 +914,20 @@ class PlayerParameters:
     """Parameters of bag_player."""
 
     node: Player = Player()
+
+
+# names of the nodes that each is for
+NODES: Mapping[type[Any], tuple[str, ...]] = {
+    Parameters: ('front_end', 'back_end'),
+    EkfParameters: ('ekf_slam',),
+    DeformableParameters: ('deformable_slam',),
+    DetectorParameters: ('reflector_detector',),
+    SimulatorParameters: ('simulator',),
+    CarrierParameters: ('carrier_simulator',),
+    PlayerParameters: ('bag_player',),
+}
+# parameters that every node of ROS has
+ROS_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 
 
 @dataclass(frozen=True)
@@ -965,8 +993,13 @@ def flatten(tree: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
     return flat
 
 
-def read_yaml(path: str | Path) -> dict[str, Any]:
-    """The flat parameters of a ROS parameter file (``/**: ros__parameters: ...``)."""
+def read_yaml(path: str | Path, of: type[Any] = Parameters) -> dict[str, Any]:
+    """The flat parameters for the nodes of ``of`` in a ROS parameter file, which others may share.
+
+    Sections are those of a node (``front_end: ros__parameters: ...``), in whatever namespace, or
+    of all nodes (``/**``). What another node of this package knows is left to that one. Raises
+    FileFormatError for another kind of file, ParameterError for a name that no node knows.
+    """
     try:
         tree = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
     except OSError as e:
@@ -975,9 +1008,27 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
         raise FileFormatError(f'{path}: not YAML: {str(e).splitlines()[0]}') from e
     if not isinstance(tree, Mapping):
         raise FileFormatError(f'{path}: no parameters in it')
-    flat: dict[str, Any] = {}
-    for node, body in tree.items():
-        if not isinstance(body, Mapping) or not isinstance(body.get('ros__parameters'), Mapping):
-            raise FileFormatError(f'{path}: {node!r} has no ros__parameters')
-        flat.update(flatten(body['ros__parameters']))
-    return flat
+    ours = ('**', '*', *NODES[of])
+    sections = [flat for name, flat in _sections(tree, str(path)) if name in ours]
+    if not sections:
+        raise FileFormatError(f'{path}: no section of {" or ".join(NODES[of])}, nor of /**')
+    known = {d.name for d in declarations(of)}
+    foreign = {d.name for other in NODES for d in declarations(other)} - known
+    return {
+        name: value
+        for section in sections
+        for name, value in section.items()
+        if name not in foreign and not name.startswith(ROS_OWN)
+    }
+
+
+def _sections(tree: Mapping[str, Any], path: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Name of the node, without its namespace, and flat parameters of each section of a file."""
+    for key, body in tree.items():
+        if not isinstance(body, Mapping):
+            raise FileFormatError(f'{path}: {key!r} has no ros__parameters')
+        parameters = body.get('ros__parameters')
+        if isinstance(parameters, Mapping):
+            yield str(key).rsplit('/')[-1], flatten(parameters)
+        else:
+            yield from _sections(body, path)

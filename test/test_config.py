@@ -12,13 +12,12 @@ from xml.etree import ElementTree
 import pytest
 
 from rlml_slam import __version__
+from rlml_slam.errors import FileFormatError, ParameterError
 from rlml_slam.params import (
-    CarrierParameters,
-    DeformableParameters,
+    NODES,
     DetectorParameters,
     EkfParameters,
     Parameters,
-    PlayerParameters,
     SimulatorParameters,
     declarations,
     flatten,
@@ -28,16 +27,7 @@ from rlml_slam.params import (
 from rlml_slam.tools.config import FILES, parameter_file
 
 ROOT = Path(__file__).resolve().parents[1]
-ALL = (
-    Parameters,
-    EkfParameters,
-    DeformableParameters,
-    DetectorParameters,
-    SimulatorParameters,
-    CarrierParameters,
-    PlayerParameters,
-)
-KNOWN = {d.name for of in ALL for d in declarations(of)}
+KNOWN = {d.name for of in NODES for d in declarations(of)}
 
 
 @pytest.mark.parametrize('name', FILES)
@@ -48,7 +38,7 @@ def test_parameter_files_are_what_is_declared(name):
 @pytest.mark.parametrize('name', FILES)
 def test_parameter_files_give_the_defaults(name):
     of, _ = FILES[name]
-    assert from_mapping(read_yaml(ROOT / 'config' / name), of) == of()
+    assert from_mapping(read_yaml(ROOT / 'config' / name, of), of) == of()
 
 
 @pytest.mark.parametrize('path', sorted((ROOT / 'config').glob('*.yaml')), ids=lambda p: p.name)
@@ -57,19 +47,89 @@ def test_parameter_files_name_no_unknown_parameter(path):
 
 
 def test_every_parameter_says_what_it_is():
-    for of in ALL:
+    for of in NODES:
         for d in declarations(of):
             assert len(d.meaning) > 5, d.name
             assert d.low <= d.high, d.name
 
 
 def test_defaults_lie_inside_their_bounds():
-    for of in ALL:
+    for of in NODES:
         from_mapping({d.name: d.default for d in declarations(of)}, of)
 
 
 def test_nested_yaml_is_flattened_as_ros_does():
     assert flatten({'a': {'b': {'c': 1}}, 'd': 2}) == {'a.b.c': 1, 'd': 2}
+
+
+SHARED = """
+/**:
+  ros__parameters: {use_sim_time: true, odom_topic: wheels, detector.threshold: fixed}
+/robot1/front_end:
+  ros__parameters: {submap: {size: 80}}
+back_end: {ros__parameters: {map_file_name: hall, qos_overrides: {/clock: {depth: 1}}}}
+simulator:
+  ros__parameters: {laser_frame: eye}
+controller_server:
+  ros__parameters: {use_odom: false, FollowPath: {plugin: dwb}}
+local_costmap:
+  local_costmap:
+    ros__parameters: {resolution: 0.1}
+"""
+
+
+@pytest.mark.parametrize(
+    ('of', 'values'),
+    [
+        (Parameters, {'odom_topic': 'wheels', 'submap.size': 80, 'map_file_name': 'hall'}),
+        (EkfParameters, {'odom_topic': 'wheels'}),
+        (DetectorParameters, {'odom_topic': 'wheels', 'detector.threshold': 'fixed'}),
+        (SimulatorParameters, {'laser_frame': 'eye'}),
+    ],
+)
+def test_one_file_may_serve_all_nodes_of_a_robot(of, values, tmp_path):
+    path = tmp_path / 'robot.yaml'
+    path.write_text(SHARED)
+    assert read_yaml(path, of) == values
+
+
+@pytest.mark.parametrize(
+    ('text', 'why'),
+    [
+        ('controller_server: {ros__parameters: {use_odom: false}}', 'no section of front_end or'),
+        ('use_odom: false', "'use_odom' has no ros__parameters"),
+        ('[1, 2]', 'no parameters in it'),
+        ('a: [', 'not YAML'),
+    ],
+)
+def test_file_without_parameters_of_the_nodes_is_refused(text, why, tmp_path):
+    path = tmp_path / 'robot.yaml'
+    path.write_text(text)
+    with pytest.raises(FileFormatError, match=why):
+        read_yaml(path)
+
+
+def test_misspelt_parameter_is_refused(tmp_path):
+    path = tmp_path / 'robot.yaml'
+    path.write_text('front_end: {ros__parameters: {use_odon: false}}')
+    with pytest.raises(ParameterError, match="unknown parameter 'use_odon'; known are use_odom"):
+        from_mapping(read_yaml(path))
+
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'why'),
+    [
+        ('map_start_pose', [1.0], r'Node.map_start_pose = \[1.0\] is not a list of 3 numbers'),
+        ('laser_pose', [], 'is not a list of 3 numbers'),
+        ('laser_pose', [0.0, 0.0, 0.0, 0.0], 'is not a list of 3 numbers'),
+        ('submap.bias2', [-1.0, 0.0, 0.0], r'has a number outside \[0, 100\]'),
+        ('loop_closure.floor2', [0.0, 0.0, -1e-9], r'has a number outside \[0, 100\]'),
+        ('back_end.match_sigma', [0.0, 0.1, 0.1], r'has a number outside \[0.0001, 10\]'),
+    ],
+)
+def test_lists_are_checked_for_length_and_range(name, value, why):
+    with pytest.raises(ParameterError, match=why):
+        from_mapping({name: value})
 
 
 def test_versions_agree():

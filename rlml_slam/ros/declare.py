@@ -16,29 +16,13 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.parameter import Parameter
 
 from rlml_slam.params import (
-    CarrierParameters,
+    NODES,
+    ROS_OWN,
     Declaration,
-    DeformableParameters,
-    DetectorParameters,
-    EkfParameters,
     Parameters,
-    PlayerParameters,
-    SimulatorParameters,
     declarations,
     from_mapping,
 )
-
-AGGREGATES: tuple[type[Any], ...] = (
-    Parameters,
-    EkfParameters,
-    DeformableParameters,
-    DetectorParameters,
-    SimulatorParameters,
-    CarrierParameters,
-    PlayerParameters,
-)
-# rclpy's own, which it takes from the same overrides
-_OWN = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 
 
 def declare(node: Any, of: type[Any] = Parameters) -> Any:
@@ -50,9 +34,9 @@ def declare(node: Any, of: type[Any] = Parameters) -> Any:
     given = {name: p.value for name, p in node._parameter_overrides.items()}
     known = {d.name: d for d in declarations(of)}
     parameters = from_mapping({n: v for n, v in given.items() if n in known}, of)
-    everywhere = [d.name for aggregate in AGGREGATES for d in declarations(aggregate)]
+    everywhere = [d.name for other in NODES for d in declarations(other)]
     for name in sorted(given.keys() - set(everywhere)):
-        if not name.startswith(_OWN):
+        if not name.startswith(ROS_OWN):
             near = difflib.get_close_matches(name, known, n=1)
             hint = f'; is {near[0]!r} meant?' if near else ''
             node.get_logger().warning(f'unknown parameter {name!r} has no effect{hint}')

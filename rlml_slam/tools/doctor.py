@@ -66,7 +66,10 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Look at the bag, print what is seen and draw it."""
-    values = {**(read_yaml(args.config) if args.config else {}), 'detector.threshold': 'automatic'}
+    values = {
+        **(read_yaml(args.config, DetectorParameters) if args.config else {}),
+        'detector.threshold': 'automatic',
+    }
     given: DetectorParameters = from_mapping(values, DetectorParameters)
     evidence = gather(args.bag, args.topic, given, args.json)
     figures = examine(evidence, given.detector)

@@ -82,7 +82,7 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Replay, write the results, and say what they are."""
     kind = SYSTEMS[args.system][0]
-    params = from_mapping(read_yaml(args.config), kind) if args.config else kind()
+    params = from_mapping(read_yaml(args.config, kind), kind) if args.config else kind()
     if args.no_odometry:
         params = replace(params, node=replace(params.node, use_odom=False))
     make_folder(args.out)  # before the work, not after it

@@ -57,7 +57,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def parameters_of(args: argparse.Namespace) -> SimulatorParameters:
     """The parameters of the file, then of --set, then of the other options."""
-    values: dict[str, Any] = read_yaml(args.config) if args.config else {}
+    values: dict[str, Any] = read_yaml(args.config, SimulatorParameters) if args.config else {}
     values.update(_assignment(text) for text in args.set)
     values['world'] = args.world
     for name in ('seed', 'duration'):

@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     """Run all parts and print their figures."""
     if min(args.scans, args.rooms) < 1 or args.drive <= 0.0:
         raise ParameterError('study detector: --scans, --rooms and --drive must be positive')
-    values = read_yaml(args.config) if args.config else {}
+    values = read_yaml(args.config, DetectorParameters) if args.config else {}
     given: DetectorParameters = from_mapping(values, DetectorParameters)
     p, laser = given.detector, Laser()
     summary: dict[str, Any] = {'cylinders': []}

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from rlml_slam.errors import ParameterError
-from rlml_slam.params import read_yaml
+from rlml_slam.params import EkfParameters, read_yaml
 from rlml_slam.tools import study_ekf_consistency as consistency
 from rlml_slam.tools import study_ekf_drives as drives
 from rlml_slam.tools import study_ekf_speed as speed
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     if args.seeds < 1 or args.jobs < 1 or known < 0:
         raise ParameterError('study ekf: --seeds and --jobs must be 1 or more')
     began = time.perf_counter()
-    values = read_yaml(args.config) if args.config else {}
+    values = read_yaml(args.config, EkfParameters) if args.config else {}
     tasks = [
         (w, s, values, tuple(args.system), args.duration)
         for w in args.world

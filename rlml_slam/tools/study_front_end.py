@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     if args.seeds < 1 or args.jobs < 1:
         raise ParameterError('study worlds: --seeds and --jobs must be 1 or more')
     params = from_mapping(read_yaml(args.config)) if args.config else Parameters()
-    simulator = read_yaml(args.simulator) if args.simulator else {}
+    simulator = read_yaml(args.simulator, SimulatorParameters) if args.simulator else {}
     cases = [
         Case(world, seed, not args.no_reflectors)
         for world in args.world

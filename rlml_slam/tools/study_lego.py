@@ -68,7 +68,7 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the system, print the figures, draw the picture."""
     data = read_lego(args.folder)
-    result = drive(data, read_yaml(args.config) if args.config else {})
+    result = drive(data, read_yaml(args.config, EkfParameters) if args.config else {})
     figures = judge(data, result) | judge_scale(data, result)
     if args.out is not None:
         write_atomically(args.out, picture(data, result))

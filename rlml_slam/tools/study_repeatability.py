@@ -48,7 +48,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a row for each extractor."""
-    values = read_yaml(args.config) if args.config else {}
+    values = read_yaml(args.config, EkfParameters) if args.config else {}
     params: EkfParameters = from_mapping({**PARAMETERS, **values}, EkfParameters)
     log = read_carmen(args.log)
     path = Trajectory(

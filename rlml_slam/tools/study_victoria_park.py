@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the systems, print the figures, draw the picture."""
     data = read_victoria_park(args.folder)
     params: EkfParameters = from_mapping(
-        read_yaml(args.config) if args.config else {}, EkfParameters
+        read_yaml(args.config, EkfParameters) if args.config else {}, EkfParameters
     )
     results = {s: drive(data, s, params, args.duration, args.json) for s in args.system}
     figures = {s: judge(r, data.gps) for s, r in results.items()}

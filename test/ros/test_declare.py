@@ -14,8 +14,8 @@ from rclpy.node import Node  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 
 from rlml_slam.errors import ParameterError  # noqa: E402
-from rlml_slam.params import Parameters, declarations  # noqa: E402
-from rlml_slam.ros.declare import AGGREGATES, declare  # noqa: E402
+from rlml_slam.params import NODES, Parameters, declarations  # noqa: E402
+from rlml_slam.ros.declare import declare  # noqa: E402
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def warnings_of(node, monkeypatch):
     return said
 
 
-@pytest.mark.parametrize('of', AGGREGATES, ids=lambda of: of.__name__)
+@pytest.mark.parametrize('of', NODES, ids=lambda of: of.__name__)
 def test_every_parameter_is_declared_with_its_default_and_documented(make_node, of):
     node = make_node()
     assert declare(node, of) == of()
