@@ -9,13 +9,17 @@ this cell; at an empty place something is detected with q, the density of ghosts
 
 and they stay within the odds of ``reflector.gone`` either way, for anything may be moved later.
 A probability of the reflector alone would not do: a flat one, or one behind a corner that the
-beams pass, is missed from the same places again and again.
+beams pass, is missed from the same places again and again. Misses in a row have a common cause
+now and then, such as a person whom the beams of a coarse scan pass: with the probability h, a
+reflector that is there is hidden for the whole WHILE, so that its misses multiply the odds by
+h + (1 - h) prod (1 - p) / (1 - q), and not by the product alone.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +35,18 @@ from rlml_slam.se2 import Array
 
 APART = 0.5  # [m] side of a cell, and travel between two misses that count: nearer ones are alike
 YOUNG = 30  # sightings after which it is settled whether a reflector is new
+# Both by judgement: people pass, and what stays for longer is larger than the gaps of a scan.
+HIDDEN, WHILE = 0.05, 10_000_000_000  # h, and [ns] how long that lasts
 TWO = 2.0  # looks that a cell begins with, one of them a miss (Laplace)
+
+
+@dataclass
+class _Misses:
+    """Those of one WHILE: when it began, the log odds of then, and what the misses add to them."""
+
+    since: int
+    odds: float
+    sum: float = 0.0
 
 
 class Presence:
@@ -45,20 +60,23 @@ class Presence:
         self._graph = graph
         self._reflectors = reflectors
         self._missed: dict[int, Array] = {}  # from where, the last time that counted, by key
+        self._misses: dict[int, _Misses] = {}
 
     def look(self, keys: Sequence[Keyframe], interval: Interval) -> tuple[int, ...]:
         """Weigh what was seen near the newest keyframe; keys of those that were given up."""
         key = keys[-1]
         key.looked = interval.looked
-        if not (self._p.gone and interval.looked) or key.points is None or key.origin is None:
-            return ()
         alive = self._reflectors.alive()
+        if not (alive and self._p.gone and interval.looked):
+            return ()
+        if key.points is None or key.origin is None:
+            return ()
         pose = self._graph.poses[key.index]
         places = self._graph.landmarks[[m.index for m in alive]].reshape(-1, 2)
         seen, near = self._seen(alive, se2.transform(se2.inverse(pose), places), interval)
         cell = cell_of(pose)
-        missed = np.array([not s and cell in m.views for s, m in zip(seen, alive, strict=True)])
-        missed &= ~near
+        known = np.array([cell in m.views for m in alive], dtype=np.bool_)
+        missed = known & ~seen & ~near
         if missed.any():
             scan = key.points.astype(np.float64)
             missed &= expected(pose, places, scan, key.origin, math.inf)
@@ -68,12 +86,13 @@ class Presence:
         gone = []
         for k in np.flatnonzero(seen | missed).tolist():
             m = alive[k]
-            if self._weigh(m, bool(seen[k]), pose, cell):
+            if self._weigh(m, bool(seen[k]), pose, interval.last_look):
                 gone.append(m)
             elif seen[k] and not m.life.is_new and m.life.hits < YOUNG:
                 m.life.is_new = self._was_absent(m, keys[:-1])
         for m in gone:
             self._missed.pop(m.key, None)
+            self._misses.pop(m.key, None)
         return self._reflectors.give_up(gone)
 
     def _seen(
@@ -87,28 +106,35 @@ class Presence:
         seen = np.array([m.key in keys for m in alive], dtype=np.bool_)
         mapped = {m.key for m in alive}
         others = [z for k, z in interval.detected if self._reflectors.resolve(k) not in mapped]
-        if not others or not len(alive):
+        if not others:
             return seen, np.zeros(len(alive), dtype=np.bool_)
         gap = np.linalg.norm(places[:, None] - np.array(others)[None], axis=-1)
         near: NDArray[np.bool_] = gap.min(axis=1) < 2.0 * self._p.min_separation
         return seen, near
 
-    def _weigh(self, m: Landmark, is_seen: bool, pose: Array, cell: Cell) -> bool:
+    def _weigh(self, m: Landmark, is_seen: bool, pose: Array, stamp: int) -> bool:
         """Bayes' rule for one look; whether the reflector is to be given up."""
-        last = self._missed.get(m.key)
+        last, cell, life = self._missed.get(m.key), cell_of(pose), m.life
         if not is_seen:
             if last is not None and np.hypot(*(pose[:2] - last)) < APART:
                 return False
             self._missed[m.key] = pose[:2].copy()
         hits, misses = m.views.get(cell, (0, 0))
         m.views[cell] = (hits + is_seen, misses + (not is_seen))
-        m.life.hits += is_seen
-        m.life.misses += not is_seen
+        life.hits += is_seen
+        life.misses += not is_seen
         p, q = (0.5 * TWO + hits) / (TWO + hits + misses), self._empty
         most = math.log((1.0 - self._p.gone) / self._p.gone)
-        m.life.odds += math.log(p / q) if is_seen else math.log((1.0 - p) / (1.0 - q))
-        m.life.odds = min(m.life.odds, most)
-        return m.life.odds < -most
+        if is_seen:
+            self._misses.pop(m.key, None)
+            life.odds = min(life.odds + math.log(p / q), most)
+            return False
+        row = self._misses.get(m.key)
+        if row is None or not 0 <= stamp - row.since < WHILE:
+            row = self._misses[m.key] = _Misses(stamp, life.odds)
+        row.sum += math.log((1.0 - p) / (1.0 - q))
+        life.odds = row.odds + math.log(HIDDEN + (1.0 - HIDDEN) * math.exp(row.sum))
+        return life.odds < -most
 
     def _was_absent(self, m: Landmark, keys: Sequence[Keyframe]) -> bool:
         """Whether keyframes before its first sighting would have seen it, had it been there.

@@ -14,7 +14,7 @@ from rlml_slam.rlml import stored_map
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.keyframes import Interval, Sighting
 from rlml_slam.rlml.landmark import Landmark
-from rlml_slam.rlml.presence import Presence
+from rlml_slam.rlml.presence import HIDDEN, WHILE, Presence
 from rlml_slam.rlml.reflector_graph import ReflectorGraph
 from rlml_slam.rlml.reflector_states import reflector_states, state_table
 from rlml_slam.rlml.slam import Slam
@@ -62,11 +62,11 @@ def by_state(back_end):
 
 @pytest.fixture(scope='module')
 def changed():
-    """Three laps; then one reflector is moved, one missing and one new; six laps more."""
+    """Three laps; then one reflector is moved, one missing and one new; ten laps more."""
     slam = Slam(PARAMS)
     laps(slam, ROOM, 3)
     before = by_state(slam.back_end)
-    laps(slam, replace(ROOM, reflectors=CHANGED), 6, start=3)
+    laps(slam, replace(ROOM, reflectors=CHANGED), 10, start=3)
     slam.finish()
     return slam, before
 
@@ -137,7 +137,7 @@ def test_hidden_reflector_stays_in_the_map():
     x, y = ROOM.reflectors[0]
     rack = polygon((x + 0.3, y - 0.2), (x + 0.8, y - 0.2), (x + 0.8, y + 0.9), (x + 0.3, y + 0.9))
     hidden = TinyWorld(np.vstack([ROOM.walls, rack]), np.delete(ROOM.reflectors, 0, axis=0))
-    laps(slam, hidden, 5, start=3)
+    laps(slam, hidden, 8, start=3)
     found = by_state(slam.back_end)
     assert len(found['present']) == len(ROOM.reflectors)
     assert 'missing' not in found
@@ -146,40 +146,70 @@ def test_hidden_reflector_stays_in_the_map():
 def test_blind_detector_empties_no_map():
     slam = Slam(PARAMS)
     laps(slam, ROOM, 3)
-    laps(slam, ROOM.without_reflectors(), 5, start=3)
+    laps(slam, ROOM.without_reflectors(), 8, start=3)
     assert len(by_state(slam.back_end)['present']) == len(ROOM.reflectors)
+
+
+def test_hall_without_reflectors_is_mapped():
+    slam = Slam(PARAMS)
+    assert laps(slam, ROOM.without_reflectors(), 1)
+    assert slam.back_end.reflector_states() == []
 
 
 def test_nothing_is_given_up_where_that_is_not_wanted():
     params = replace(PARAMS, reflector=replace(PARAMS.reflector, gone=0.0))
     slam = Slam(params)
     laps(slam, ROOM, 3)
-    laps(slam, replace(ROOM, reflectors=CHANGED), 5, start=3)
+    laps(slam, replace(ROOM, reflectors=CHANGED), 8, start=3)
     assert 'missing' not in by_state(slam.back_end)
     assert len(slam.reflectors()) == len(ROOM.reflectors) + 2
 
 
 def test_odds_follow_bayes():
     graph = Graph()
-    reflectors = ReflectorGraph(PARAMS.reflector, graph)
-    presence = Presence(PARAMS, graph, reflectors)
-    m, pose, cell = Landmark(0), np.zeros(3), (0, 0)
+    presence = Presence(PARAMS, graph, ReflectorGraph(PARAMS.reflector, graph))
+    m, pose = Landmark(0), np.zeros(3)
     empty = PARAMS.reflector.density * math.pi * PARAMS.reflector.min_separation**2
-    m.views[cell] = (2, 1)
-    assert not presence._weigh(m, False, pose, cell)
-    p = (1 + 2) / (2 + 3)
-    assert m.life.odds == pytest.approx(math.log((1 - p) / (1 - empty)), rel=1e-12)
+    m.views[0, 0] = (2, 1)
+    assert not presence._weigh(m, False, pose, SECOND)
+    first = (1 - 3 / 5) / (1 - empty)  # (1 + 2) of (2 + 3)
+    assert m.life.odds == pytest.approx(math.log(HIDDEN + (1 - HIDDEN) * first), rel=1e-12)
     # from the same spot, the same miss tells nothing more
     before = m.life.odds
-    presence._weigh(m, False, np.array([0.2, 0.0, 0.0]), cell)
+    presence._weigh(m, False, np.array([0.2, 0.0, 0.0]), SECOND)
     assert m.life.odds == before
-    presence._weigh(m, True, pose, cell)
-    p = (1 + 2) / (2 + 4)
-    assert m.life.odds == pytest.approx(before + math.log(p / empty), rel=1e-12)
+    # a moment later they have a common cause now and then
+    presence._weigh(m, False, np.array([0.7, 0.0, 0.0]), 2 * SECOND)
+    both = first * 0.5 / (1 - empty)
+    assert m.life.odds == pytest.approx(math.log(HIDDEN + (1 - HIDDEN) * both), rel=1e-12)
+    # much later they have not
+    before = m.life.odds
+    presence._weigh(m, False, np.array([1.7, 0.0, 0.0]), SECOND + WHILE)
+    once = HIDDEN + (1 - HIDDEN) * 0.5 / (1 - empty)
+    assert m.life.odds == pytest.approx(before + math.log(once), rel=1e-12)
+    before = m.life.odds
+    presence._weigh(m, True, pose, SECOND + WHILE)
+    assert m.life.odds == pytest.approx(before + math.log(3 / 6 / empty), rel=1e-12)
     for k in range(20):
-        presence._weigh(m, True, np.array([1.0 * k, 0.0, 0.0]), (k, 1))
+        presence._weigh(m, True, np.array([1.0 * k, 0.0, 0.0]), SECOND)
     gone = PARAMS.reflector.gone
     assert m.life.odds == pytest.approx(math.log((1 - gone) / gone), rel=1e-12)
+
+
+def test_no_single_while_ends_a_reflector():
+    """However often it is missed meanwhile, from wherever it was always seen."""
+    graph = Graph()
+    presence = Presence(PARAMS, graph, ReflectorGraph(PARAMS.reflector, graph))
+    m = Landmark(0)
+    for k in range(100):
+        m.views[2 * k, 0] = (1000, 0)
+    m.life.odds = math.log((1 - PARAMS.reflector.gone) / PARAMS.reflector.gone)
+    given_up = [
+        presence._weigh(m, False, np.array([1.0 * k, 0.0, 0.0]), SECOND + k * WHILE // 20)
+        for k in range(100)
+    ]
+    assert not any(given_up[:80])
+    assert given_up[-1]
 
 
 def test_candidates_do_not_pile_up():
