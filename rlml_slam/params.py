@@ -143,6 +143,9 @@ class Node(Group):
     laser_pose: tuple[float, ...] = param(
         (0.0, 0.0, 0.0), 'pose of the laser in base_frame where no /tf_static tells', 'm, m, rad'
     )
+    laser_upside_down: bool = param(
+        False, 'the laser hangs upside down, its x axis at laser_pose, where no /tf_static tells'
+    )
     transform_publish_period: float = param(0.02, 'period of map to odom on /tf', 's', 0.001, 10.0)
     transform_timeout: float = param(
         0.2, 'longest wait of a scan for the odometry at its stamp', 's', 0.0, 10.0

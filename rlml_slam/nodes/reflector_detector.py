@@ -17,6 +17,7 @@ from rlml_slam.ros.detector_health import DetectorHealth
 from rlml_slam.ros.messages import make_rclpy, rclpy_class
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensors import SENSOR, Sensors
+from rlml_slam.sensing.mirror import mirrored_detections
 from rlml_slam.sensing.reflector_detector import detect
 from rlml_slam.types import Observation
 
@@ -47,6 +48,8 @@ class ReflectorDetectorNode(Node):
             return
         found = detect(scan, self.params.detector)
         seen = found.at_stamp(scan, observation.T_base_laser, observation.sweep)
+        if self.sensors.hangs(scan.frame_id):
+            seen = mirrored_detections(seen)  # as the laser has them
         if len(scan.intensities):  # without any, nothing was looked at
             self._publisher.publish(build.detections(make_rclpy, seen, found.intensities))
         self.health.update(scan, found)

@@ -27,6 +27,7 @@ MIN_UPRIGHT = math.cos(MAX_TILT)
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # (x, y, yaw) of ROS's 6 x 6 covariances
 MAX_VARIANCE = 1e6  # [m^2], [rad^2] of a start: from 1e9 or so, updates lose all their digits
 _ROUNDING = 1e-9  # of the largest variance
+FARTHEST = 1e4  # [m] beyond any laser
 _NEAR = 1e-3  # [m] nearer than this a bearing has no meaning
 
 
@@ -65,7 +66,10 @@ def stamp(msg: Any, topic: str) -> int:
 
 
 def scan(msg: Any, topic: str = 'scan') -> Scan:
-    """LaserScan; ranges are passed on as they are, NaN and Inf included."""
+    """LaserScan; ranges are passed on as they are, NaN and Inf included.
+
+    A range_max of Inf says that the driver does not know it, not that Inf is a range.
+    """
     ranges = np.array(msg.ranges, dtype=np.float32)
     intensities = np.array(msg.intensities, dtype=np.float32)
     if intensities.size and intensities.shape != ranges.shape:
@@ -77,7 +81,7 @@ def scan(msg: Any, topic: str = 'scan') -> Scan:
         float(msg.angle_increment),
         float(msg.time_increment),
         float(msg.range_min),
-        float(msg.range_max),
+        min(float(msg.range_max), FARTHEST),
         ranges,
         intensities,
     )

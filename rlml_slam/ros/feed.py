@@ -12,6 +12,7 @@ from rlml_slam.ros import convert
 from rlml_slam.ros.convert import frame
 from rlml_slam.ros.tf import Extrinsics
 from rlml_slam.se2 import Array
+from rlml_slam.sensing.mirror import mirrored_detections, mirrored_scan
 from rlml_slam.sensing.sequence import Inputs
 from rlml_slam.types import Detections, Imu, Odometry, Scan
 
@@ -61,8 +62,8 @@ class Feed(Generic[Out]):
     """Converts the messages of the streams (keys of STREAMS) and hands them to a target.
 
     ``extrinsics`` is filled by the caller from /tf_static; a sensor that it does not know gets
-    the parameter ``laser_pose``. A message that cannot be believed is counted in ``inputs``; only
-    a clock that jumped back raises InputError.
+    the parameters ``laser_pose`` and ``laser_upside_down``. A message that cannot be believed is
+    counted in ``inputs``; only a clock that jumped back raises InputError.
     """
 
     def __init__(self, params: Parameters, target: Target[Out], inputs: Inputs) -> None:
@@ -101,15 +102,23 @@ class Feed(Generic[Out]):
             self._placed.add(sensor)
         return True
 
+    def hangs(self, sensor: str) -> bool:
+        """Whether a sensor hangs upside down, by /tf_static or else by the parameter."""
+        base = self._p.node.base_frame
+        if sensor == base or self.extrinsics.up(base, sensor) is None:
+            return sensor != base and self._p.node.laser_upside_down
+        return self.extrinsics.hangs(base, sensor)
+
     def _converted(self, stream: str, msg: Any) -> Odometry | Imu | Scan | Detections:
         noise = self._p.reflector
         if stream == 'scan':
-            return convert.scan(msg)
+            scan = convert.scan(msg)
+            return mirrored_scan(scan) if self.hangs(scan.frame_id) else scan
         if stream == 'odom':
             return convert.odometry(msg)
         if stream == 'imu':
             up = self.extrinsics.up(self._p.node.base_frame, frame(msg.header.frame_id))
             return convert.imu(msg, up=up)
-        if stream == 'reflectors':
-            return convert.detections(msg, noise)
-        return convert.detections_of_poses(msg, noise)
+        read = convert.detections if stream == 'reflectors' else convert.detections_of_poses
+        seen = read(msg, noise)
+        return mirrored_detections(seen) if self.hangs(seen.frame_id) else seen

@@ -29,6 +29,7 @@ DEPTH = 200
 MOTION_DEPTH = 2000
 SENSOR = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 MOTION = QoSProfile(depth=MOTION_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+PATIENCE = 5.0  # [s] of the wall clock, after which it is told what has never come
 SILENCE = 1.0  # [s] of the wall clock without any message, after which nothing more is waited for
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -58,12 +59,14 @@ class Sensors:
         self._waits = subscribe_static(node, self._feed.extrinsics)
         self._held: list[tuple[str, Any]] = []
         self._queues: list[tuple[str, Any]] = []
-        self._heard = time.monotonic()
+        self._heard = self._began = time.monotonic()
+        self._told: set[str] = set()
         for stream in streams:
             # without scan matching, a scan still asks for a pose at its stamp
             if getattr(params.node, USED_BY[stream]) or stream == 'scan':
                 for topic in topics_of(params.node, stream):
                     self._subscribe(node, stream, topic)
+        self._missing = [k for k, (s, _) in enumerate(self._queues) if s in ('scan', 'odom')]
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(0.25 * SILENCE, self.flush_if_silent, clock=steady)
 
@@ -84,6 +87,10 @@ class Sensors:
         """Where the sensors sit, as far as /tf_static has told."""
         return self._feed.extrinsics
 
+    def hangs(self, sensor: str) -> bool:
+        """Whether a sensor hangs upside down."""
+        return self._feed.hangs(sensor)
+
     def receive(self, index: int, msg: Any) -> None:
         """One message of a queue, and all that have arrived in the others as well, by stamp.
 
@@ -101,6 +108,7 @@ class Sensors:
         queues = {k: first.get(k, []) + self._taken(k) for k in reversed(range(len(self._queues)))}
         count = 0
         ordered = (queues[k] for k in range(len(self._queues)))
+        self._missing = [k for k in self._missing if not queues[k]]
         for item in heapq.merge(*ordered, key=lambda item: _stamp(item[1])):
             self.add(*item)
             count += 1
@@ -108,10 +116,27 @@ class Sensors:
 
     def flush_if_silent(self) -> None:
         """Where nothing has come for a while: a pose for the scan that waits for odometry."""
+        self._tell_of_missing()
         if self._take({}) or time.monotonic() - self._heard < SILENCE:
             return
         for observation in self.sequencer.flush():
             self._handle(observation)
+
+    def _tell_of_missing(self) -> None:
+        """Say once which scans and odometry have never come, PATIENCE after the start."""
+        if self._missing and time.monotonic() - self._began > PATIENCE:
+            missing = [
+                f'{self._queues[k][0]} on {self._queues[k][1].topic_name}' for k in self._missing
+            ]
+            self._logger.warning(f'waiting for {", ".join(missing)}')
+            self._missing = []
+
+    def _tell_of_refused(self) -> None:
+        """Say of each stream once why an input was not used; /diagnostics count all of them."""
+        for stream, error in self.sequencer.inputs.first_errors.items():
+            if stream not in self._told:
+                self._told.add(stream)
+                self._logger.warning(f'{stream}: not used: {error}')
 
     def _taken(self, index: int) -> list[tuple[str, Any]]:
         """Everything in a queue, in order of arrival."""
@@ -174,6 +199,7 @@ class Sensors:
             self._begin(self.extrinsics)
             self._restart()
             return
+        self._tell_of_refused()
         for observation in observations:
             self._handle(observation)
 

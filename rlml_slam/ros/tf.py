@@ -18,6 +18,7 @@ from rlml_slam.ros.messages import make_rclpy, rclpy_class
 from rlml_slam.se2 import Array
 
 TF_MESSAGE = 'tf2_msgs/msg/TFMessage'
+HALF_TURN = np.diag([1.0, -1.0, -1.0])  # about the x axis
 
 
 class Extrinsics:
@@ -34,13 +35,21 @@ class Extrinsics:
     def pose(self, base: str, frame: str) -> Array | None:
         """Planar T_base_frame (3,), None if the tree does not connect the two.
 
-        Raises InputError if the sensor is tilted against the base.
+        Of a sensor that hangs upside down, it is that of one which stands there upright, with its
+        x axis in the same direction. Raises InputError if the sensor is tilted against the base.
         """
         found = self._between(base, frame)
         if found is None:
             return None
         R, t = found
+        if R[2, 2] < 0.0:
+            R = R @ HALF_TURN
         return np.array([t[0], t[1], convert.yaw(R, f'{base} to {frame}')])
+
+    def hangs(self, base: str, frame: str) -> bool:
+        """Whether a sensor is known to hang upside down."""
+        up = self.up(base, frame)
+        return up is not None and float(up[2]) < 0.0
 
     def up(self, base: str, frame: str) -> Array | None:
         """The base z axis (3,) in the sensor's frame, None if the tree does not connect them."""

@@ -50,6 +50,7 @@ class Inputs:
 
     counts: dict[str, Counter[str]] = field(default_factory=dict)
     last_error: str = ''
+    first_errors: dict[str, str] = field(default_factory=dict)
 
     def count(self, stream: str, what: str, error: str = '') -> None:
         """One more input of ``stream`` that was ``what``."""
@@ -58,6 +59,7 @@ class Inputs:
         self.counts[stream][what] += 1
         if error:
             self.last_error = error
+            self.first_errors.setdefault(stream, error)
 
     def totals(self) -> dict[str, dict[str, int]]:
         """Plain dictionaries, sorted, for reports."""

@@ -64,7 +64,7 @@ def source(args: argparse.Namespace, bag: BagReader, inputs: BagInputs) -> Sourc
     # nodes listen to the topics that replay takes
     system: dict[str, Any] = {STREAMS[s][0]: topic for s, topic in inputs.topics.items()}
     sensor = next(s for s in ('scan', 'reflectors', 'reflector_poses') if s in inputs.topics)
-    system['laser_pose'] = sensor_pose(bag, inputs, inputs.topics[sensor])
+    system |= sensor_place(bag, inputs, inputs.topics[sensor])
     return Source(
         f'{Path(args.bag).resolve().name}, live',
         'bag_player',
@@ -79,12 +79,13 @@ def source(args: argparse.Namespace, bag: BagReader, inputs: BagInputs) -> Sourc
     )  # fmt: skip
 
 
-def sensor_pose(bag: BagReader, inputs: BagInputs, topic: str) -> list[float]:
-    """(x, y, theta) of a topic's sensor, for nodes that have no tf2_msgs to hear it."""
-    default = list(inputs.params.node.laser_pose)
+def sensor_place(bag: BagReader, inputs: BagInputs, topic: str) -> dict[str, Any]:
+    """Parameters for where a topic's sensor sits, for nodes that have no tf2_msgs to hear it."""
     for _, _, message in bag.messages([topic]):
-        pose = inputs.extrinsics.pose(
-            inputs.params.node.base_frame, frame(message.header.frame_id)
-        )
-        return default if pose is None else [float(v) for v in pose]
-    return default
+        ends = inputs.params.node.base_frame, frame(message.header.frame_id)
+        pose = inputs.extrinsics.pose(*ends)
+        if pose is None:
+            break
+        place = [float(v) for v in pose]
+        return {'laser_pose': place, 'laser_upside_down': inputs.extrinsics.hangs(*ends)}
+    return {'laser_pose': list(inputs.params.node.laser_pose)}

@@ -5,6 +5,10 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import re
+import time
+from array import array
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -258,6 +262,32 @@ def test_wrong_frame_is_counted_and_named(live, node):
     feed(node, 3.0, spoil)
     assert used(node, 'scan', 'invalid') > 5
     assert "scan in frame 'camera'" in node.sensors.sequencer.inputs.last_error
+
+
+def test_first_refusal_of_a_stream_is_told_on_the_console(live, node, monkeypatch):
+    said = []
+    monkeypatch.setattr(node.sensors, '_logger', SimpleNamespace(warning=said.append))
+    for stream, msg in room(['/scan', '/odom'], seconds=1.0):
+        if stream == 'scan':
+            msg.ranges = msg.intensities = array('f')
+        node.sensors.add(stream, msg)
+    (text,) = said
+    assert re.fullmatch(r'scan: not used: scan at \d+ ns is empty', text)
+
+
+def test_what_never_came_is_told_once(live, node, monkeypatch):
+    said = []
+    monkeypatch.setattr(node.sensors, '_logger', SimpleNamespace(warning=said.append))
+    node.sensors.flush_if_silent()
+    assert said == []
+    (index,) = (k for k, (stream, _) in enumerate(node.sensors._queues) if stream == 'scan')
+    _, scan = next(iter(room(['/scan'], seconds=2.0)))
+    node.sensors.receive(index, scan)
+    now = time.monotonic()
+    monkeypatch.setattr(time, 'monotonic', lambda: now + 6.0)
+    node.sensors.flush_if_silent()
+    node.sensors.flush_if_silent()
+    assert said == ['waiting for odom on /odom']
 
 
 def test_missing_odometry_does_not_stop_the_poses(live, node):

@@ -49,12 +49,19 @@ def test_cycle_does_not_hang():
     assert tree.pose('base_link', 'a') is None
 
 
-def test_imu_upside_down_is_turned_and_a_laser_refused():
+def test_sensor_that_hangs_upside_down_is_told_from_one_that_is_tilted():
     tree = Extrinsics()
-    tree.add([Transform('base_link', 'imu', FLIPPED, np.zeros(3))])
-    np.testing.assert_allclose(tree.up('base_link', 'imu'), [0.0, 0.0, -1.0])
-    with pytest.raises(InputError, match='base_link to imu is not planar: it tilts by 180'):
-        tree.pose('base_link', 'imu')
+    tree.add(planar('base_link', 'mast', [1.0, 2.0, 0.7]))
+    tree.add([Transform('mast', 'laser', FLIPPED, np.array([0.0, 0.0, 1.5]))])
+    np.testing.assert_allclose(tree.up('base_link', 'laser'), [0.0, 0.0, -1.0])
+    np.testing.assert_allclose(tree.pose('base_link', 'laser'), [1.0, 2.0, 0.7], atol=1e-12)
+    assert tree.hangs('base_link', 'laser')
+    assert not tree.hangs('base_link', 'mast')
+    assert not tree.hangs('base_link', 'nowhere')
+    on_its_side = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    tree.add([Transform('base_link', 'camera', on_its_side, np.zeros(3))])
+    with pytest.raises(InputError, match='base_link to camera is not planar: it tilts by 90'):
+        tree.pose('base_link', 'camera')
 
 
 def test_later_transform_replaces_the_earlier():
