@@ -78,7 +78,7 @@ def content_of(back_end: BackEnd, params: Parameters, grid: OccupancyGrid | None
     arrays: dict[str, NDArray[Any]] = {
         'pose': graph.poses, 'pose_fixed': graph.fixed_poses,
         'landmark': graph.landmarks, 'landmark_fixed': graph.fixed_landmarks,
-        **_keys(back_end.keyframes), **back_end.scans.arrays(),
+        **arrays_of(back_end.keyframes), **back_end.scans.arrays(),
         **back_end.reflector_graph.arrays(), **back_end.path.arrays(),
         'reflector_map': found.points, 'reflector_cov': found.cov,
         **{f'reflector_map_{name}': getattr(found, name) for name in MADE},
@@ -101,7 +101,8 @@ def content_of(back_end: BackEnd, params: Parameters, grid: OccupancyGrid | None
     return Content(arrays, description)
 
 
-def _keys(keys: list[Keyframe]) -> dict[str, NDArray[Any]]:
+def arrays_of(keys: list[Keyframe]) -> dict[str, NDArray[Any]]:
+    """The keyframes and their scans, as the file has them."""
     points = [k.points for k in keys if k.points is not None]
     return {
         'key_stamp': np.array([k.stamp for k in keys], dtype=np.int64),
