@@ -52,9 +52,7 @@ COMMANDS: Table = {
         'saved maps',
         {
             'info': Command('map_info', 'check a saved map and say what is in it'),
-            'import': Command(
-                'map_import', 'text files as a saved map: CSV, g2o, TUM, PGM and YAML'
-            ),
+            'import': Command('map_import', 'text files as a saved map: CSV, g2o, PGM and YAML'),
             'merge': Command('map_merge', 'two saved maps as one'),
             'reflectors': Command(
                 'map_reflectors', 'which reflectors are there, new, moved, missing or ghosts'
