@@ -3,35 +3,47 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from rlml_slam.errors import InputError
 
-PATIENCE = 10.0  # [s] in which a running back end answers
+PATIENCE = 10.0  # [s] in which a running node is found
+WORK = 120.0  # [s] in which it answers: to save or to search a large map takes its time
 
 
 def ask(node: str, service: str, argument: str | None = None) -> str:
-    """The answer of a running back end; InputError with its words where it refuses."""
-    import rclpy
+    """The answer of a running node; InputError with its words where it refuses."""
     from diagnostic_msgs.srv import AddDiagnostics
     from std_srvs.srv import Trigger
 
-    kind = Trigger if argument is None else AddDiagnostics
-    request = kind.Request()
-    if argument is not None:
-        request.load_namespace = argument
+    if argument is None:
+        return told(call(node, service, Trigger, {}))
+    return told(call(node, service, AddDiagnostics, {'load_namespace': argument}))
+
+
+def told(answer: Any) -> str:
+    """The words of an answer; InputError with them where it is no success."""
+    if not answer.success:
+        raise InputError(str(answer.message))
+    return str(answer.message)
+
+
+def call(node: str, service: str, kind: Any, fields: dict[str, Any]) -> Any:
+    """The response of a service of a running node; InputError where there is none."""
+    import rclpy
+
     rclpy.init()
     try:
         asker = rclpy.create_node('rlml_ask')
         client = asker.create_client(kind, f'{node}/{service}')
         if not client.wait_for_service(PATIENCE):
-            raise InputError(f'{node}: no such back end is running')
-        future = client.call_async(request)
-        rclpy.spin_until_future_complete(asker, future, timeout_sec=PATIENCE)
+            raise InputError(f'{node}: no node with the service {service} is running')
+        future = client.call_async(kind.Request(**fields))
+        rclpy.spin_until_future_complete(asker, future, timeout_sec=WORK)
         answer = future.result() if future.done() else None
         asker.destroy_node()
     finally:
         rclpy.shutdown()
     if answer is None:
-        raise InputError(f'{node}: no answer within {PATIENCE:.0f} s')
-    if not answer.success:
-        raise InputError(str(answer.message))
-    return str(answer.message)
+        raise InputError(f'{node}: no answer within {WORK:.0f} s')
+    return answer

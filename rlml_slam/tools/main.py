@@ -66,6 +66,7 @@ COMMANDS: Table = {
     'closures': Command(
         'closures', 'loop closures of a replay or of a running back end; revoke one'
     ),
+    'call': Command('call', 'a service of a running node: save_map, relocalize and so on'),
     'optimize': Command('optimize', 'optimise a pose graph file (g2o, TORO)'),
     'study': Group(
         'experiments that answer one question each',

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``rlml call`` against a running back end."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from live import DOMAIN
+
+from rlml_slam.maps.saved import SavedMap
+from rlml_slam.nodes.back_end import BackEndNode
+from rlml_slam.ros.map_folder import MapFolder
+from rlml_slam.tools.main import main
+from rlml_slam.types import Reflectors
+
+
+@pytest.fixture
+def command(live, monkeypatch, capsys):
+    """Runs a command line beside the nodes; its exit code, and what it prints."""
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(DOMAIN))
+
+    def run(*words):
+        with ThreadPoolExecutor(1) as pool:
+            code = pool.submit(main, ['call', *words])
+            live.spin_until(code.done, timeout=30.0)
+        said = capsys.readouterr()
+        return code.result(), said.out, said.err
+
+    return run
+
+
+def test_services_answer_in_words_and_refuse_in_words(live, command, tmp_path):
+    n = 3
+    found = Reflectors(
+        np.arange(n), np.arange(2.0 * n).reshape(n, 2), np.tile(1e-4 * np.eye(2), (n, 1, 1)),
+        np.full(n, -1), np.full(n, 9), np.full(n, np.nan),
+    )  # fmt: skip
+    MapFolder(str(tmp_path)).save('hall', SavedMap(found))
+    values = {'mode': 'localization', 'map_file_name': 'hall', 'map_directory': str(tmp_path)}
+    live.start(BackEndNode, **values)
+    assert command('pause_new_measurements', 'on') == (0, 'paused\n', '')
+    assert command('load_map', 'hall') == (0, 'hall: loaded\n', '')
+    code, out, err = command('load_map', 'nowhere')
+    assert (code, out) == (1, '')
+    assert 'refused the map' in err
+    code, out, err = command('save_map')
+    assert (code, out) == (1, '')
+    assert 'nothing to save' in err
+
+
+@pytest.mark.parametrize(
+    ('words', 'why'),
+    [
+        (['load_map'], 'load_map needs an argument'),
+        (['save_map', 'hall'], 'save_map takes no argument'),
+        (['set_localization_mode', 'yes'], "'yes' is neither on nor off"),
+    ],
+)
+def test_wrong_argument_is_one_line(words, why, capsys):
+    assert main(['call', *words]) == 1
+    assert why in capsys.readouterr().err
