@@ -20,7 +20,6 @@ import io
 import json
 import os
 import struct
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -32,6 +31,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from rlml_slam.errors import FileFormatError, MapError
+from rlml_slam.maps.atomic import write_atomically
 
 MAGIC, VERSION = b'RLMLMAP', 1
 HEAD = struct.Struct('<7sBQ32s')
@@ -60,22 +60,10 @@ def write(path: str | Path, content: Content) -> Path:
     head = HEAD.pack(MAGIC, VERSION, len(body), hashlib.sha256(body).digest())
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
-        try:
-            with os.fdopen(handle, 'wb') as f:
-                f.write(head + hashlib.sha256(head).digest()[:16])
-                f.write(body)
-                f.flush()
-                os.fsync(f.fileno())
-            os.chmod(temporary, 0o644)
-            _keep_previous(path)
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
-        _sync_folder(path.parent)
     except OSError as e:
         raise MapError(f'{path}: cannot be written: {e.strerror or e}') from e
+    check = hashlib.sha256(head).digest()[:16]
+    write_atomically(path, head, check, body, before=_keep_previous)
     return path
 
 
@@ -99,15 +87,6 @@ def _is_whole(path: Path) -> bool:
     except (MapError, FileFormatError):
         return False
     return True
-
-
-def _sync_folder(folder: Path) -> None:
-    """Have the names on the disk as well as the bytes."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def _archive(content: Content) -> memoryview:

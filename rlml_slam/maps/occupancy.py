@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 import math
-import os
 import re
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +16,7 @@ from numpy.typing import NDArray
 
 from rlml_slam.compiled import kernel
 from rlml_slam.errors import FileFormatError, MapError
+from rlml_slam.maps.atomic import write_atomically
 from rlml_slam.se2 import Array, transform
 
 UNKNOWN = -1
@@ -129,22 +128,6 @@ def save(grid: OccupancyGrid, path: str | Path) -> tuple[Path, Path]:
     write_atomically(pgm, header + image[::-1].tobytes())
     write_atomically(meta, text.encode())
     return pgm, meta
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file so that a reader sees the old one or the new one, never a part."""
-    try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name + '.')
-        try:
-            with os.fdopen(handle, 'wb') as f:
-                f.write(data)
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
-        except BaseException:
-            os.unlink(temporary)
-            raise
-    except OSError as e:
-        raise MapError(f'{path}: cannot be written: {e.strerror}') from e
 
 
 def load(path: str | Path) -> OccupancyGrid:

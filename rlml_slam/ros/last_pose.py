@@ -15,7 +15,7 @@ import numpy as np
 
 from rlml_slam import se2
 from rlml_slam.errors import FileFormatError
-from rlml_slam.maps.occupancy import write_atomically
+from rlml_slam.maps.atomic import write_atomically
 from rlml_slam.rlml.relocalize import Relocation
 from rlml_slam.se2 import Array
 from rlml_slam.types import Frame, Level, Verdict

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rlml_slam.errors import FileFormatError
-from rlml_slam.maps.occupancy import write_atomically
+from rlml_slam.maps.atomic import write_atomically
 from rlml_slam.params import (
     CarrierParameters,
     Declaration,

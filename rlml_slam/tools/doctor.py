@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from rlml_slam.errors import BagError, InputError
-from rlml_slam.maps.occupancy import write_atomically
+from rlml_slam.maps.atomic import write_atomically
 from rlml_slam.params import Detector, DetectorParameters, from_mapping, read_yaml
 from rlml_slam.ros import convert
 from rlml_slam.ros.bag import BagReader, choose_topics

@@ -12,7 +12,8 @@ import numpy as np
 
 from rlml_slam.errors import MapError
 from rlml_slam.maps import container, reflector_file
-from rlml_slam.maps.occupancy import UNKNOWN, OccupancyGrid, save, write_atomically
+from rlml_slam.maps.atomic import write_atomically
+from rlml_slam.maps.occupancy import UNKNOWN, OccupancyGrid, save
 from rlml_slam.rlml.reflector_states import state_table
 from rlml_slam.tools.metrics import judge, metrics
 from rlml_slam.tools.record import Run

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from rlml_slam.maps.occupancy import write_atomically
+from rlml_slam.maps.atomic import write_atomically
 from rlml_slam.tools import page
 from rlml_slam.tools.outputs import make_folder
 from rlml_slam.tools.pictures import CLOSURE, LIVE, PATH, TRUTH, png

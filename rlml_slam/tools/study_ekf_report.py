@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from rlml_slam.maps.occupancy import write_atomically
+from rlml_slam.maps.atomic import write_atomically
 from rlml_slam.tools import page
 from rlml_slam.tools import study_ekf_drives as drives
 from rlml_slam.tools import study_ekf_speed as speed

@@ -13,7 +13,7 @@ import numpy as np
 
 from rlml_slam import se2
 from rlml_slam.ekf.slam import EkfSlam
-from rlml_slam.maps.occupancy import write_atomically
+from rlml_slam.maps.atomic import write_atomically
 from rlml_slam.params import EkfParameters, from_mapping, read_yaml
 from rlml_slam.se2 import Array
 from rlml_slam.tools.convert_lego import LASER_FRAME, T_BASE_LASER, Lego, read_lego

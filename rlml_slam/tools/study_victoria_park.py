@@ -18,7 +18,7 @@ import numpy as np
 
 from rlml_slam import se2, warm_up
 from rlml_slam.ekf.slam import EkfSlam
-from rlml_slam.maps.occupancy import write_atomically
+from rlml_slam.maps.atomic import write_atomically
 from rlml_slam.params import EkfParameters, from_mapping, read_yaml
 from rlml_slam.rlml.slam import Slam
 from rlml_slam.se2 import Array

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.errors import FileFormatError
-from rlml_slam.maps.occupancy import write_atomically
+from rlml_slam.maps.atomic import write_atomically
 from rlml_slam.se2 import Array, wrap
 from rlml_slam.tools.text_file import format_stamp, parse_numbers, parse_stamp, read_lines
 
