@@ -30,7 +30,7 @@ from rlml_slam.types import EdgeKind, Verdict
 # of a map that overlaps with another, most reflectors may be of places that the other lacks; that
 # what they have in common is no chance, the verdict still has to show
 APART = 0.95
-OPTIONAL = 'grid', 'survey_'  # what not every map has
+LATER = 'key_looked', 'reflector_gone', 'reflector_life', 'reflector_surveyed', 'reflector_view'
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -51,8 +51,7 @@ class Merged:
 
 def merge_maps(first: Content, second: Content, params: Parameters) -> Merged:
     """One map, in the frame of the first. Raises MapError where nothing tells how they lie."""
-    lacking = first.arrays.keys() ^ second.arrays.keys()
-    if any(not name.startswith(OPTIONAL) for name in lacking):
+    if not all(name in c.arrays for name in LATER for c in (first, second)):
         raise MapError('one of the maps is of an older program: go on with it once, and save it')
     a, b = stored_map.saved_map(first).reflectors, stored_map.saved_map(second).reflectors
     surveys = stored_map.survey_of(first), stored_map.survey_of(second)

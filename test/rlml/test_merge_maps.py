@@ -123,6 +123,13 @@ def test_maps_of_which_nothing_tells_how_they_lie_are_refused(two, tmp_path, cap
         merge_maps(twin, twin, PARAMS)
 
 
+def test_map_of_an_older_program_is_refused(two):
+    older = {k: v for k, v in two[1].arrays.items() if k != 'reflector_gone'}
+    for pair in ((two[0], two[1]._replace(arrays=older)), (two[1]._replace(arrays=older),) * 2):
+        with pytest.raises(MapError, match='older program'):
+            merge_maps(*pair, PARAMS)
+
+
 def test_command_merges_files(two, tmp_path, capsys):
     names = [str(container.write(tmp_path / f'{k}.rlml', c)) for k, c in enumerate(two)]
     out = tmp_path / 'c.rlml'
