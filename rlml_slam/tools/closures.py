@@ -18,6 +18,7 @@ from rlml_slam.rlml import stored_map
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.closure_table import COLUMNS, closure_table, told
 from rlml_slam.tools.ask import ask
+from rlml_slam.tools.columns import aligned
 
 
 def add_parser(subparsers: Any) -> None:
@@ -95,9 +96,6 @@ def text(rows: list[dict[str, str]], everything: bool) -> str:
     shown = [r for r, is_sound in zip(rows, sound, strict=True) if everything or not is_sound]
     columns = COLUMNS[:-1]
     lines = [[r[name] for name in columns] for r in shown]
-    width = [max(map(len, column)) for column in zip(columns, *lines, strict=True)]
-    out = ['  '.join(w.ljust(n) for w, n in zip(row, width, strict=True)).rstrip()
-           for row in [list(columns), *lines]]  # fmt: skip
     states = [r['state'] for r in rows]
     counts = ', '.join(f'{states.count(s)} {s}' for s in ('active', 'disabled', 'revoked'))
-    return '\n'.join([*out, f'{len(rows)} loop closures: {counts}'])
+    return f'{aligned([columns, *lines])}\n{len(rows)} loop closures: {counts}'

@@ -16,6 +16,7 @@ from rlml_slam.rlml import stored_map
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.reflector_states import COLUMNS, state_table
 from rlml_slam.tools.ask import ask
+from rlml_slam.tools.columns import aligned
 
 ORDER = ('moved', 'missing', 'new', 'ghost', 'present')
 
@@ -58,8 +59,5 @@ def text(rows: list[dict[str, str]], everything: bool) -> str:
     shown = [r for r in rows if everything or r['state'] != 'present']
     shown.sort(key=lambda r: ORDER.index(r['state']))
     lines = [[r[name] for name in COLUMNS] for r in shown]
-    width = [max(map(len, column)) for column in zip(COLUMNS, *lines, strict=True)]
-    out = ['  '.join(w.ljust(n) for w, n in zip(row, width, strict=True)).rstrip()
-           for row in [list(COLUMNS), *lines]]  # fmt: skip
     summary = ', '.join(f'{counts[state]} {state}' for state in ORDER[::-1] if counts[state])
-    return '\n'.join([*out, summary or 'no reflectors'])
+    return f'{aligned([COLUMNS, *lines])}\n{summary or "no reflectors"}'

@@ -24,36 +24,30 @@ from rlml_slam.rlml.slam import Slam
 from rlml_slam.simulation.robot import SECOND
 from rlml_slam.simulation.simulation import START, Message
 from rlml_slam.tools.ate import trajectory_errors
+from rlml_slam.tools.columns import aligned
 from rlml_slam.tools.drives import feed, simulate
 from rlml_slam.tools.metrics import nees
 from rlml_slam.tools.progress import Progress
 from rlml_slam.tools.record import Truth
+from rlml_slam.tools.study_ablation_tables import (
+    COLUMNS,
+    FAULT_HEADER,
+    FAULTS,
+    SENSORS,
+    drive_rows,
+    fault_rows,
+    kidnap_text,
+)
 from rlml_slam.tools.study_jobs import each
 from rlml_slam.tools.tum import Trajectory
 from rlml_slam.types import Detections, Frame, Level, Scan
 
 WORLDS = ('hall', 'corridor', 'symmetric', 'yard')
-SENSORS: dict[str, dict[str, bool]] = {
-    'odometry': {'use_scan': False, 'use_reflectors': False},
-    'scan': {'use_reflectors': False},
-    'reflectors': {'use_scan': False},
-    'both': {},
-}
 # false detections per scan that are half of all
 VISIBLE = {'hall': 6.0, 'corridor': 3.3, 'symmetric': 5.7, 'yard': 9.9}
-FAULTS = ('slip', 'ghosts', 'missed', 'dropout', 'jitter')
 DROPOUT, EVERY = 0.5, 10.0  # [s] without scan and reflectors, and from one to the next
 INSIDE = float(chi2.ppf(0.95, 3))
 KIDNAPPED = (55.0, 85.0)  # [s] when a robot is carried away, somewhere on its way so far
-COLUMNS: dict[str, tuple[str, float, int]] = {
-    'ate_m': ('ATE [cm]', 100.0, 2),
-    'max_m': ('largest [cm]', 100.0, 1),
-    'along_m': ('along x, largest [cm]', 100.0, 1),
-    'heading_deg': ('heading [°]', 1.0, 3),
-    'nees': ('NEES (3)', 1.0, 2),
-    'coverage': ('95 % coverage [%]', 100.0, 1),
-    'lost': ('LOST [%]', 100.0, 2),
-}
 
 
 def add_parser(subparsers: Any) -> None:
@@ -232,52 +226,8 @@ def robustness(drives: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, f
     return out
 
 
-def drive_rows(summary: Mapping[str, Any]) -> list[list[str]]:
-    """A row of cells per world and system or fault: mean (worst)."""
-    return [
-        [name, *(f'{c * s[k]["mean"]:.{d}f} ({c * s[k]["max"]:.{d}f})'
-                 for k, (_, c, d) in COLUMNS.items())]
-        for name, s in summary['drives'].items()
-    ]  # fmt: skip
-
-
-def fault_rows(summary: Mapping[str, Any]) -> list[list[str]]:
-    """A row of cells per world and fault."""
-    return [
-        [name, f'{f["ratio"]:.2f}', f'{f["worst"]:.2f}', f'{100 * f["max_m"]:.1f}']
-        for name, f in summary['robustness'].items()
-    ]
-
-
-def kidnap_text(summary: Mapping[str, Any]) -> str:
-    """What became of the carried robots, in words."""
-    rows = summary['kidnaps']
-    if not rows:
-        return 'no robot was carried away'
-    found = [r for r in rows if r['found_s'] is not None]
-    out = f'{len(found)} of {len(rows)} carried robots found themselves'
-    if found:
-        out += (
-            f'; LOST after {max(r["lost_s"] for r in found):.2f} s at most, OK after '
-            f'{max(r["found_s"] for r in found):.2f} s, from then on within '
-            f'{100 * max(r["max_m"] for r in found):.1f} cm'
-        )
-    return f'{out}; {sum(r["false_alarms"] for r in rows)} false alarms before'
-
-
-FAULT_HEADER = ['world, fault', 'ATE / clean', 'worst seed', 'largest [cm]']
-
-
 def text(summary: Mapping[str, Any]) -> str:
     """The tables as text."""
     drives = [['world, system or fault', *(c[0] for c in COLUMNS.values())], *drive_rows(summary)]
     faults = [FAULT_HEADER, *fault_rows(summary)]
     return '\n\n'.join([aligned(drives), aligned(faults), kidnap_text(summary)])
-
-
-def aligned(cells: Sequence[Sequence[str]]) -> str:
-    """Rows of cells in columns."""
-    widths = [max(len(row[k]) for row in cells) for k in range(len(cells[0]))]
-    return '\n'.join(
-        '  '.join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in cells
-    )

@@ -15,7 +15,7 @@ from rlml_slam.maps.atomic import write_atomically
 from rlml_slam.tools import page
 from rlml_slam.tools.outputs import make_folder
 from rlml_slam.tools.pictures import CLOSURE, LIVE, PATH, TRUTH, png
-from rlml_slam.tools.study_ablation import (
+from rlml_slam.tools.study_ablation_tables import (
     COLUMNS,
     FAULT_HEADER,
     FAULTS,

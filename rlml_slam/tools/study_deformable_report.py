@@ -22,7 +22,7 @@ from rlml_slam.deformable.experiment import FEATURES, ROWS, Row
 from rlml_slam.deformable.study import ESTIMATORS, RowResult, Runs, run_estimators
 from rlml_slam.errors import RlmlError
 from rlml_slam.se2 import Array
-from rlml_slam.tools.study_deformable import tables
+from rlml_slam.tools.study_deformable_tables import tables
 
 matplotlib.use('Agg')
 

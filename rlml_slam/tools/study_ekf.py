@@ -20,6 +20,7 @@ from rlml_slam.params import EkfParameters, read_yaml
 from rlml_slam.tools import study_ekf_consistency as consistency
 from rlml_slam.tools import study_ekf_drives as drives
 from rlml_slam.tools import study_ekf_speed as speed
+from rlml_slam.tools.columns import aligned
 from rlml_slam.tools.progress import Progress
 from rlml_slam.tools.study_jobs import each
 
@@ -89,10 +90,10 @@ def text(summary: Mapping[str, Any]) -> str:
     tables = [(drives.HEADER, drives.rows(summary['drives']))]
     if summary['consistency']:
         tables.append((consistency.HEADER, consistency.rows(summary['consistency'])))
-    lines = [f'{summary["seeds"]} seeds; mean ± deviation (worst)']
-    for header, rows in tables:
-        cells = [header, *rows]
-        widths = [max(len(r[k]) for r in cells) for k in range(len(header))]
-        lines += ['  '.join(c.ljust(w) for c, w in zip(r, widths, strict=True)) for r in cells]
-        lines.append('')
-    return '\n'.join([*lines, *speed.lines(summary['speed'])])
+    return '\n\n'.join(
+        [
+            f'{summary["seeds"]} seeds; mean ± deviation (worst)',
+            *(aligned([header, *rows]) for header, rows in tables),
+            '\n'.join(speed.lines(summary['speed'])),
+        ]
+    )

@@ -23,6 +23,7 @@ from rlml_slam.matching.constellation import Constellation, locate
 from rlml_slam.matching.pair_votes import warm_up
 from rlml_slam.params import Relocalization
 from rlml_slam.se2 import Array
+from rlml_slam.tools.columns import aligned
 from rlml_slam.tools.progress import Progress
 from rlml_slam.tools.study_jobs import each
 from rlml_slam.types import Verdict
@@ -202,5 +203,4 @@ def text(rows: Mapping[str, Mapping[str, float | None]]) -> str:
     for name, figures in rows.items():
         values = [(figures[key], form) for key, (_, form) in COLUMNS.items()]
         cells.append([name, *('-' if v is None else f'{v:{form}}' for v, form in values)])
-    widths = [max(len(r[k]) for r in cells) for k in range(len(cells[0]))]
-    return '\n'.join('  '.join(c.ljust(w) for c, w in zip(r, widths, strict=True)) for r in cells)
+    return aligned(cells)
