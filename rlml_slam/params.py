@@ -4,7 +4,7 @@
 A group is a frozen dataclass of param() fields; Parameters holds one of each. The ROS
 declaration (``ros/declare.py``), ``config/*.yaml`` and the tables of the README are derived from
 here and tested against it. A wrong value raises ParameterError that names class, field, value and
-meaning; an unknown name is refused, never ignored.
+meaning. An unknown name is refused by the commands, and told in the log by the nodes.
 """
 
 from __future__ import annotations
@@ -146,7 +146,10 @@ class Node(Group):
     laser_upside_down: bool = param(
         False, 'the laser hangs upside down, its x axis at laser_pose, where no /tf_static tells'
     )
-    transform_publish_period: float = param(0.02, 'period of map to odom on /tf', 's', 0.001, 10.0)
+    transform_publish_period: float = param(
+        0.02, 'shortest time between two of map to odom on /tf, one for each new frame', 's',
+        0.001, 10.0,
+    )  # fmt: skip
     transform_timeout: float = param(
         0.2, 'longest wait of a scan for the odometry at its stamp', 's', 0.0, 10.0
     )

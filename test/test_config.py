@@ -24,7 +24,7 @@ from rlml_slam.params import (
     from_mapping,
     read_yaml,
 )
-from rlml_slam.tools.config import FILES, parameter_file
+from rlml_slam.tools.config import FILES, UNREAD, parameter_file
 
 ROOT = Path(__file__).resolve().parents[1]
 KNOWN = {d.name for of in NODES for d in declarations(of)}
@@ -211,3 +211,11 @@ def test_pinned_requirements_hold_all_that_is_asked_for():
 
 def test_this_python_is_supported():
     assert (3, 10) <= sys.version_info[:2] <= (3, 13)
+
+
+def test_parameter_files_leave_out_what_their_node_does_not_read():
+    for name, unread in UNREAD.items():
+        of, _ = FILES[name]
+        names = {d.name for d in declarations(of)}
+        listed = read_yaml(ROOT / 'config' / name, of).keys()
+        assert {n.split('.')[0] for n in names - listed} == set(unread)

@@ -87,8 +87,9 @@ class FrontEnd:
         self._last_stamp: int | None = None
 
     def use_map(self, reflectors: Reflectors, grid: OccupancyGrid | None = None) -> None:
-        """Localise against given reflectors and grid (map frame), which never change.
+        """Localise against given reflectors and grid (map frame); nothing is added to them.
 
+        The estimate of a reflector moves with its detections, within the covariance given for it.
         A start pose that is only assumed, with no covariance, is as good as a person's guess; and
         it stays unconfirmed until what is seen agrees with the map.
         """

@@ -28,6 +28,20 @@ FILES: dict[str, tuple[type[Any], str]] = {
 }
 
 
+# what a node declares, because it shares the group, but does not read: names and groups
+UNREAD: dict[str, tuple[str, ...]] = {
+    'ekf_slam.yaml': (
+        'continue_map', 'restore_pose', 'transform_publish_period',
+        'scan_match', 'loop_closure', 'relocalization', 'solver',
+    ),
+    'reflector_detector.yaml': (
+        'map_frame', 'odom_frame', 'local_frame', 'use_scan', 'use_reflectors',
+        'reflector_poses_topic', 'mode', 'map_directory', 'map_file_name', 'map_start_pose',
+        'restore_pose', 'continue_map', 'transform_publish_period', 'map_update_interval',
+    ),
+}  # fmt: skip
+
+
 def parameter_file(name: str) -> str:
     """The text of ``config/<name>``: defaults with meaning, unit and range as comments."""
     of, what = FILES[name]
@@ -40,6 +54,8 @@ def parameter_file(name: str) -> str:
     ]
     group = 'node'
     for d in declarations(of):
+        if d.name.split('.')[0] in UNREAD.get(name, ()):
+            continue
         if d.group != group:
             group = d.group
             lines.append(f'    {group}:')

@@ -18,6 +18,7 @@ from rlml_slam.params import (
     DeformableParameters,
     DetectorParameters,
     Parameters,
+    PlayerParameters,
     SimulatorParameters,
     declarations,
 )
@@ -120,4 +121,5 @@ TABLES: Mapping[str, Callable[[], str]] = {
     'deformable parameters': lambda: parameter_table(DeformableParameters, 'deformable.'),
     'detector parameters': lambda: parameter_table(DetectorParameters, 'detector.'),
     'carrier parameters': lambda: parameter_table(CarrierParameters),
+    'player parameters': lambda: parameter_table(PlayerParameters),
 }
