@@ -191,6 +191,13 @@ class MotionNoise(Group):
         5.0, 'a faster odometry step is a jump and is not used', 'm/s', 0.01, 100.0
     )
     max_turn_rate: float = param(15.0, 'a faster odometry turn is a jump', 'rad/s', 0.01, 100.0)
+    free_speeds: tuple[float, ...] = param(
+        (0.5, 0.1, 2.0),
+        'speed forward, sideways and of turning of a robot without odometry, 1 sigma',
+        'm/s, m/s, rad/s',
+    )
+    free_time: float = param(4.0, 'time in which that is another one', 's', 0.01, 60.0)
+    free_jitter: float = param(0.02, 'error of the stamps that it is told by', 's', 0.0, 1.0)
 
 
 @dataclass(frozen=True)

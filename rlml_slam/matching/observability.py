@@ -87,20 +87,31 @@ def _accumulate(
     return H
 
 
-def information(submap: Submap, points: Array, pose: Array, params: ScanMatch) -> Array:
+def share_open(odometry: bool) -> float:
+    """Share of the strongest direction's information below which one is left open.
+
+    Along a corridor, odometry is better than what the beams on a door frame or two say. A robot
+    without it has nothing better, and is told by them whether it moves at all.
+    """
+    return OPEN if odometry else 0.0
+
+
+def information(
+    submap: Submap, points: Array, pose: Array, params: ScanMatch, share: float = OPEN
+) -> Array:
     """Information (3, 3) of a match of ``points`` (n, 2), in scan order, at ``pose`` (3,).
 
     Coordinates are those of the pose in the submap frame. ``params.sigma_point`` is the error of
     one end point across its surface, neighbours' correlation included; ``params.floor2`` (3,) the
-    variances of what more points do not average out. A direction that the scan leaves open has
-    information zero.
+    variances of what more points do not average out. A direction that the scan leaves open, for
+    it has less than ``share`` of the information of the strongest one, has information zero.
     """
     j, i = submap.corner
     return _information(
         submap.values, float(j), float(i), 1.0 / submap.resolution,
         np.ascontiguousarray(points, dtype=np.float64),
         np.ascontiguousarray(pose, dtype=np.float64),
-        params.sigma_point, np.array(params.floor2),
+        params.sigma_point, np.array(params.floor2), share,
     )  # fmt: skip
 
 
@@ -114,6 +125,7 @@ def _information(
     pose: Array,
     sigma_point: float,
     floor2: Array,
+    share: float,
 ) -> Array:
     """Kernel of information()."""
     H = _accumulate(values, corner_j, corner_i, scale, points, pose)
@@ -123,7 +135,7 @@ def _information(
     unit = np.array([1.0, 1.0, 1.0 / lever])
     units = np.outer(unit, unit)
     strength, axes = np.linalg.eigh(H * units)
-    strength = np.maximum(strength - OPEN * max(strength[2], 0.0), 0.0)
+    strength = np.maximum(strength - share * max(strength[2], 0.0), 0.0)
     H = np.dot(axes * strength, axes.T.copy()) / units / sigma_point**2
     # (H^-1 + floor)^-1, written so that an open direction stays open
     out = np.linalg.solve(np.eye(3) + H * floor2, H)

@@ -70,9 +70,11 @@ class BackEnd:
     def reset(self) -> None:
         """Forget everything."""
         p = self._p
+        # wheels slip; the front end's own motion, without any, does not
+        slips = Loss(LossKind.CAUCHY, p.back_end.odometry_robust_scale)
         self.graph = Graph(
             Losses(
-                odometry=Loss(LossKind.CAUCHY, p.back_end.odometry_robust_scale),
+                odometry=slips if p.node.use_odom else Loss(),
                 closure=Loss(LossKind.HUBER, p.back_end.closure_robust_scale),
                 scan=Loss(LossKind.CAUCHY, p.back_end.scan_robust_scale),
                 reflector=Loss(LossKind.CAUCHY, p.reflector.robust_scale),

@@ -21,6 +21,7 @@ from rlml_slam.maps.saved import SavedMap
 from rlml_slam.matching import association, observability, thinning
 from rlml_slam.matching.scan_match import match
 from rlml_slam.params import Parameters
+from rlml_slam.rlml.coasting import Coasting
 from rlml_slam.rlml.confirmation import START_SIGMA, Confirmation
 from rlml_slam.rlml.correction import Correction, Known
 from rlml_slam.rlml.doubt import Doubt, consents
@@ -31,7 +32,7 @@ from rlml_slam.rlml.map_window import MapWindow
 from rlml_slam.rlml.reflector_update import use_reflectors
 from rlml_slam.rlml.relocalize import is_mapped
 from rlml_slam.rlml.scan_update import fuse, prior_of
-from rlml_slam.rlml.second_look import second_look
+from rlml_slam.rlml.second_look import AS_USUAL, second_look
 from rlml_slam.rlml.submaps import Submaps
 from rlml_slam.rlml.tracks import Tracks
 from rlml_slam.rlml.unseen import expected
@@ -42,7 +43,6 @@ from rlml_slam.types import (
     Detections,
     Frame,
     Health,
-    Motion,
     Observation,
     Reflectors,
     Status,
@@ -66,7 +66,7 @@ class FrontEnd:
 
     def reset(self, pose: Array, cov: Array) -> None:
         """Forget everything and start at a pose (3,) of the map with covariance (3, 3)."""
-        self.state = JointState(pose, cov, self._p.motion.imu_bias)
+        self.state = JointState(pose, cov, self._p.motion.imu_bias, self._p.motion.free_speeds)
         self.tracks = Tracks()
         self.submaps = Submaps(self._p.submap)
         self.health = HealthMonitor(self._p.health)
@@ -76,9 +76,9 @@ class FrontEnd:
         self._jumped = False
         self._correction = Correction(np.zeros(3))
         self._velocity = np.zeros(3)
-        self._velocity_known = False
         self._since: tuple[int, Array] | None = None
         self._has_odometry = False
+        self._coasting = Coasting(self._p.motion)
         self._map: SavedMap | None = None
         self._window: MapWindow | None = None
         self.confirmation = Confirmation(self._p)
@@ -130,7 +130,7 @@ class FrontEnd:
             self.state.place(pose, cov)
             self.submaps = Submaps(self._p.submap)
             self.doubt = Doubt(self._p.health)
-            self._velocity_known, self._since = False, None
+            self._since = None
             T_map_local = self.T_map_local
         # what the graph knows is of where the robot was
         self._correction = Correction(T_map_local)
@@ -212,8 +212,7 @@ class FrontEnd:
     def process(self, observation: Observation) -> Frame:
         """The pose at the observation's stamp; never raises for what was measured."""
         began = time.perf_counter()
-        motion = self._motion(observation)
-        self.state.predict(motion, self._bias_walk(observation.stamp))
+        coasts = self._predict(observation)
         if self._window is not None:
             self._window.follow(self.state, self.tracks)
         matched = _Matched.none(observation.detections)
@@ -222,12 +221,16 @@ class FrontEnd:
         self._use_grid(observation)
         self._use_reflectors(observation, matched)
         doubtful = self._is_doubtful(observation, matched, evidence)
+        if coasts:
+            motion = self._coasting.found(self.state, observation.motion)
+            observation = replace(observation, motion=motion)
         observation = self._with_spread(observation, matched)
         self._map_reflectors(observation, matched, doubtful)
         self._map_scan(observation, evidence, doubtful and evidence.misfit)
         self._remember_velocity(observation.stamp)
+        moved = observation.motion.delta
         self.confirmation.judge(
-            observation.stamp, math.hypot(motion.delta[0], motion.delta[1]), len(matched.status),
+            observation.stamp, math.hypot(moved[0], moved[1]), len(matched.status),
             matched.num_used, matched.agrees, self._fix,
         )  # fmt: skip
         health = self._judge(observation, matched, evidence)
@@ -237,23 +240,19 @@ class FrontEnd:
 
     # --- prior -----------------------------------------------------------------------------
 
-    def _motion(self, observation: Observation) -> Motion:
-        """The measured motion; of a robot without any odometry, constant velocity, wide."""
-        motion = observation.motion
+    def _predict(self, observation: Observation) -> bool:
+        """Move the pose as odometry says; whether the robot has none and goes on as it went."""
+        stamp, last = observation.stamp, self._last_stamp
+        self._last_stamp = stamp
         self._has_odometry |= observation.odom_pose is not None
-        if self._has_odometry or self._last_stamp is None or not self._velocity_known:
-            return motion
-        dt = (observation.stamp - self._last_stamp) * 1e-9
-        if dt > self._p.motion.max_gap:
-            return motion
-        # white acceleration: sigma = a dt^2 / 2 for each axis, floored for the first steps
-        sigma = np.array([1.0, 0.5, 2.0]) * dt * dt * 2.0 + np.array([0.02, 0.02, 0.02])
-        return Motion(se2.exp(self._velocity * dt), np.diag(sigma**2), known=False)
-
-    def _bias_walk(self, stamp: int) -> float:
-        """Variance that the gyro's bias gains until ``stamp``."""
-        dt = 0.0 if self._last_stamp is None else (stamp - self._last_stamp) * 1e-9
-        return self._p.motion.imu_bias_walk**2 * dt
+        dt = 0.0 if last is None else (stamp - last) * 1e-9
+        coasts = not self._has_odometry and last is not None
+        if coasts:
+            self._coasting.predict(self.state, dt, observation.motion)
+        else:
+            # the variance that the gyro's bias gains until now
+            self.state.predict(observation.motion, self._p.motion.imu_bias_walk**2 * dt)
+        return coasts
 
     def _remember_velocity(self, stamp: int) -> None:
         """Velocity over BURST at least: scans of one burst are too close to divide by."""
@@ -263,8 +262,7 @@ class FrontEnd:
         elif stamp - since[0] >= BURST:
             dt = (stamp - since[0]) * 1e-9
             self._velocity = se2.log(se2.between(since[1], pose)) / dt
-            self._velocity_known, self._since = True, (stamp, pose)
-        self._last_stamp = stamp
+            self._since = (stamp, pose)
 
     # --- reflector term ----------------------------------------------------------------------
 
@@ -367,7 +365,9 @@ class FrontEnd:
         points = thinning.thin(observation.points, p.voxel, p.max_points)
         prior, strength = prior_of(self.state.x, self.state.P, np.array(p.floor2))
         found = match(submap, points, prior, strength, p, searched=False)
-        if found.score < p.good_score or found.prior_weight < 0.5:
+        # where nothing but the speed leads to the start, a fit that is worse is of another place
+        least = 0.0 if self._has_odometry else AS_USUAL * self.doubt.usual
+        if found.score < max(p.good_score, least) or found.prior_weight < 0.5:
             searched = match(submap, points, prior, strength, p)
             found = searched if searched.score > found.score else found
         misfit = self.doubt.misfits(found.score, submap.insertions)
@@ -377,8 +377,11 @@ class FrontEnd:
         if found.score < p.min_score or (misfit and not matched.agrees):
             return Evidence(scan=True, misfit=misfit, beams=len(points), score=found.score)
         self.doubt.learn(found.score)
-        information = observability.information(submap, points, found.pose, p)
-        fuse(self.state.x, self.state.P, found.pose, information, p.prior_scale)
+        share = observability.share_open(self._has_odometry)
+        information = observability.information(submap, points, found.pose, p, share)
+        # a speed is less sure than odometry: what it leads wrong by must not make a new one
+        gate = p.prior_scale if self._has_odometry else p.prior_scale / math.sqrt(3.0)
+        fuse(self.state.x, self.state.P, found.pose, information, gate)
         heading = float(self.state.anchor(0)[2])
         return Evidence(
             scan=True,
@@ -449,7 +452,7 @@ class FrontEnd:
         return self.health.judge(
             observation.stamp,
             evidence,
-            odometry=observation.motion.known,
+            odometry=observation.motion.known or not self._p.node.use_odom,
             detections=None if observation.detections is None else len(observation.detections),
             used=matched.num_used,
             cov=self.in_map(self.state.pose, self.state.pose_cov)[1],

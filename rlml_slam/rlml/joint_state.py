@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The newest pose, the anchors of two submaps and the reflectors: one mean, one covariance.
+"""The newest pose and velocity, two submaps' anchors, the reflectors: one mean, one covariance.
 
 Eq. 5 and 11 of the notes hold the reflectors and the submap fixed, which makes the covariance
 shrink without end while the same few errors of the map are measured again and again. Here they
@@ -11,6 +11,7 @@ first sighting ties it to the pose of that moment.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,19 +22,30 @@ from rlml_slam.se2 import Array
 from rlml_slam.types import Motion
 
 BIAS = 3
-ANCHORS = (4, 7)
-LANDMARKS = 10
+VELOCITY = 4
+ANCHORS = (7, 10)
+LANDMARKS = 13
+MOVING = slice(VELOCITY, VELOCITY + 3)
 
 
 class JointState:
-    """Mean ``x`` (10 + 2m,) = pose, gyro bias, two anchors, reflectors; and covariance ``P``."""
+    """Mean ``x`` (13 + 2m,) and covariance ``P`` of all that is estimated together.
 
-    def __init__(self, pose: Array, cov: Array, bias_sigma: float) -> None:
+    In this order: the pose, the gyro's bias, the velocity (forward, left, turn) of the base, which
+    a robot with odometry does not need (:mod:`coasting`), two anchors, the reflectors.
+    """
+
+    def __init__(
+        self, pose: Array, cov: Array, bias_sigma: float, speeds: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> None:
+        """``speeds`` (3,) [m/s, m/s, rad/s] are the sigmas of an unknown velocity."""
         self.x = np.zeros(LANDMARKS)
         self.P = np.zeros((LANDMARKS, LANDMARKS))
         self.x[:3] = pose
         self.P[:3, :3] = cov
         self.P[BIAS, BIAS] = bias_sigma**2
+        self._unknown = np.diag(np.array(speeds) ** 2)
+        self.P[MOVING, MOVING] = self._unknown
 
     @property
     def num_landmarks(self) -> int:
@@ -90,8 +102,11 @@ class JointState:
     def place(self, pose: Array, cov: Array) -> None:
         """Put the pose (3,) elsewhere, with an error of covariance (3, 3) of its own."""
         self.x[:3] = pose
-        self.P[:3, :] = self.P[:, :3] = 0.0
+        self.x[MOVING] = 0.0
+        for rows in (slice(3), MOVING):
+            self.P[rows, :] = self.P[:, rows] = 0.0
         self.P[:3, :3] = cov
+        self.P[MOVING, MOVING] = self._unknown
 
     def widen(self, cov: Array) -> None:
         """Add independent uncertainty (3, 3) to the pose."""
@@ -124,8 +139,8 @@ class JointState:
     def replace(self, points: Array, cov: Array, anchor_cov: Array) -> None:
         """New reflectors (m, 2) and the joint covariance (3 + 2m, 3 + 2m) of the pose and them.
 
-        Pose, bias and anchors keep their means; an anchor keeps its place relative to the pose,
-        known but for ``anchor_cov`` (3, 3).
+        All else keeps its mean; an anchor keeps its place relative to the pose, known but for
+        ``anchor_cov`` (3, 3).
         """
         n = LANDMARKS + 2 * len(points)
         x, P = np.zeros(n), np.zeros((n, n))
@@ -134,6 +149,7 @@ class JointState:
         rows = np.r_[0:3, LANDMARKS:n]
         P[np.ix_(rows, rows)] = cov
         P[BIAS, BIAS] = self.P[BIAS, BIAS]
+        P[MOVING, MOVING] = self.P[MOVING, MOVING]
         for a in ANCHORS:
             J, _ = se2.compose_jacobians(x[:3], se2.between(x[:3], x[a : a + 3]))
             P[a : a + 3, :] = J @ P[:3, :]

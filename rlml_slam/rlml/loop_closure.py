@@ -157,6 +157,7 @@ class ScanGraph:
     def __init__(self, params: Parameters, graph: Graph) -> None:
         self._p = params
         self._graph = graph
+        self._open = observability.share_open(params.node.use_odom)
         self._active: list[KeySubmap] = []
         self._finished: list[KeySubmap] = []
         self._pyramids: OrderedDict[KeySubmap, search.Pyramid] = OrderedDict()
@@ -222,7 +223,7 @@ class ScanGraph:
         found = match(m.submap, points, guess, prior, p, searched=False)
         if found.score < p.min_score or key.index == m.anchor.index:
             return
-        information = observability.information(m.submap, points, found.pose, p)
+        information = observability.information(m.submap, points, found.pose, p, self._open)
         self._edge(EdgeKind.SCAN, m, key, found.pose, information)
 
     def _edge(
@@ -441,7 +442,9 @@ class ScanGraph:
         found = match(m.submap, points, result.best.pose, weak, self._p.scan_match, searched=False)
         if found.score < p.min_score:
             return rejected('the refined fit is too weak', found.score)
-        information = observability.information(m.submap, points, found.pose, self._p.scan_match)
+        information = observability.information(
+            m.submap, points, found.pose, self._p.scan_match, self._open
+        )
         if np.linalg.eigvalsh(np.linalg.inv(information + OPEN * np.eye(3))[:2, :2])[1] > HELD**2:
             return rejected('the scan leaves a direction open', found.score)
         term = linearize(m.submap, points, found.pose)

@@ -41,7 +41,7 @@ def prior_of(x: Array, P: Array, floor2: Array) -> tuple[Array, Array]:
     return pose, information
 
 
-@part
+@kernel
 def relative(x: Array, P: Array) -> tuple[Array, Array]:
     """The pose in the frame of the submap (3,) and its covariance (3, 3)."""
     c, s = math.cos(x[TARGET + 2]), math.sin(x[TARGET + 2])
@@ -89,5 +89,6 @@ def fuse(x: Array, P: Array, pose: Array, information: Array, prior_scale: float
 def warm_up() -> None:
     """Compile the kernels with the signatures that are used at run time."""
     state = JointState(np.zeros(3), np.eye(3), 0.1)
+    relative(state.x, state.P)
     prior_of(state.x, state.P, np.ones(3))
     fuse(state.x, state.P, np.zeros(3), np.eye(3), 3.0)

@@ -11,7 +11,7 @@ from rlml_slam.maps.saved import SavedMap
 from rlml_slam.params import Node, Parameters, Reflector
 from rlml_slam.rlml import map_window
 from rlml_slam.rlml.front_end import FrontEnd
-from rlml_slam.rlml.joint_state import JointState
+from rlml_slam.rlml.joint_state import LANDMARKS, JointState
 from rlml_slam.rlml.map_window import MARGIN, MapWindow
 from rlml_slam.rlml.tracks import Tracks
 from rlml_slam.types import ANONYMOUS, Reflectors
@@ -50,7 +50,7 @@ def test_what_stays_in_reach_keeps_what_is_known_of_it():
     window.follow(state, tracks)
     index = int(np.argmin(np.abs(AISLE[tracks.keys, 0] - 106.0)))
     key = tracks.keys[index]
-    state.apply(np.arange(10 + 2 * index, 12 + 2 * index), np.eye(2), 1e-6 * np.eye(2), np.ones(2))
+    state.apply(LANDMARKS + 2 * index + np.arange(2), np.eye(2), 1e-6 * np.eye(2), np.ones(2))
     told = state.landmark_covs()[index].copy()
     state.x[0] = 100.0 + 1.5 * MARGIN
     window.follow(state, tracks)
