@@ -17,7 +17,7 @@ import math
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -36,8 +36,10 @@ MAX_SWEEP = 1.0  # [s] of one scan
 SIGMA = (1e-4, 10.0)  # [m] a detection that claims to be better or worse is believed this much
 INSTANTS = 20  # instants remembered: the other half of one comes soon after
 AHEAD = SECOND  # a stamp this far before all others is strange; sensors lag by less
-PERSISTENT = 10  # inputs in a row: fewer with a strange stamp are faults, more are a new clock
+CONFIRM = 3  # messages that tell whether time did go on where a stamp is strange
+PERSISTENT = 10  # inputs in a row that are behind: fewer are late, more are of a new clock
 # stamp, stream, what came, and how much later than its stamp it was measured [ns]
+Message: TypeAlias = Odometry | Imu | Scan | Detections
 Waiting: TypeAlias = tuple[int, str, Scan | Detections, int]
 
 
@@ -92,7 +94,15 @@ class Sequencer:
         self._newest_any = -(2**62)
         self._first_any: int | None = None
         self._step: dict[str, int] = {}  # by stream: between its last two stamps
-        self._num_ahead = self._num_behind = 0  # messages in a row whose stamp is far off
+        self._num_behind = 0  # messages in a row whose stamp is far behind
+        self._parked: list[tuple[str, Message]] = []  # put aside, their stamps far ahead
+        self._num_passed = 0  # messages since that were not
+        self._add: dict[str, Callable[[Any], list[Observation]]] = {
+            'odom': self.add_odometry,
+            'imu': self.add_imu,
+            'scan': self.add_scan,
+            'reflectors': self.add_detections,
+        }
         self._last: int | None = None  # stamp up to which motion is used or carried
         self._carried = STILL
         self._white = 0.0  # [s] error of the last stamp that is not of the next
@@ -107,6 +117,8 @@ class Sequencer:
         """One wheel odometry sample."""
         if not self._node.use_odom:
             return []
+        if self._parks('odom', sample):
+            return self._unpark()
         sample = dataclasses.replace(sample, stamp=self._steady('odom', '', sample.stamp))
         valid = np.shape(sample.pose) == (3,) and bool(np.all(np.isfinite(sample.pose)))
         if self._accept('odom', sample.stamp, valid, 'pose is not finite'):
@@ -119,6 +131,8 @@ class Sequencer:
         """One IMU sample."""
         if not self._node.use_imu:
             return []
+        if self._parks('imu', sample):
+            return self._unpark()
         sample = dataclasses.replace(sample, stamp=self._steady('imu', '', sample.stamp))
         if self._accept('imu', sample.stamp, np.isfinite(sample.yaw_rate), 'rate is not finite'):
             self.buffer.add_imu(sample)
@@ -127,6 +141,8 @@ class Sequencer:
 
     def add_scan(self, scan: Scan) -> list[Observation]:
         """One sweep; used for its stamp alone where ``use_scan`` is false."""
+        if self._parks('scan', scan):
+            return self._unpark()
         n = len(scan.ranges)
         geometry = (scan.angle_min, scan.angle_increment, scan.time_increment, scan.range_max)
         if n == 0:
@@ -150,6 +166,8 @@ class Sequencer:
         """The reflectors of one instant."""
         if not self._node.use_reflectors:
             return []
+        if self._parks('reflectors', detections):
+            return self._unpark()
         d = detections
         finite = np.isfinite(d.points).all() and np.isfinite(d.cov).all()
         if self._known_frame('reflectors', d.frame_id) and self._accept(
@@ -182,7 +200,7 @@ class Sequencer:
 
     def flush(self) -> list[Observation]:
         """Everything that still waits, at the end of the data."""
-        return self._release(lambda _stamp, _end: True)
+        return self._unpark(1) + self._release(lambda _stamp, _end: True)
 
     def _known_frame(self, stream: str, frame_id: str) -> bool:
         """Whether the sensor's pose is known; the first unknown frame gets ``laser_pose``."""
@@ -214,8 +232,6 @@ class Sequencer:
         if stamp == self._newest_of.get((stream, source)):
             self.inputs.count(stream, 'duplicate')
             return False
-        if self._is_ahead(stream, stamp):
-            return False
         self._look_back(stream, stamp)
         newest = self._newest.get(stream)
         measured = stream in ('scan', 'reflectors')
@@ -234,23 +250,38 @@ class Sequencer:
             self._first_any = stamp
         return True
 
-    def _is_ahead(self, stream: str, stamp: int) -> bool:
-        """Whether a stamp is too far ahead of all others to be believed.
+    def _parks(self, stream: str, message: Message) -> bool:
+        """Whether a message is put aside, for its stamp is too far ahead of all others.
 
-        One that is believed makes all that come after it late. Where nothing else comes for some
-        messages, time did go on.
+        One that is believed makes all that come after it late. Where the others go on as before,
+        it is left out; where it is followed by more of its kind, time did go on.
         """
+        stamp = message.stamp
         ahead = stamp - self._newest_any
-        if self._first_any is None or ahead <= AHEAD + 3 * self._step.get(stream, 0):
-            self._num_ahead = 0
-            return False
-        self._num_ahead += 1
-        if self._num_ahead >= PERSISTENT:
-            self._num_ahead = 0
-            return False
-        error = f'{stream} at {stamp} ns is {ahead / SECOND:.1f} s ahead of all other stamps'
-        self.inputs.count(stream, 'future', error)
-        return True
+        if self._first_any is not None and ahead > AHEAD + 3 * self._step.get(stream, 0):
+            self._parked.append((stream, message))
+            self._num_passed = 0
+            return True
+        if self._parked and stamp > self._newest.get(stream, stamp):
+            self._num_passed += 1
+            if self._num_passed >= CONFIRM:
+                self._leave_out_parked()
+        return False
+
+    def _leave_out_parked(self) -> None:
+        for stream, message in self._parked:
+            ahead = (message.stamp - self._newest_any) / SECOND
+            error = f'{stream} at {message.stamp} ns is {ahead:.1f} s ahead of all other stamps'
+            self.inputs.count(stream, 'future', error)
+        self._parked = []
+
+    def _unpark(self, least: int = CONFIRM) -> list[Observation]:
+        """Take in what was put aside, if there is enough of it."""
+        if not self._parked or len(self._parked) < least:
+            return []
+        parked, self._parked = self._parked, []
+        self._newest_any = max(self._newest_any, parked[0][1].stamp)
+        return [o for stream, message in parked for o in self._add[stream](message)]
 
     def _look_back(self, stream: str, stamp: int) -> None:
         """Find out which is right where stamps are far behind the newest one.

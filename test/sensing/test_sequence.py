@@ -273,20 +273,38 @@ def test_detections_are_moved_from_their_sensor_to_the_base():
 def test_single_stamps_far_ahead_are_left_out():
     sequencer, t = running()
     assert feed(sequencer, [odometry(t + 100 * SECOND), scan(t + 100 * SECOND)]) == []
+    more = [odometry(t + k * 20 * MS) for k in range(1, 5)]
+    (o,) = feed(sequencer, [scan(t), detections(t), *more])
+    assert o.motion.known
     assert sequencer.inputs.counts['odom']['future'] == 1
     assert sequencer.inputs.counts['scan']['future'] == 1
-    (o,) = feed(sequencer, [scan(t), detections(t), odometry(t + 20 * MS)])
-    assert o.motion.known
 
 
 def test_clock_that_stays_ahead_is_followed():
     sequencer, t = running()
     ahead = t + 100 * SECOND
     feed(sequencer, [odometry(ahead + k * 20 * MS) for k in range(100)])
-    assert sequencer.inputs.counts['odom']['future'] == PERSISTENT - 1
     s = ahead + 50 * 20 * MS
     out = feed(sequencer, [scan(s), detections(s), odometry(ahead + 2 * SECOND)])
     assert [o.stamp for o in out] == [s]
+    assert 'future' not in sequencer.inputs.counts['odom']
+
+
+@pytest.mark.parametrize('pause', [1.5, 8.0, 60.0])
+@pytest.mark.parametrize('odometry_too', [True, False])
+def test_nothing_is_lost_across_a_pause_of_everything(pause, odometry_too):
+    later = int(pause * SECOND)
+    inputs = [m for m in drive_inputs() if odometry_too or not isinstance(m, Odometry)]
+    again = [replace(m, stamp=m.stamp + 3 * SECOND + later) for m in inputs]
+    # the last of them begin a second pause: the end of the data is no reason to lose them
+    last = [replace(m, stamp=m.stamp + 10 * SECOND + 2 * later) for m in inputs[:2]]
+    sequencer = Sequencer(Parameters())
+    out = feed(sequencer, [*inputs, *again, *last]) + sequencer.flush()
+    assert len(out) == 61
+    assert sequencer.inputs.counts['scan']['used'] == 61
+    if odometry_too:
+        assert sequencer.inputs.counts['odom'] == {'used': 301}
+    assert all('future' not in c for c in sequencer.inputs.counts.values())
 
 
 @pytest.mark.parametrize('ahead', [5, 12, 25])
