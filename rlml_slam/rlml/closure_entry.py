@@ -24,8 +24,8 @@ from rlml_slam.se2 import Array
 
 Ints = NDArray[np.int64]
 APART = 1.0  # [m] between the places of two views that count as two
-# Chance that a wrong place, alike in one view, is alike in the next one as well: of 31 wrong
-# matches in two real logs, with odometry as it was and spoilt, none was.
+# Chance that a wrong place, alike in one view, is alike in the next one as well. Of the wrong
+# matches of two real logs, fewer were.
 ALIKE = 0.1
 RISK = 0.1  # chances that any of the closures that wait agrees with another by accident
 
