@@ -21,6 +21,7 @@ from rlml_slam.ros import build, convert
 from rlml_slam.ros.associated import read_associated
 from rlml_slam.ros.messages import make_rclpy as make
 from rlml_slam.ros.messages import rclpy_class
+from rlml_slam.sensing.sequence import CONFIRM
 from rlml_slam.types import Health, Level, Status
 
 SECOND = 1_000_000_000
@@ -320,8 +321,16 @@ def test_late_and_future_messages_are_counted_and_harmless(live, node):
     node.sensors.add('scan', early)
     node.sensors.add('scan', future)
     assert used(node, 'scan', 'late') == 1
-    assert used(node, 'scan', 'future') == 1
     assert node.last is before
+    # whether time did go on is told by what comes next
+    stream, last = next((s, m) for s, m in reversed(sent) if s == 'odom')
+    for k in range(1, CONFIRM + 1):
+        after = copy.deepcopy(last)
+        after.header.stamp.nanosec = (last.header.stamp.nanosec + k * 10_000_000) % SECOND
+        after.header.stamp.sec += (last.header.stamp.nanosec + k * 10_000_000) // SECOND
+        node.sensors.add(stream, after)
+    assert used(node, 'scan', 'future') == 1
+    assert node.last.stamp < convert.stamp(future, 'scan')
 
 
 @pytest.mark.parametrize('sec', [0, -5])

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels that were compiled from other sources are not used."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import rlml_slam
+from rlml_slam.compiled import forget_stale
+
+
+@pytest.fixture
+def package(tmp_path):
+    """A package whose kernel has a constant of another file built in."""
+    folder = tmp_path / 'some'
+    folder.mkdir()
+    (folder / '__init__.py').write_text('')
+    (folder / 'constants.py').write_text('N = 1\n')
+    (folder / 'kernels.py').write_text(
+        'from pathlib import Path\n'
+        'from rlml_slam.compiled import forget_stale, kernel\n'
+        'forget_stale(Path(__file__).parent)\n'
+        'from some.constants import N\n'
+        '@kernel\n'
+        'def answer(x):\n'
+        '    return x + N\n'
+    )
+    return folder
+
+
+def answer(package):
+    """What the kernel answers to 10 in a new process."""
+    code = 'from some.kernels import answer; print(answer(10))'
+    path = f'{package.parent}:{Path(rlml_slam.__file__).parents[1]}'
+    done = subprocess.run(
+        [sys.executable, '-c', code], env={'PYTHONPATH': path, 'HOME': str(package.parent)},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    return int(done.stdout)
+
+
+def test_constant_that_changed_in_another_file_is_used(package):
+    assert answer(package) == 11
+    assert list(package.glob('__pycache__/*.nbi'))
+    (package / 'constants.py').write_text('N = 25\n')
+    assert answer(package) == 35
+
+
+def test_kernels_of_the_same_sources_stay(package):
+    forget_stale(package)
+    compiled = package / '__pycache__' / 'kernels.answer.nbi'
+    compiled.touch()
+    forget_stale(package)
+    assert compiled.exists()
+    (package / 'more.py').write_text('')
+    forget_stale(package)
+    assert not compiled.exists()
+
+
+def test_folder_that_cannot_be_written_to_is_no_error(package):
+    (package / '__pycache__').write_text('not a folder')
+    forget_stale(package)
