@@ -118,7 +118,7 @@ class Sequencer:
         if not self._node.use_odom:
             return []
         if self._parks('odom', sample):
-            return self._unpark()
+            return self._release()
         sample = dataclasses.replace(sample, stamp=self._steady('odom', '', sample.stamp))
         valid = np.shape(sample.pose) == (3,) and bool(np.all(np.isfinite(sample.pose)))
         if self._accept('odom', sample.stamp, valid, 'pose is not finite'):
@@ -132,7 +132,7 @@ class Sequencer:
         if not self._node.use_imu:
             return []
         if self._parks('imu', sample):
-            return self._unpark()
+            return self._release()
         sample = dataclasses.replace(sample, stamp=self._steady('imu', '', sample.stamp))
         if self._accept('imu', sample.stamp, np.isfinite(sample.yaw_rate), 'rate is not finite'):
             self.buffer.add_imu(sample)
@@ -142,7 +142,7 @@ class Sequencer:
     def add_scan(self, scan: Scan) -> list[Observation]:
         """One sweep; used for its stamp alone where ``use_scan`` is false."""
         if self._parks('scan', scan):
-            return self._unpark()
+            return self._release()
         n = len(scan.ranges)
         geometry = (scan.angle_min, scan.angle_increment, scan.time_increment, scan.range_max)
         if n == 0:
@@ -167,7 +167,7 @@ class Sequencer:
         if not self._node.use_reflectors:
             return []
         if self._parks('reflectors', detections):
-            return self._unpark()
+            return self._release()
         d = detections
         finite = np.isfinite(d.points).all() and np.isfinite(d.cov).all()
         if self._known_frame('reflectors', d.frame_id) and self._accept(
@@ -200,7 +200,7 @@ class Sequencer:
 
     def flush(self) -> list[Observation]:
         """Everything that still waits, at the end of the data."""
-        return self._unpark(1) + self._release(lambda _stamp, _end: True)
+        return self._release(lambda _stamp, _end: True)
 
     def _known_frame(self, stream: str, frame_id: str) -> bool:
         """Whether the sensor's pose is known; the first unknown frame gets ``laser_pose``."""
@@ -264,24 +264,28 @@ class Sequencer:
             return True
         if self._parked and stamp > self._newest.get(stream, stamp):
             self._num_passed += 1
-            if self._num_passed >= CONFIRM:
-                self._leave_out_parked()
         return False
 
-    def _leave_out_parked(self) -> None:
-        for stream, message in self._parked:
-            ahead = (message.stamp - self._newest_any) / SECOND
-            error = f'{stream} at {message.stamp} ns is {ahead:.1f} s ahead of all other stamps'
-            self.inputs.count(stream, 'future', error)
-        self._parked = []
+    def _unpark(self, least: int) -> list[Observation]:
+        """Take in what was put aside, once it shows what is right; ``least`` of it say so.
 
-    def _unpark(self, least: int = CONFIRM) -> list[Observation]:
-        """Take in what was put aside, if there is enough of it."""
-        if not self._parked or len(self._parked) < least:
+        Where the others went on, it is what they have caught up with; the rest is left out.
+        """
+        others = self._num_passed >= CONFIRM
+        if not self._parked or (len(self._parked) < least and not others):
             return []
-        parked, self._parked = self._parked, []
-        self._newest_any = max(self._newest_any, parked[0][1].stamp)
-        return [o for stream, message in parked for o in self._add[stream](message)]
+        parked, self._parked, self._num_passed = self._parked, [], 0
+        if not others:
+            self._newest_any = max(self._newest_any, parked[0][1].stamp)
+        out = []
+        for stream, message in parked:
+            ahead = message.stamp - self._newest_any
+            if ahead <= AHEAD or not others:
+                out += self._add[stream](message)
+            else:
+                error = f'{stream} at {message.stamp} ns is {ahead / SECOND:.1f} s ahead of all '
+                self.inputs.count(stream, 'future', error + 'other stamps')
+        return out
 
     def _look_back(self, stream: str, stamp: int) -> None:
         """Find out which is right where stamps are far behind the newest one.
@@ -315,7 +319,7 @@ class Sequencer:
         self._waiting.sort(key=lambda w: (w[0], w[1]))
 
     def _release(self, ready: Callable[[int, int], bool] | None = None) -> list[Observation]:
-        out = []
+        out = self._unpark(CONFIRM if ready is None else 1)
         while self._waiting:
             stamp = self._waiting[0][0]
             # one scan and one set of detections; a second lidar's scan is the next observation
