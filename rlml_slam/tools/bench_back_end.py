@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from statistics import median
@@ -27,7 +26,7 @@ from rlml_slam.graph.initialize import initialize
 from rlml_slam.graph.solver import warm_up
 from rlml_slam.se2 import Array
 from rlml_slam.tools.bench_graphs import city, warehouse
-from rlml_slam.tools.bench_rivals import Run, Solver, installed
+from rlml_slam.tools.bench_rivals import Run, Solver, installed, single_thread
 
 SAME = 1.001  # chi2 within this factor of the best is the same optimum
 LIMIT = 100  # iterations, for solvers that stop by themselves
@@ -51,8 +50,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print."""
-    for name in ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS'):
-        os.environ.setdefault(name, '1')
+    single_thread()
     if args.runs < 1:
         raise RlmlError(f'--runs {args.runs} is not at least 1')
     libraries = {name: m for name, m in installed().items() if name not in args.without}

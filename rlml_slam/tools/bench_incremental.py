@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +28,7 @@ from rlml_slam.graph.solver import optimize
 from rlml_slam.se2 import Array
 from rlml_slam.tools.bench_back_end import read_graphs
 from rlml_slam.tools.bench_graphs import city, warehouse
-from rlml_slam.tools.bench_rivals import Isam, timed
+from rlml_slam.tools.bench_rivals import Isam, single_thread, timed
 from rlml_slam.types import EdgeKind
 
 
@@ -57,8 +56,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print."""
-    for name in ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS'):
-        os.environ.setdefault(name, '1')
+    single_thread()
     compile_kernels()
     with_rival = not args.alone and importlib.util.find_spec('gtsam') is not None
     results = []

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from statistics import median
@@ -28,7 +27,7 @@ from rlml_slam.graph.solver import optimize
 from rlml_slam.se2 import Array
 from rlml_slam.tools.bench_back_end import read_graphs
 from rlml_slam.tools.bench_graphs import city, warehouse
-from rlml_slam.tools.bench_rivals import bearing_range, timed
+from rlml_slam.tools.bench_rivals import gtsam_graph, single_thread, timed
 from rlml_slam.types import EdgeKind
 
 # information of the prior that stands for a fixed pose: about that of a laser's measurement, so
@@ -51,8 +50,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print."""
-    for name in ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS'):
-        os.environ.setdefault(name, '1')
+    single_thread()
     if args.runs < 1:
         raise RlmlError(f'--runs {args.runs} is not at least 1')
     warm_up()
@@ -143,19 +141,9 @@ def _gtsam(graph: Graph) -> tuple[float, tuple[Array, Array]]:
     """(CPU time [ms], the same from GTSAM), whose poses have their own axes."""
     import gtsam
 
-    n = len(graph.poses)
-    values, fg = gtsam.Values(), gtsam.NonlinearFactorGraph()
-    for i, pose in enumerate(graph.poses):
-        values.insert(i, gtsam.Pose2(*pose))
-    for k, point in enumerate(graph.landmarks):
-        values.insert(n + k, point)
+    n, p = len(graph.poses), graph.pose_priors
+    values, fg = gtsam_graph(graph)
     information = gtsam.noiseModel.Gaussian.Information
-    e, s, p = graph.edges, graph.sightings, graph.pose_priors
-    for (i, j), z, info in zip(e.nodes, e.measured, e.information, strict=True):
-        edge = gtsam.BetweenFactorPose2(int(i), int(j), gtsam.Pose2(*z), information(info))
-        fg.add(edge)
-    for (i, k), z, info in zip(s.nodes, s.measured, s.information, strict=True):
-        fg.add(bearing_range(int(i), int(n + k), z, info))
     for (i,), z, info in zip(p.nodes, p.measured, p.information, strict=True):
         fg.add(gtsam.PriorFactorPose2(int(i), gtsam.Pose2(*z), information(info)))
 

@@ -8,6 +8,7 @@ the process. Estimates are written back, so that one evaluator judges them all.
 from __future__ import annotations
 
 import importlib.util
+import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -122,11 +123,14 @@ def run_g2o(graph: Graph, iterations: int, algorithm: str) -> Run:
     return Run(ms, steps)
 
 
-def run_gtsam(graph: Graph, iterations: int, algorithm: str) -> Run:
-    """GTSAM with its default parameters; its edges have the group logarithm as residual.
+def single_thread() -> None:
+    """Let the libraries that are loaded from now on use one thread; all are measured by CPU."""
+    for name in ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS'):
+        os.environ.setdefault(name, '1')
 
-    A sighting becomes a range and bearing factor with the covariance carried over.
-    """
+
+def gtsam_graph(graph: Graph) -> tuple[Any, Any]:
+    """(values, factors) of a graph's edges and sightings; landmark k has the key poses + k."""
     import gtsam
 
     n = len(graph.poses)
@@ -135,13 +139,24 @@ def run_gtsam(graph: Graph, iterations: int, algorithm: str) -> Run:
         values.insert(i, gtsam.Pose2(*pose))
     for k, point in enumerate(graph.landmarks):
         values.insert(n + k, point)
-    gaussian = gtsam.noiseModel.Gaussian
     e, s = graph.edges, graph.sightings
     for (i, j), z, info in zip(e.nodes, e.measured, e.information, strict=True):
-        noise = gaussian.Information(info)
+        noise = gtsam.noiseModel.Gaussian.Information(info)
         fg.add(gtsam.BetweenFactorPose2(int(i), int(j), gtsam.Pose2(*z), noise))
     for (i, k), z, info in zip(s.nodes, s.measured, s.information, strict=True):
         fg.add(bearing_range(int(i), int(n + k), z, info))
+    return values, fg
+
+
+def run_gtsam(graph: Graph, iterations: int, algorithm: str) -> Run:
+    """GTSAM with its default parameters; its edges have the group logarithm as residual.
+
+    A sighting becomes a range and bearing factor with the covariance carried over.
+    """
+    import gtsam
+
+    values, fg = gtsam_graph(graph)
+    n = len(graph.poses)
     for fixed in np.flatnonzero(graph.fixed_poses):
         exact = gtsam.noiseModel.Constrained.All(3)
         fg.add(gtsam.PriorFactorPose2(int(fixed), gtsam.Pose2(*graph.poses[fixed]), exact))

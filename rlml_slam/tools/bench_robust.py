@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,7 +28,7 @@ from rlml_slam.graph.solver import optimize, warm_up
 from rlml_slam.graph.table import FactorKind
 from rlml_slam.se2 import Array
 from rlml_slam.tools.bench_back_end import read_graphs
-from rlml_slam.tools.bench_rivals import timed
+from rlml_slam.tools.bench_rivals import single_thread, timed
 from rlml_slam.tools.progress import Progress
 from rlml_slam.tools.wrong_closures import add_clustered, add_random, copied
 
@@ -68,8 +67,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print."""
-    for name in ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS'):
-        os.environ.setdefault(name, '1')
+    single_thread()
     if args.seeds < 1:
         raise RlmlError(f'--seeds {args.seeds} is not at least 1')
     counts = [_count(word) for word in args.wrong]

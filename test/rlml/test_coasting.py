@@ -2,11 +2,12 @@
 import numpy as np
 import pytest
 from differences import central_differences
+from made_states import made
 
 from rlml_slam import se2
 from rlml_slam.params import Node, Parameters, SimulatorParameters, from_mapping
 from rlml_slam.rlml.coasting import coast, way_cov
-from rlml_slam.rlml.joint_state import ANCHORS, BIAS, LANDMARKS, VELOCITY, JointState
+from rlml_slam.rlml.joint_state import BIAS, VELOCITY, JointState
 from rlml_slam.rlml.slam import Slam
 from rlml_slam.tools.drives import feed, simulate
 from rlml_slam.types import Level, Motion
@@ -16,25 +17,15 @@ TIME = 2.0
 UNMEASURED = Motion(np.zeros(3), np.eye(3), known=False)
 
 
-def made(seed=0, theta=0.4):
-    """A state with every correlation there can be."""
-    rng = np.random.default_rng(seed)
-    state = JointState(np.zeros(3), np.zeros((3, 3)), 0.02)
-    state.add_landmark(np.array([3.0, 1.0]), 0.01 * np.eye(2))
-    n = LANDMARKS + 2
-    state.x = rng.normal(0.0, 0.7, n)
-    state.x[2], state.x[BIAS] = theta, 0.01
-    for a in ANCHORS:
-        state.x[a + 2] = rng.uniform(-3.0, 3.0)
-    A = 0.05 * rng.standard_normal((n, n))
-    state.P = A @ A.T + 1e-4 * np.eye(n)
-    return state
+def moving(seed=0, theta=0.4):
+    """A state with every correlation there can be, at speeds of a robot."""
+    return made(seed, landmarks=1, theta=theta, spread=0.7)
 
 
 @pytest.mark.parametrize('theta', [0.0, 0.4, 3.1])
 @pytest.mark.parametrize('gain', [0.0, -0.5])
 def test_state_moves_by_its_velocity_as_in_a_dense_ekf(theta, gain):
-    state, dt = made(theta=theta), 0.5
+    state, dt = moving(theta=theta), 0.5
     x, P = state.x.copy(), state.P.copy()
     motion = Motion(
         np.array([0.0, 0.0, 0.3]), np.diag([1.0, 1.0, 1e-4]), False, np.array([0.0, 0.0, gain])
