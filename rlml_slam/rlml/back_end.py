@@ -22,11 +22,12 @@ from rlml_slam.graph.solver import optimize
 from rlml_slam.maps.occupancy import OccupancyGrid, render
 from rlml_slam.maps.survey import Survey, same
 from rlml_slam.params import Parameters
+from rlml_slam.rlml.closure import Closure
 from rlml_slam.rlml.closure_watch import ClosureWatch
 from rlml_slam.rlml.correction import Correction, Known, either
 from rlml_slam.rlml.deferred import DeferredMatches
 from rlml_slam.rlml.keyframes import Interval, Keyframe
-from rlml_slam.rlml.loop_closure import Closure, ScanGraph
+from rlml_slam.rlml.loop_closure import ScanGraph
 from rlml_slam.rlml.path import Path
 from rlml_slam.rlml.plant_frame import PlantFrame
 from rlml_slam.rlml.presence import Presence

@@ -7,7 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable
 
-from rlml_slam.rlml.loop_closure import Closure, State
+from rlml_slam.rlml.closure import Closure, State
 
 COLUMNS = (
     'number', 'keyframe_i', 'keyframe_j', 'state', 'residual', 'weight', 'score', 'overlap',

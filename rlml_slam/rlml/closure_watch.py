@@ -21,7 +21,7 @@ from rlml_slam.graph.robust import loss
 from rlml_slam.graph.selection import select_closures
 from rlml_slam.graph.solver import optimize
 from rlml_slam.params import Parameters
-from rlml_slam.rlml.loop_closure import Closure, State
+from rlml_slam.rlml.closure import Closure, State
 from rlml_slam.se2 import Array
 
 # judging all anew takes as long as many solves: after one, the graph must have grown this much

@@ -9,12 +9,9 @@ waits.
 
 from __future__ import annotations
 
-import math
-from collections import OrderedDict, deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from enum import Enum
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,128 +20,23 @@ from rlml_slam import se2
 from rlml_slam.graph.evidence import uniform
 from rlml_slam.graph.factors import relative_information
 from rlml_slam.graph.graph import Graph, Renumbering
-from rlml_slam.matching import observability, search, thinning
-from rlml_slam.matching.scan_match import linearize, match
+from rlml_slam.matching import observability, thinning
+from rlml_slam.matching.scan_match import match
 from rlml_slam.matching.submap import Submap
 from rlml_slam.params import Parameters
+from rlml_slam.rlml.closure import Closure, Fate, State
+from rlml_slam.rlml.closure_candidates import candidates
 from rlml_slam.rlml.closure_entry import may_enter
+from rlml_slam.rlml.closure_match import OPEN, Match, Matcher
+from rlml_slam.rlml.key_submap import TURN, KeySubmap
 from rlml_slam.rlml.keyframes import Keyframe
-from rlml_slam.rlml.submaps import GRID_TURN
 from rlml_slam.se2 import Array
 from rlml_slam.types import EdgeKind
 
-TURN = np.array([0.0, 0.0, GRID_TURN])
-OPEN = 1e-2  # [1/m², 1/rad²] an edge knows its directions to 10 m and 10 rad at the worst
-HELD = 1.0  # [m] a closure holds its place to this in any direction, or may be of another one
 COVERED = 0.8  # share of a submap's walls that a newer one must know to take its place
 RECORDS = 2000  # of closures; beyond, the oldest rejected ones go
-NOTES = 50  # changes of the weight of a closure that are remembered
 WAITING = 60  # closures that wait for others to agree with them, the newest
 WAITS = 'waits for others that agree'
-PYRAMIDS = 16  # search pyramids kept: each is several times as large as its submap
-
-
-class State(Enum):
-    """What a closure counts: what it is worth, nothing for now, nothing for good."""
-
-    ACTIVE = 0
-    DISABLED = 1
-    REVOKED = 2
-
-
-class Note(NamedTuple):
-    """When the newest keyframe was ``keyframe``: squared Mahalanobis norm and robust weight."""
-
-    keyframe: int
-    residual: float
-    weight: float
-
-
-@dataclass
-class Fate:
-    """What becomes of a closure: state with reason, residual now, and its weight over time."""
-
-    state: State = State.ACTIVE
-    reason: str = ''
-    residual: float = math.nan
-    notes: deque[Note] = field(default_factory=lambda: deque(maxlen=NOTES))
-
-    @property
-    def weight(self) -> float:
-        """The last one noted, NaN before the first."""
-        return self.notes[-1].weight if self.notes else math.nan
-
-    def note(self, keyframe: int, residual: float, weight: float) -> None:
-        """Remember a weight."""
-        self.notes.append(Note(keyframe, residual, weight))
-
-    def turn(self, state: State, reason: str) -> None:
-        """Go over to another state."""
-        self.state, self.reason = state, reason
-
-
-@dataclass(frozen=True)
-class Closure:
-    """A loop closure that was tried: poses ``i`` (submap's anchor) and ``j``, and the verdict.
-
-    ``edge`` is its index in ``graph.edges``, -1 where it was rejected; ``why`` says it in words.
-    ``score`` is the mean hit probability, ``second`` that of the second-best place per the best
-    one's (NaN where there is none), ``overlap`` the share of end points on walls. Those that were
-    accepted are numbered from 0; ``fate`` is what has become of it since.
-    """
-
-    i: int
-    j: int
-    delta: Array
-    score: float
-    edge: int
-    why: str
-    overlap: float = math.nan
-    second: float = math.nan
-    number: int = -1
-    fate: Fate = field(default_factory=Fate, compare=False)
-
-    @property
-    def accepted(self) -> bool:
-        """Whether it entered the graph."""
-        return self.edge >= 0
-
-
-@dataclass(eq=False)
-class KeySubmap:
-    """A submap of ``size`` keyframes, at ``T_anchor_grid`` (3,) from keyframe ``anchor``.
-
-    While it is being built that is the first of them, and the submap is turned by GRID_TURN.
-    """
-
-    anchor: Keyframe
-    submap: Submap
-    size: int = 0
-    centre: Array = field(default_factory=lambda: np.zeros(2))
-    T_anchor_grid: Array = field(default_factory=lambda: TURN)
-
-
-@dataclass(frozen=True)
-class _Match:
-    """A keyframe that fits a submap at ``T_grid_key`` (3,), with the information (3, 3) there.
-
-    The others as in Closure.
-    """
-
-    m: KeySubmap
-    key: Keyframe
-    T_grid_key: Array
-    information: Array
-    score: float
-    overlap: float
-    second: float
-
-    def closure(self, why: str, edge: int = -1, number: int = -1) -> Closure:
-        """Its record."""
-        return Closure(
-            self.m.anchor.index, self.key.index, self.T_grid_key, self.score, edge, why,
-            self.overlap, self.second, number,
-        )  # fmt: skip
 
 
 class ScanGraph:
@@ -160,8 +52,8 @@ class ScanGraph:
         self._open = observability.share_open(params.node.use_odom)
         self._active: list[KeySubmap] = []
         self._finished: list[KeySubmap] = []
-        self._pyramids: OrderedDict[KeySubmap, search.Pyramid] = OrderedDict()
-        self._waiting: list[_Match] = []
+        self._matcher = Matcher(params)
+        self._waiting: list[Match] = []
         self._wrong = uniform(params.loop_closure.searched)
         self._count = 0
         self._accepted = 0
@@ -375,17 +267,10 @@ class ScanGraph:
     def _close(
         self, key: Keyframe, points: Array, among: Sequence[KeySubmap]
     ) -> tuple[Closure, ...]:
-        """Try those ``among`` finished submaps that are near the keyframe, the nearest first."""
-        p = self._p.loop_closure
-        here = self._pose(key)[:2]
-        near = []
-        for k, m in enumerate(among):
-            centre = se2.transform(self._grid(m), m.centre[None])[0]
-            distance = float(np.linalg.norm(centre - here))
-            if distance < p.max_distance:
-                near.append((distance, k))
-        tried = [self._try(among[k], key, points) for _, k in sorted(near)[: p.candidates]]
-        fit = [match for match in tried if isinstance(match, _Match)]
+        """Try those ``among`` finished submaps that are near the keyframe."""
+        near = candidates(self._graph, key, among, self._p.loop_closure)
+        tried = [self._matcher.match(candidate, key, points) for candidate in near]
+        fit = [match for match in tried if isinstance(match, Match)]
         out = [closure for closure in tried if isinstance(closure, Closure)]
         if fit:
             out += self._admit(fit)
@@ -394,7 +279,7 @@ class ScanGraph:
             self.tried[closure.accepted] += 1
         return tuple(out)
 
-    def _admit(self, fresh: Sequence[_Match]) -> list[Closure]:
+    def _admit(self, fresh: Sequence[Match]) -> list[Closure]:
         """Let in what may, of the ``fresh`` ones and those that waited; the others wait."""
         matches = [*self._waiting, *fresh]
         measured = [
@@ -420,42 +305,3 @@ class ScanGraph:
         left = [c for c, enters in zip(matches, may.tolist(), strict=True) if not enters]
         self._waiting = left[-WAITING:]
         return out
-
-    def _try(self, m: KeySubmap, key: Keyframe, points: Array) -> _Match | Closure:
-        """Search and verify; the record of what failed."""
-        p = self._p.loop_closure
-        guess = se2.between(self._grid(m), self._pose(key))
-        i, j = m.anchor.index, key.index
-
-        def rejected(why: str, score: float = 0.0) -> Closure:
-            return Closure(i, j, guess, score, -1, why)
-
-        result = search.wide(
-            self._pyramid(m), points, guess, p.search_window, p.search_angle, p.min_score,
-            second_share=p.max_second,
-        )  # fmt: skip
-        if result.best is None:
-            return rejected('no place in the window fits')
-        if result.second is not None and result.second.score > p.max_second * result.best.score:
-            return rejected('a second place fits as well', result.best.score)
-        weak = np.diag(1.0 / np.array([0.5, 0.5, 0.2]) ** 2)
-        found = match(m.submap, points, result.best.pose, weak, self._p.scan_match, searched=False)
-        if found.score < p.min_score:
-            return rejected('the refined fit is too weak', found.score)
-        information = observability.information(
-            m.submap, points, found.pose, self._p.scan_match, self._open
-        )
-        if np.linalg.eigvalsh(np.linalg.inv(information + OPEN * np.eye(3))[:2, :2])[1] > HELD**2:
-            return rejected('the scan leaves a direction open', found.score)
-        term = linearize(m.submap, points, found.pose)
-        second = math.nan if result.second is None else result.second.score / result.best.score
-        overlap = term.inliers / max(term.count, 1)
-        return _Match(m, key, found.pose, information, found.score, overlap, second)
-
-    def _pyramid(self, m: KeySubmap) -> search.Pyramid:
-        if m not in self._pyramids:
-            self._pyramids[m] = search.Pyramid(m.submap)
-            if len(self._pyramids) > PYRAMIDS:
-                self._pyramids.popitem(last=False)
-        self._pyramids.move_to_end(m)
-        return self._pyramids[m]

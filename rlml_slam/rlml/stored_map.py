@@ -40,8 +40,8 @@ from rlml_slam.maps.saved import SavedMap
 from rlml_slam.maps.survey import Survey
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.back_end import BackEnd
+from rlml_slam.rlml.closure import Closure
 from rlml_slam.rlml.keyframes import Keyframe
-from rlml_slam.rlml.loop_closure import Closure
 from rlml_slam.types import Reflectors
 
 FORMAT, VERSION = 'rlml_slam map', 1

@@ -22,7 +22,7 @@ from rlml_slam import params, se2, warm_up
 from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.initialize import initialize
 from rlml_slam.graph.solver import optimize
-from rlml_slam.rlml.loop_closure import State
+from rlml_slam.rlml.closure import State
 from rlml_slam.rlml.slam import Slam
 from rlml_slam.ros.bag import BagReader
 from rlml_slam.ros.feed import Feed

@@ -17,7 +17,7 @@ from rlml_slam.maps import reflector_file
 from rlml_slam.nodes.back_end import BackEndNode
 from rlml_slam.nodes.front_end import FrontEndNode
 from rlml_slam.params import Parameters
-from rlml_slam.rlml.loop_closure import Closure
+from rlml_slam.rlml.closure import Closure
 from rlml_slam.rlml.slam import Slam
 from rlml_slam.ros import build, convert
 from rlml_slam.ros.associated import read_reflector_map

@@ -25,9 +25,12 @@ from rlml_slam.matching.submap import Submap
 from rlml_slam.params import BackEnd as BackEndParameters
 from rlml_slam.params import LoopClosure, Node, Parameters
 from rlml_slam.rlml.back_end import BackEnd
+from rlml_slam.rlml.closure_candidates import candidates
+from rlml_slam.rlml.closure_match import Matcher
 from rlml_slam.rlml.front_end import FrontEnd
+from rlml_slam.rlml.key_submap import KeySubmap
 from rlml_slam.rlml.keyframes import Interval, Keyframe, Sighting
-from rlml_slam.rlml.loop_closure import KeySubmap, ScanGraph
+from rlml_slam.rlml.loop_closure import ScanGraph
 from rlml_slam.types import ANONYMOUS, EdgeKind, Frame, Motion, Observation, Status
 
 CURVE = drive((0.6, 0.0, 3.0), (0.6, 0.6, 4.0), (0.5, -0.7, 2.0))
@@ -438,7 +441,6 @@ def test_outlier_between_keyframes_is_kept_apart():
 def test_loop_is_closed_only_by_a_scan_that_holds_its_place(open_):
     """A corridor looks the same from everywhere in it, until it has an end."""
     graph = Graph()
-    scans = ScanGraph(Parameters(), graph)
     pose = np.array([0.3, 0.1, 0.05])
     keys = [
         Keyframe(graph.add_pose(p), FIRST, p, EYE, None, None, FIRST) for p in (np.zeros(3), pose)
@@ -452,7 +454,10 @@ def test_loop_is_closed_only_by_a_scan_that_holds_its_place(open_):
     for _ in range(5):
         m.submap.insert(se2.transform(se2.inverse(m.T_anchor_grid), walls), np.zeros(2))
     m.submap.complete()
-    found = scans._try(m, keys[1], se2.transform(se2.inverse(pose), walls))
+    (candidate,) = candidates(graph, keys[1], [m], LoopClosure())
+    found = Matcher(Parameters()).match(
+        candidate, keys[1], se2.transform(se2.inverse(pose), walls)
+    )
     if open_:
         assert found.why == 'the scan leaves a direction open'
     else:

@@ -16,9 +16,10 @@ from rlml_slam.graph.robust import Loss, Losses, LossKind
 from rlml_slam.graph.solver import optimize
 from rlml_slam.params import Parameters
 from rlml_slam.rlml import loop_closure
+from rlml_slam.rlml.closure import NOTES, Closure, State
 from rlml_slam.rlml.closure_table import closure_table, told, weight
 from rlml_slam.rlml.closure_watch import ClosureWatch
-from rlml_slam.rlml.loop_closure import NOTES, Closure, ScanGraph, State
+from rlml_slam.rlml.loop_closure import ScanGraph
 from rlml_slam.tools import closures as command
 from rlml_slam.tools.main import main
 from rlml_slam.types import EdgeKind

@@ -14,8 +14,8 @@ from rlml_slam.maps.container import Content
 from rlml_slam.params import Parameters
 from rlml_slam.rlml import stored_map
 from rlml_slam.rlml.back_end import BackEnd
+from rlml_slam.rlml.closure import Closure
 from rlml_slam.rlml.front_end import FrontEnd
-from rlml_slam.rlml.loop_closure import Closure
 from rlml_slam.rlml.slam import Slam
 from rlml_slam.tools import map_export, map_info
 from rlml_slam.tools.main import main

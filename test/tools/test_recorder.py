@@ -19,7 +19,7 @@ from rclpy.serialization import deserialize_message, serialize_message  # noqa: 
 from rlml_slam.maps.occupancy import OccupancyGrid  # noqa: E402
 from rlml_slam.motion import STILL  # noqa: E402
 from rlml_slam.rlml.back_end import Update  # noqa: E402
-from rlml_slam.rlml.loop_closure import Closure  # noqa: E402
+from rlml_slam.rlml.closure import Closure  # noqa: E402
 from rlml_slam.ros import build  # noqa: E402
 from rlml_slam.ros.associated import build_reflector_map  # noqa: E402
 from rlml_slam.ros.frames import build_record  # noqa: E402

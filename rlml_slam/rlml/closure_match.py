@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scan searched in a finished submap by branch and bound, refined, and verified.
+
+By its score, by the lead over the second-best place, and by whether it is held in all directions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import numpy as np
+
+from rlml_slam.matching import observability, search
+from rlml_slam.matching.scan_match import linearize, match
+from rlml_slam.params import Parameters
+from rlml_slam.rlml.closure import Closure
+from rlml_slam.rlml.closure_candidates import Candidate
+from rlml_slam.rlml.key_submap import KeySubmap
+from rlml_slam.rlml.keyframes import Keyframe
+from rlml_slam.se2 import Array
+
+OPEN = 1e-2  # [1/m², 1/rad²] an edge knows its directions to 10 m and 10 rad at the worst
+HELD = 1.0  # [m] a closure holds its place to this in any direction, or may be of another one
+PYRAMIDS = 16  # search pyramids kept: each is several times as large as its submap
+
+
+@dataclass(frozen=True)
+class Match:
+    """A keyframe that fits a submap at ``T_grid_key`` (3,), with the information (3, 3) there.
+
+    The others as in Closure.
+    """
+
+    m: KeySubmap
+    key: Keyframe
+    T_grid_key: Array
+    information: Array
+    score: float
+    overlap: float
+    second: float
+
+    def closure(self, why: str, edge: int = -1, number: int = -1) -> Closure:
+        """Its record."""
+        return Closure(
+            self.m.anchor.index, self.key.index, self.T_grid_key, self.score, edge, why,
+            self.overlap, self.second, number,
+        )  # fmt: skip
+
+
+class Matcher:
+    """Searches and verifies; keeps what the search needs of submaps from one time to the next."""
+
+    def __init__(self, params: Parameters) -> None:
+        self._p = params
+        self._open = observability.share_open(params.node.use_odom)
+        self._pyramids: OrderedDict[KeySubmap, search.Pyramid] = OrderedDict()
+
+    def match(self, candidate: Candidate, key: Keyframe, points: Array) -> Match | Closure:
+        """Search and verify ``points`` (n, 2) of a keyframe; the record of what failed."""
+        p, m, guess = self._p.loop_closure, candidate.m, candidate.guess
+        i, j = m.anchor.index, key.index
+
+        def rejected(why: str, score: float = 0.0) -> Closure:
+            return Closure(i, j, guess, score, -1, why)
+
+        result = search.wide(
+            self._pyramid(m), points, guess, candidate.window, candidate.angle, p.min_score,
+            second_share=p.max_second,
+        )  # fmt: skip
+        if result.best is None:
+            return rejected('no place in the window fits')
+        if result.second is not None and result.second.score > p.max_second * result.best.score:
+            return rejected('a second place fits as well', result.best.score)
+        weak = np.diag(1.0 / np.array([0.5, 0.5, 0.2]) ** 2)
+        found = match(m.submap, points, result.best.pose, weak, self._p.scan_match, searched=False)
+        if found.score < p.min_score:
+            return rejected('the refined fit is too weak', found.score)
+        information = observability.information(
+            m.submap, points, found.pose, self._p.scan_match, self._open
+        )
+        if np.linalg.eigvalsh(np.linalg.inv(information + OPEN * np.eye(3))[:2, :2])[1] > HELD**2:
+            return rejected('the scan leaves a direction open', found.score)
+        term = linearize(m.submap, points, found.pose)
+        second = math.nan if result.second is None else result.second.score / result.best.score
+        overlap = term.inliers / max(term.count, 1)
+        return Match(m, key, found.pose, information, found.score, overlap, second)
+
+    def _pyramid(self, m: KeySubmap) -> search.Pyramid:
+        if m not in self._pyramids:
+            self._pyramids[m] = search.Pyramid(m.submap)
+            if len(self._pyramids) > PYRAMIDS:
+                self._pyramids.popitem(last=False)
+        self._pyramids.move_to_end(m)
+        return self._pyramids[m]

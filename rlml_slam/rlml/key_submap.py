@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A submap of the back end: made of keyframes, and hung on one of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rlml_slam.matching.submap import Submap
+from rlml_slam.rlml.keyframes import Keyframe
+from rlml_slam.rlml.submaps import GRID_TURN
+from rlml_slam.se2 import Array
+
+TURN = np.array([0.0, 0.0, GRID_TURN])
+
+
+@dataclass(eq=False)
+class KeySubmap:
+    """A submap of ``size`` keyframes, at ``T_anchor_grid`` (3,) from keyframe ``anchor``.
+
+    While it is being built that is the first of them, and the submap is turned by GRID_TURN.
+    """
+
+    anchor: Keyframe
+    submap: Submap
+    size: int = 0
+    centre: Array = field(default_factory=lambda: np.zeros(2))
+    T_anchor_grid: Array = field(default_factory=lambda: TURN)
