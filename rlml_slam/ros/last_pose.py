@@ -10,12 +10,16 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from rlml_slam import se2
 from rlml_slam.errors import FileFormatError
 from rlml_slam.maps.atomic import write_atomically
+from rlml_slam.maps.saved import SavedMap
+from rlml_slam.params import Parameters
+from rlml_slam.rlml.find_place import find_place
 from rlml_slam.rlml.relocalize import Relocation
 from rlml_slam.se2 import Array
 from rlml_slam.types import Frame, Level, Verdict
@@ -33,6 +37,32 @@ class LastPose:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._written: tuple[int, Array] | None = None
+        self.tried = False  # whether it was looked at: only the first frame can be at it
+
+    def follow(
+        self, frame: Frame, params: Parameters, in_map: SavedMap, logger: Any
+    ) -> tuple[Array, Array] | None:
+        """Where to start, pose (3,) and covariance (3, 3), if the first frame verifies it.
+
+        Later frames are remembered. Raises MapError where that cannot be.
+        """
+        if self.tried:
+            self.remember(frame)
+            return None
+        seen = frame.observation
+        if seen.points is None and seen.detections is None:
+            return None
+        self.tried = True
+        try:
+            last = self.read()
+        except FileFormatError as e:
+            logger.warning(f'{e}')
+            return None
+        if last is None:
+            return None
+        start, why = verified(last, find_place(in_map.grid, in_map.reflectors, seen, params))
+        logger.warning(why) if start is None else logger.info(why)
+        return start
 
     def read(self) -> Array | None:
         """The pose (3,), None where there is no file. Raises FileFormatError."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rlml_slam import se2
-from rlml_slam.errors import FileFormatError, MapError
+from rlml_slam.errors import MapError
 from rlml_slam.maps import container
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved import SavedMap
@@ -21,27 +21,22 @@ from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.closure_table import told
 from rlml_slam.rlml.find_place import find_place
 from rlml_slam.rlml.recovery import Recovery
-from rlml_slam.ros import build
-from rlml_slam.ros.associated import build_reflector_map
-from rlml_slam.ros.beliefs import StampedBelief, build_belief
+from rlml_slam.ros.beliefs import StampedBelief
 from rlml_slam.ros.continued import Continued
 from rlml_slam.ros.frames import Record
-from rlml_slam.ros.last_pose import LastPose, verified
+from rlml_slam.ros.last_pose import LastPose
 from rlml_slam.ros.map_folder import MapFolder
-from rlml_slam.ros.messages import make_rclpy, rclpy_class
+from rlml_slam.ros.map_topics import MapTopics
 from rlml_slam.ros.odom_frame import OdomFrame
 from rlml_slam.ros.products import MapProducts
-from rlml_slam.ros.sensors import LATCHED
 from rlml_slam.ros.steady_odom import SteadyOdom
 from rlml_slam.ros.tf import TransformPublisher
-from rlml_slam.ros.updates import build_update
 from rlml_slam.ros.worker import Worker
 from rlml_slam.se2 import Array
 from rlml_slam.types import Frame, Verdict
 
 MAX_BACKLOG = 20  # frames behind which pictures of the map are left out
 IDLE = 0.3  # [s] of the wall clock without a frame, after which the map is brought up to date
-CERTAIN = 1e-6 * np.eye(3)
 SAME_PLACE, SAME_TURN = 0.3, 0.1  # [m], [rad] of a scan from where it is believed
 ADVICE = (
     'drive to a place of the map that looks like no other and call again, or tell the pose on '
@@ -63,7 +58,6 @@ class Mapper:
         self.saved: SavedMap | None = None
         self._loaded: SavedMap | None = None  # the last one that came from the folder
         self._last_pose: LastPose | None = None
-        self._started = False  # whether the last pose was looked at
         if params.node.mode == 'localization':
             self._load(params.node.map_file_name)
         self.back_end = BackEnd(params, self.folder.survey(params.back_end.survey))
@@ -81,18 +75,8 @@ class Mapper:
         self._written: int | None = None  # stamp of the newest keyframe that is in a file
         self._heard = 0.0
         self._tf = TransformPublisher(node)
-        kind = rclpy_class('geometry_msgs/msg/PoseWithCovarianceStamped')
-        self._correction = node.create_publisher(kind, 'correction', LATCHED)
-        self._jumps = node.create_publisher(kind, 'jumps', 10)
-        self._steady = SteadyOdom(params.back_end, self._tell_jump)
-        cloud = rclpy_class('sensor_msgs/msg/PointCloud2')
-        self._belief = node.create_publisher(cloud, 'belief', 5)
-        self._updates = node.create_publisher(cloud, 'updates', 50)
-        self._initialpose = node.create_publisher(kind, 'initialpose', 10)
-        self._relocation = node.create_publisher(kind, 'relocation', 10)
-        grid = rclpy_class('nav_msgs/msg/OccupancyGrid')
-        self._grid = node.create_publisher(grid, 'localization_grid', LATCHED)
-        self._localization = node.create_publisher(cloud, 'localization_map', LATCHED)
+        self._topics = MapTopics(node, params.node)
+        self._steady = SteadyOdom(params.back_end, self._topics.jump)
         if self.saved is not None:
             self.worker.submit(self._use_saved)
         elif params.node.continue_map and self.folder.whole(params.node.map_file_name).exists():
@@ -126,9 +110,7 @@ class Mapper:
             update = self.back_end.add(frame if known is None else known.to_map(frame))
             if update is not None:
                 place = self.back_end.graph.poses[update.keyframe, :2]
-                self._updates.publish(
-                    build_update(make_rclpy, frame.stamp, self._p.node.map_frame, place, update)
-                )
+                self._topics.update(frame.stamp, place, update)
                 for closure in update.changed:
                     self._logger.warning(told(closure))
                 if update.gone:
@@ -136,7 +118,7 @@ class Mapper:
                     self._logger.warning(f'no longer seen where they were: reflectors {keys}')
                 if update.optimized:
                     self._tell_of_plant()
-                    self._send_correction()
+                    self._topics.correct(self.stamp, self.back_end)
                     self._send_belief(record)
         self._recover(record)
         self._use_last_pose(frame)
@@ -162,7 +144,7 @@ class Mapper:
         found = self._continued.enter(frame)
         if found is not None and found.pose is not None and found.cov is not None:
             self._logger.info(f'goes on in the saved map: {found.why}')
-            self._tell_pose(frame.stamp, found.pose, found.cov)
+            self._topics.start_at(frame.stamp, found.pose, found.cov)
         return not self._enters
 
     def _begin_session(self) -> None:
@@ -214,51 +196,22 @@ class Mapper:
         self._logger.info(f'found again: {found.why}')
         if self.saved is not None:
             self._told = record.session  # what is still to come of it is answered
-            self._tell_pose(frame.stamp, found.pose, found.cov)
+            self._topics.start_at(frame.stamp, found.pose, found.cov)
         else:
-            name = self._p.node.map_frame
-            self._relocation.publish(
-                build.pose_with_covariance(make_rclpy, frame.stamp, name, found.pose, found.cov)
-            )
+            self._topics.relocate(frame.stamp, found.pose, found.cov)
 
     def _use_last_pose(self, frame: Frame) -> None:
         """Start where the robot was last, if that is verified; and write down where it is."""
         if self._last_pose is None or self.saved is not self._loaded:
             return
         try:
-            if self._started:
-                self._last_pose.remember(frame)
-            elif frame.observation.points is not None or frame.observation.detections is not None:
-                self._started = True
-                self._restore(frame, self._last_pose)
+            start = self._last_pose.follow(frame, self._p, self.current(), self._logger)
         except MapError as e:
             self._logger.warning(f'{e}')
             self._last_pose = None  # where it cannot be written now, it cannot later
-
-    def _restore(self, frame: Frame, file: LastPose) -> None:
-        try:
-            last = file.read()
-        except FileFormatError as e:
-            self._logger.warning(f'{e}')
-            return
-        if last is None:
-            return
-        in_map = self.current()
-        found = find_place(in_map.grid, in_map.reflectors, frame.observation, self._p)
-        start, why = verified(last, found)
-        if start is None:
-            self._logger.warning(why)
         else:
-            self._logger.info(why)
-            self._tell_pose(frame.stamp, *start)
-
-    def _send_correction(self) -> None:
-        """The local frame in the map, with the covariance of the pose at this stamp in the map."""
-        frame, T = self._p.node.map_frame, self.back_end.T_map_local
-        known = self.back_end.known
-        cov = CERTAIN if known is None else known.cov_map
-        message = build.pose_with_covariance(make_rclpy, self.stamp, frame, T, cov)
-        self._correction.publish(message)
+            if start is not None:
+                self._topics.start_at(frame.stamp, *start)
 
     def _send_belief(self, record: Record) -> None:
         belief = self.back_end.belief()
@@ -269,7 +222,7 @@ class Mapper:
         stamped = StampedBelief(
             record.frame.stamp, record.session, self.back_end.T_map_local, belief
         )
-        self._belief.publish(build_belief(make_rclpy, stamped, self._p.node.map_frame))
+        self._topics.believe(stamped)
 
     def revoke(self, number: str) -> str:
         """In the worker: take a loop closure out of the map for good; what was done.
@@ -282,7 +235,7 @@ class Mapper:
             raise MapError('the map that is localized in does not change')
         closure = self.back_end.revoke(int(number))
         self._logger.warning(told(closure))
-        self._send_correction()
+        self._topics.correct(self.stamp, self.back_end)
         self.publish_map()
         return told(closure)
 
@@ -315,11 +268,6 @@ class Mapper:
         n = self._p.node
         self._tf.publish(self._sent, (n.map_frame, n.odom_frame), T)
 
-    def _tell_jump(self, stamp: int, jump: Array) -> None:
-        base = self._p.node.base_frame
-        none = np.zeros((3, 3))
-        self._jumps.publish(build.pose_with_covariance(make_rclpy, stamp, base, jump, none))
-
     def _forget(self) -> None:
         """The local frame is another one; so is the map, but for one that is localized in."""
         if self.saved is None:
@@ -328,17 +276,12 @@ class Mapper:
         self.back_end.T_map_local, self.back_end.known = np.zeros(3), None
         self.products.restart()
         self._newest = None
-        self._send_correction()
+        self._topics.correct(self.stamp, self.back_end)
 
     def start_at(self, pose: Array) -> None:
         """In the worker: begin anew at a pose of the map, the front end as well."""
         self._forget()
-        self._tell_pose(self.stamp, pose, CERTAIN)
-
-    def _tell_pose(self, stamp: int, pose: Array, cov: Array) -> None:
-        frame = self._p.node.map_frame
-        message = build.pose_with_covariance(make_rclpy, stamp, frame, pose, cov)
-        self._initialpose.publish(message)
+        self._topics.start_at(self.stamp, pose)
 
     def save(self, name: str) -> str:
         """In the worker: write the map; what was written, in words. Raises MapError."""
@@ -368,8 +311,9 @@ class Mapper:
         if self.saved is None:
             self._continue(name)
             return self.current()
-        self._started = True  # the robot is where it is, not where it was last in that map
         self._load(name)
+        if self._last_pose is not None:
+            self._last_pose.tried = True  # the robot is where it is, not where it was last
         self._use_saved()
         return self.saved
 
@@ -392,11 +336,7 @@ class Mapper:
     def _use_saved(self) -> None:
         """Publish the map that never changes, and tell the front end to localize in it."""
         assert self.saved is not None
-        frame, reflectors = self._p.node.map_frame, self.saved.reflectors
-        grid = self.saved.grid or OccupancyGrid(1.0, (0.0, 0.0), np.zeros((0, 0), dtype=np.int8))
-        self._grid.publish(build.occupancy_grid(make_rclpy, self.stamp, frame, grid))
-        message = build_reflector_map(make_rclpy, self.stamp, frame, reflectors)
-        self._localization.publish(message)
+        self._topics.localize_in(self.stamp, self.saved)
         self.publish_map()
 
     def localize(self, on: bool) -> str:
@@ -414,9 +354,7 @@ class Mapper:
             self._use_saved()
             return f'localizes in the map as it is now: {_content(current)}'
         self.saved = None
-        header = build.header(make_rclpy, self.stamp, self._p.node.map_frame)
-        # without fields: no map to localize in
-        self._localization.publish(make_rclpy('sensor_msgs/msg/PointCloud2', header=header))
+        self._topics.localize_nowhere(self.stamp)
         self._keep()
         self._forget()
         return 'maps: a new map begins where the robot is, in the axes of the old one'
@@ -436,7 +374,7 @@ class Mapper:
         distance = math.hypot(away[0], away[1])
         if self.saved is not None:
             assert found.cov is not None
-            self._tell_pose(frame.stamp, found.pose, found.cov)
+            self._topics.start_at(frame.stamp, found.pose, found.cov)
             return True, f'{place}; {distance:.2f} m from where it was believed'
         if distance < SAME_PLACE and abs(away[2]) < SAME_TURN:
             return True, f'{place}; this is where it is believed to be'

@@ -38,5 +38,5 @@ def picture(e: Evidence, figures: dict[str, Any]) -> bytes:
     for axes in (over, beside):
         axes.grid(True, color=FAINT, linewidth=0.5)
         axes.set_axisbelow(True)
-    over.legend(frameon=False, fontsize=8, markerscale=6.0)
+    over.legend(frameon=False, fontsize=8, markerscale=6.0, loc='upper right')
     return png(figure)

@@ -274,5 +274,5 @@ def timing_picture(run: Run) -> bytes:
             axes.axvline(
                 value, color=INK, linewidth=0.9, linestyle=style, label=f'{name} {value:.2f} ms'
             )
-        axes.legend(frameon=False, fontsize=8)
+        axes.legend(frameon=False, fontsize=8, loc='upper right')
     return png(figure)

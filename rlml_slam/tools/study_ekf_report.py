@@ -126,5 +126,5 @@ def draw_consistency(series: Mapping[str, Series]) -> bytes:
             axes.grid(True, alpha=0.3)
     panels[0, 0].set_ylabel('mean NEES')
     panels[1, 0].set_ylabel('RMS heading error [°]')
-    panels[0, 0].legend(fontsize=8)
+    panels[0, 0].legend(fontsize=8, loc='upper right')
     return png(figure)

@@ -150,7 +150,7 @@ def picture(results: dict[str, Result], figures: dict[str, Any], gps: Trajectory
             aspect='equal', xlabel='x [m]',
             title=f'{system.replace("_", " ")}: {figures[system]["rmse_m"]:.1f} m',
         )  # fmt: skip
-        axes.legend(fontsize=8)
+        axes.legend(fontsize=8, loc='upper right')
     # a path that is lost must not make the park a dot
     low, high = gps.poses[:, :2].min(axis=0) - 40.0, gps.poses[:, :2].max(axis=0) + 40.0
     panels[0].set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), ylabel='y [m]')
