@@ -112,7 +112,7 @@ def factorise(
             child -= 1
         if not partial_cholesky(values, at, width, height, floor):
             return s
-        _lower_step(fronts, entries, values, s, x, work)
+        lower_step(fronts, entries, values, s, x, work)
         schur_update(values, at, width, height, mine, u)
         for c in range(count[other] - 1, child, -1):
             num_runs = _runs(fronts, entries, pending[other, c], s, runs)
@@ -189,11 +189,11 @@ def solve_lower(fronts: Records, entries: Records, values: Array, x: Array) -> N
     """X becomes L^-1 x, by positions."""
     work = np.empty(highest(fronts))
     for s in range(len(fronts) - 1):
-        _lower_step(fronts, entries, values, s, x, work)
+        lower_step(fronts, entries, values, s, x, work)
 
 
 @part
-def _lower_step(
+def lower_step(
     fronts: Records, entries: Records, values: Array, s: int, x: Array, work: Array
 ) -> None:
     """Front s's part in the forward solve."""

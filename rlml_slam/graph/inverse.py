@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from rlml_slam.compiled import kernel, part
-from rlml_slam.graph.fronts import solve_lower, solve_upper
+from rlml_slam.graph.fronts import highest, lower_step, solve_lower, solve_upper
 from rlml_slam.graph.structure import Ints, Records
 from rlml_slam.graph.system import System
 from rlml_slam.se2 import Array
@@ -135,4 +135,47 @@ def columns(system: System, which: Ints) -> Array:
         x[which[k]] = 1.0
         solve_lower(system.fronts, system.entries, system.values, x)
         solve_upper(system.fronts, system.entries, system.values, x)
+    return out
+
+
+@kernel
+def joint(system: System, which: Ints) -> Array:
+    """Rows and columns ``which`` (k,) of H^-1 (k, k), with the factor of H in the panels.
+
+    With H = L L^T it is Y^T Y of the columns Y = L^-1 E, and each of these is zero but in the
+    fronts from its own one to the root.
+    """
+    fronts, entries = system.fronts, system.entries
+    num, k = len(fronts) - 1, len(which)
+    owner = np.empty(len(system.g), np.int64)
+    for s in range(num):
+        own = entries[fronts[s]['start']]['scalar']
+        owner[own : own + fronts[s]['width']] = s
+    Y = np.empty((k, len(system.g)))
+    work = np.empty(highest(fronts))
+    met = np.empty(num, np.int64)  # the last column whose way to the root a front was on
+    met[:] = -1
+    out = np.empty((k, k))
+    for a in range(k):
+        s = owner[which[a]]
+        while s >= 0:
+            own = entries[fronts[s]['start']]['scalar']
+            Y[a, own : own + fronts[s]['width']] = 0.0
+            met[s] = a
+            s = fronts[s]['parent']
+        Y[a, which[a]] = 1.0
+        s = owner[which[a]]
+        while s >= 0:
+            lower_step(fronts, entries, system.values, s, Y[a], work)
+            s = fronts[s]['parent']
+        for b in range(a + 1):
+            total = 0.0
+            s = owner[which[b]]
+            while s >= 0:
+                if met[s] == a:
+                    own = entries[fronts[s]['start']]['scalar']
+                    for r in range(own, own + fronts[s]['width']):
+                        total += Y[a, r] * Y[b, r]
+                s = fronts[s]['parent']
+            out[a, b] = out[b, a] = total
     return out

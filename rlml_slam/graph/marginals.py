@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from rlml_slam.errors import SolverError
 from rlml_slam.graph.equations import system_of
 from rlml_slam.graph.graph import Graph
-from rlml_slam.graph.inverse import columns, diagonal_blocks
+from rlml_slam.graph.inverse import columns, diagonal_blocks, joint
 from rlml_slam.graph.iterate import factor
 from rlml_slam.graph.linearize import linearize
 from rlml_slam.se2 import Array
@@ -75,8 +75,8 @@ class Marginals:
         at = self._rows(poses, landmarks)
         free = np.flatnonzero(at >= 0)
         out = np.zeros((len(at), len(at)))
-        out[np.ix_(free, free)] = columns(self._system, at[free])[:, at[free]]
-        return 0.5 * (out + out.T)
+        out[np.ix_(free, free)] = joint(self._system, at[free])
+        return out
 
     def _pick(self, variables: NDArray[np.int64]) -> Array:
         out = np.zeros((len(variables), 3, 3))

@@ -129,16 +129,12 @@ class Submap:
 
     def walls(self) -> Array:
         """Middles (n, 2) of the cells that stop beams more often than not, submap frame."""
-        i, j = np.nonzero(self.values > value_of(0.5))
-        cells = np.stack([j, i], -1) + np.array(self.corner, dtype=np.float64)
-        return np.asarray((cells + 0.5) * self.resolution)
+        return walls_of(self.values, *self.corner, self.resolution, int(value_of(0.5)))
 
     def knows(self, points: Array) -> float:
         """Share of points (n, 2) that lie in cells that something is known of."""
-        j, i = (np.floor(points / self.resolution).astype(np.int64) - self.corner).T
-        rows, columns = self.values.shape
-        inside = (i >= 0) & (i < rows) & (j >= 0) & (j < columns)
-        return float(np.count_nonzero(self.values[i[inside], j[inside]])) / max(len(points), 1)
+        known = count_known(self.values, *self.corner, self.resolution, points)
+        return known / max(len(points), 1)
 
     def _cover(self, x_min: float, y_min: float, x_max: float, y_max: float) -> None:
         """Grow the grid until the box and a border around it are inside."""
@@ -161,6 +157,41 @@ class Submap:
         grown = np.zeros((end_i - new_i, end_j - new_j), dtype=np.uint16)
         grown[i - new_i : i - new_i + rows, j - new_j : j - new_j + columns] = self.values
         self.values, self.corner = grown, (new_j, new_i)
+
+
+@kernel
+def walls_of(
+    values: NDArray[np.uint16], corner_j: int, corner_i: int, resolution: float, least: int
+) -> Array:
+    """Middles (n, 2) of the cells with more than ``least``, row by row."""
+    rows, columns = values.shape
+    count = 0
+    for i in range(rows):
+        for j in range(columns):
+            count += int(values[i, j] > least)
+    out = np.empty((count, 2))
+    n = 0
+    for i in range(rows):
+        for j in range(columns):
+            if values[i, j] > least:
+                out[n, 0] = (j + corner_j + 0.5) * resolution
+                out[n, 1] = (i + corner_i + 0.5) * resolution
+                n += 1
+    return out
+
+
+@kernel
+def count_known(
+    values: NDArray[np.uint16], corner_j: int, corner_i: int, resolution: float, points: Array
+) -> int:
+    """How many of the points (n, 2) lie in cells that are not 0."""
+    rows, columns = values.shape
+    count = 0
+    for k in range(len(points)):
+        j = int(np.floor(points[k, 0] / resolution)) - corner_j
+        i = int(np.floor(points[k, 1] / resolution)) - corner_i
+        count += int(0 <= i < rows and 0 <= j < columns and values[i, j] != 0)
+    return count
 
 
 @kernel
@@ -312,4 +343,6 @@ def touch_ray(
 
 def warm_up() -> None:
     """Compile the kernels with the signatures that are used at run time."""
-    Submap().insert(np.array([[1.0, 0.5], [-0.5, 1.0]]), np.zeros(2))
+    submap = Submap()
+    submap.insert(np.array([[1.0, 0.5], [-0.5, 1.0]]), np.zeros(2))
+    submap.knows(submap.walls())

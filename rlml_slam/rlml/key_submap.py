@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -27,3 +28,8 @@ class KeySubmap:
     size: int = 0
     centre: Array = field(default_factory=lambda: np.zeros(2))
     T_anchor_grid: Array = field(default_factory=lambda: TURN)
+
+    @cached_property
+    def walls(self) -> Array:
+        """Those of the submap (n, 2), which is to be complete."""
+        return self.submap.walls()

@@ -164,8 +164,7 @@ class ScanGraph:
     def _is_covered(self, old: KeySubmap, new: KeySubmap) -> bool:
         """Whether what one submap shows is known to another one as well."""
         T = se2.between(self._grid(new), self._grid(old))
-        walls = old.submap.walls()
-        return len(walls) > 0 and new.submap.knows(se2.transform(T, walls)) >= COVERED
+        return len(old.walls) > 0 and new.submap.knows(se2.transform(T, old.walls)) >= COVERED
 
     def take_over(self, pose: int, onto: Keyframe) -> None:
         """Keyframe ``pose`` goes: let submaps that stand on it stand on another one."""
