@@ -50,6 +50,14 @@ def kernel(function: F) -> F:
     return cast(F, numba.njit(cache=True, error_model='numpy', nogil=True)(function))
 
 
+def brief(function: F) -> F:
+    """A kernel of some microseconds, which keeps the GIL.
+
+    One that lets go of it waits to get it back, for as long as another thread is in Python.
+    """
+    return cast(F, numba.njit(cache=True, error_model='numpy')(function))
+
+
 def part(function: F) -> F:
     """A kernel that kernels alone call: without an entry from Python it compiles much faster."""
     options: dict[str, Any] = {'no_cpython_wrapper': True, 'no_cfunc_wrapper': True}

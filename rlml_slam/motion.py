@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.compiled import kernel, part
+from rlml_slam.compiled import brief, part
 from rlml_slam.params import MotionNoise
 from rlml_slam.se2 import Array
 from rlml_slam.types import Imu, Motion, Odometry
@@ -25,7 +25,7 @@ Stamps = NDArray[np.int64]
 COAST = 0.2  # [s] for which a robot is taken to go on as it went before its odometry ended
 
 
-@kernel
+@brief
 def integrate(
     v: Array, w: Array, dt: Array, var_v: Array, var_w: Array, var_lat: Array, gyro: Array
 ) -> Array:
@@ -115,7 +115,7 @@ class _Noise(NamedTuple):
     max_turn_rate: float
 
 
-@kernel
+@brief
 def _drive(
     start: int,
     end: int,

@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rlml_slam.compiled import kernel
+from rlml_slam.compiled import brief
 
 Array = NDArray[np.float64]
 
@@ -73,7 +73,7 @@ def compose(T_a_b: ArrayLike, T_b_c: ArrayLike) -> Array:
     return out
 
 
-@kernel
+@brief
 def compose_belief(T_a_b: Array, T_b_c: Array, cov: Array) -> tuple[Array, Array]:
     """One T_a_c (3,), with the covariance (3, 3) of T_b_c turned from b's axes to a's."""
     c, s = math.cos(T_a_b[2]), math.sin(T_a_b[2])
@@ -139,7 +139,7 @@ def transform(T_a_b: ArrayLike, p_b: ArrayLike) -> Array:
     return out
 
 
-@kernel
+@brief
 def _moved(x: float, y: float, turn: float, points: Array) -> Array:
     """Points (n, 2) of the frame at (x, y, turn), in its parent frame."""
     c, s = math.cos(turn), math.sin(turn)

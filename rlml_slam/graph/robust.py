@@ -23,7 +23,7 @@ from functools import cached_property
 
 import numpy as np
 
-from rlml_slam.compiled import kernel
+from rlml_slam.compiled import brief, kernel
 from rlml_slam.errors import SolverError
 from rlml_slam.se2 import Array
 
@@ -98,3 +98,12 @@ def loss(kind: int, scale: float, s: float) -> tuple[float, float]:
         w = 2.0 * k2 / (k2 + s)
         return k2 * (3.0 * s - k2) / (s + k2), w * w
     return k2, 0.0
+
+
+@brief
+def weights(kind: int, scale: float, s: Array) -> Array:
+    """W (n,) of squared norms ``s`` (n,)."""
+    out = np.empty(len(s))
+    for i in range(len(s)):
+        out[i] = loss(kind, scale, s[i])[1]
+    return out

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import params
-from rlml_slam.compiled import kernel
+from rlml_slam.compiled import brief, kernel
 from rlml_slam.matching import surfaces, thinning, window_search
 from rlml_slam.matching.submap import P_MIN, STEP, Submap
 from rlml_slam.se2 import Array, wrapped
@@ -317,7 +317,7 @@ def prior_term(
     return cost, weight
 
 
-@kernel
+@brief
 def whitening_of(information: Array, theta: float) -> Array:
     """W (3, 3) with W^T W = information, its rows forward, sideways, turn of the base at theta."""
     c, s = np.cos(theta), np.sin(theta)

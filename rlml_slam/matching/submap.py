@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import params
-from rlml_slam.compiled import kernel, part
+from rlml_slam.compiled import brief, kernel, part
 from rlml_slam.errors import InputError
 from rlml_slam.matching import surfaces
 from rlml_slam.se2 import Array
@@ -180,7 +180,7 @@ def walls_of(
     return out
 
 
-@kernel
+@brief
 def count_known(
     values: NDArray[np.uint16], corner_j: int, corner_i: int, resolution: float, points: Array
 ) -> int:
@@ -194,7 +194,7 @@ def count_known(
     return count
 
 
-@kernel
+@brief
 def extent(points: Array, origin: Array) -> tuple[float, float, float, float]:
     """Box (x_min, y_min, x_max, y_max) of the end points and the origin; NaN if any is NaN."""
     x_min = x_max = origin[0]

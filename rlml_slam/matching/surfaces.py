@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rlml_slam.compiled import kernel
+from rlml_slam.compiled import brief
 from rlml_slam.se2 import Array
 
 MAX_GAP = 0.6  # [m] wider gaps between neighbours are not filled
@@ -22,7 +22,7 @@ MAX_STEP = 1.0  # [m] neighbours farther apart are not of one surface
 FLAT = 0.02  # variance across per variance along, below which neighbours are a line
 
 
-@kernel
+@brief
 def fill(points: Array, spacing: float) -> Array:
     """End points (m, 2) with the gaps of straight surfaces filled, in scan order.
 
@@ -62,7 +62,7 @@ def fill(points: Array, spacing: float) -> Array:
     return out
 
 
-@kernel
+@brief
 def constraints(points: Array) -> Array:
     """Per end point (n, 3) the matrix [[a, b], [b, c]] as (a, b, c) that its slope goes through.
 

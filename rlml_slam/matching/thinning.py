@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rlml_slam.compiled import kernel
+from rlml_slam.compiled import brief
 from rlml_slam.se2 import Array
 
 
@@ -19,7 +19,7 @@ def thin(points: Array, voxel: float, max_points: int) -> Array:
     return thin_points(points, voxel, max_points)
 
 
-@kernel
+@brief
 def thin_points(points: Array, voxel: float, max_points: int) -> Array:
     """Kernel of thin(): voxel indices go through an open-addressing hash table."""
     n = len(points)

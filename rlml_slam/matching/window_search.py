@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.compiled import kernel
+from rlml_slam.compiled import brief, kernel
 from rlml_slam.matching.search import Candidate
 from rlml_slam.matching.submap import LEVELS, P_MAX, P_MIN, Submap
 from rlml_slam.se2 import Array, wrap
@@ -49,7 +49,7 @@ def window(
     return Candidate(np.array([x, y, float(wrap(theta))]), score)
 
 
-@kernel
+@brief
 def prior_loss(x: float, y: float, turn: float, whitening: Array, prior_scale: float) -> float:
     """Sum over u = whitening @ (x, y, turn) of v^2 / (1 + v^2), v = u_k / prior_scale."""
     loss = 0.0

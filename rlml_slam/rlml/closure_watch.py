@@ -17,7 +17,7 @@ from rlml_slam.errors import SolverError
 from rlml_slam.graph import factors
 from rlml_slam.graph.evidence import evidence, uniform
 from rlml_slam.graph.graph import Graph
-from rlml_slam.graph.robust import loss
+from rlml_slam.graph.robust import weights
 from rlml_slam.graph.selection import select_closures
 from rlml_slam.graph.solver import optimize
 from rlml_slam.params import Parameters
@@ -73,7 +73,7 @@ class ClosureWatch:
         information = graph.edges.information[edges]
         s, on = factors.chi2(e, information), graph.edges.enabled[edges]
         one = graph.losses.closure
-        w = np.where(on, [loss(int(one.kind), one.scale, float(k))[1] for k in s], 0.0)
+        w = np.where(on, weights(int(one.kind), one.scale, s), 0.0)
         last = np.array([c.fate.weight for c in closures])
         switched = (w == 0.0) != (last == 0.0)
         for k in np.flatnonzero(np.isnan(last) | switched | (np.abs(w - last) > CHANGED)).tolist():

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from rlml_slam import se2
-from rlml_slam.compiled import kernel
+from rlml_slam.compiled import brief
 from rlml_slam.params import MotionNoise
 from rlml_slam.rlml.correction import positive
 from rlml_slam.rlml.joint_state import BIAS, VELOCITY, JointState
@@ -77,7 +77,7 @@ def coast(
     return way
 
 
-@kernel
+@brief
 def _coast(
     x: Array,
     P: Array,
@@ -137,7 +137,7 @@ def _coast(
     return way
 
 
-@kernel
+@brief
 def way_cov(way: Array, before: Array, after: Array, heading: float) -> Array:
     """Covariance (3, 3) in base of the way between two poses, with all that was measured.
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rlml_slam import se2
-from rlml_slam.compiled import kernel
+from rlml_slam.compiled import brief
 from rlml_slam.se2 import Array
 
 
@@ -45,7 +45,7 @@ class Correction:
         return _since(self.T_map_local, pose, cov, k.pose, k.cov_local, k.cov_map)
 
 
-@kernel
+@brief
 def carried(cov: Array, way: Array) -> Array:
     """Covariance (3, 3) of a pose that lies ``way`` (2,) from one of covariance ``cov`` (3, 3).
 
@@ -57,7 +57,7 @@ def carried(cov: Array, way: Array) -> Array:
     return out
 
 
-@kernel
+@brief
 def positive(A: Array) -> Array:
     """The positive semidefinite part of a symmetric matrix (n, n)."""
     values, axes = np.linalg.eigh(0.5 * (A + A.T))
@@ -65,7 +65,7 @@ def positive(A: Array) -> Array:
     return out
 
 
-@kernel
+@brief
 def _since(
     T_map_local: Array, pose: Array, cov: Array, then: Array, cov_then: Array, cov_map: Array
 ) -> tuple[Array, Array]:

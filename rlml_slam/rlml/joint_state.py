@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.compiled import kernel
+from rlml_slam.compiled import brief, kernel
 from rlml_slam.se2 import Array
 from rlml_slam.types import Motion
 
@@ -196,7 +196,7 @@ class JointState:
         update(self.x, self.P, columns, H, R, v)
 
 
-@kernel
+@brief
 def predict(x: Array, P: Array, delta: Array, cov: Array, gain: Array, walk: float) -> None:
     """Eq. 5 and its covariance in place; see :meth:`JointState.predict`."""
     c, s = math.cos(x[2]), math.sin(x[2])

@@ -122,22 +122,22 @@ class ScanGraph:
         self, kind: EdgeKind, m: KeySubmap, key: Keyframe, T_grid_key: Array, information: Array
     ) -> int:
         self.changed |= kind is EdgeKind.CLOSURE
-        delta, information = self._measured(kind, m, T_grid_key, information)
+        delta, information = self._measured(kind, m.T_anchor_grid, T_grid_key, information)
         return self._graph.add_edge(kind, m.anchor.index, key.index, delta, information)
 
     def _measured(
-        self, kind: EdgeKind, m: KeySubmap, T_grid_key: Array, information: Array
+        self, kind: EdgeKind, T_anchor_grid: Array, T_grid_key: Array, information: Array
     ) -> tuple[Array, Array]:
-        """A keyframe's place (3,) from the submap's anchor, and the residual's information."""
+        """Keyframes' places (..., 3) from submaps' anchors, and informations of the residuals."""
         # a direction that the scan leaves open still needs a covariance, and a regular one
         cov = np.linalg.inv(information + OPEN * np.eye(3))
-        R = np.eye(3)
-        R[:2, :2] = se2.rotation(m.T_anchor_grid[2])
-        cov = R @ cov @ R.T
-        delta = se2.compose(m.T_anchor_grid, T_grid_key)
+        R = np.zeros_like(cov)
+        R[..., :2, :2], R[..., 2, 2] = se2.rotation(T_anchor_grid[..., 2]), 1.0
+        cov = R @ cov @ np.swapaxes(R, -1, -2)
+        delta = se2.compose(T_anchor_grid, T_grid_key)
         closure = kind is EdgeKind.CLOSURE
         floor2 = self._p.loop_closure.floor2 if closure else self._p.back_end.scan_floor2
-        cov[[0, 1, 2], [0, 1, 2]] += floor2
+        cov[..., [0, 1, 2], [0, 1, 2]] += floor2
         return delta, relative_information(delta, cov)
 
     def _insert(self, key: Keyframe, points: Array) -> None:
@@ -281,12 +281,14 @@ class ScanGraph:
     def _admit(self, fresh: Sequence[Match]) -> list[Closure]:
         """Let in what may, of the ``fresh`` ones and those that waited; the others wait."""
         matches = [*self._waiting, *fresh]
-        measured = [
-            self._measured(EdgeKind.CLOSURE, c.m, c.T_grid_key, c.information) for c in matches
-        ]
         nodes = np.array([(c.m.anchor.index, c.key.index) for c in matches], dtype=np.int64)
-        covs = np.linalg.inv(np.array([information for _, information in measured]))
-        deltas = np.array([delta for delta, _ in measured])
+        deltas, informations = self._measured(
+            EdgeKind.CLOSURE,
+            np.array([c.m.T_anchor_grid for c in matches]),
+            np.array([c.T_grid_key for c in matches]),
+            np.array([c.information for c in matches]),
+        )
+        covs: Array = np.asarray(np.linalg.inv(informations), dtype=np.float64)
         may = may_enter(self._graph, nodes, deltas, covs, self._wrong)
         out, waited = [], len(self._waiting)
         for n, (c, enters) in enumerate(zip(matches, may.tolist(), strict=True)):

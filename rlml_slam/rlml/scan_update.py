@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from rlml_slam.compiled import kernel, part
+from rlml_slam.compiled import brief, part
 from rlml_slam.rlml.joint_state import ANCHORS, JointState, update
 from rlml_slam.se2 import Array
 
@@ -30,7 +30,7 @@ def jacobian_of(pose: Array, turn: float) -> Array:
     return J
 
 
-@kernel
+@brief
 def prior_of(x: Array, P: Array, floor2: Array) -> tuple[Array, Array]:
     """The pose in the frame of the submap (3,) by the joint state, and its information (3, 3).
 
@@ -41,7 +41,7 @@ def prior_of(x: Array, P: Array, floor2: Array) -> tuple[Array, Array]:
     return pose, information
 
 
-@kernel
+@brief
 def relative(x: Array, P: Array) -> tuple[Array, Array]:
     """The pose in the frame of the submap (3,) and its covariance (3, 3)."""
     c, s = math.cos(x[TARGET + 2]), math.sin(x[TARGET + 2])
@@ -55,7 +55,7 @@ def relative(x: Array, P: Array) -> tuple[Array, Array]:
     return pose, np.dot(np.dot(J, cov), J.T.copy())
 
 
-@kernel
+@brief
 def fuse(x: Array, P: Array, pose: Array, information: Array, prior_scale: float) -> None:
     """Update ``x`` and ``P`` with a match at ``pose`` (3,) of the submap with ``information``.
 

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.compiled import kernel
+from rlml_slam.compiled import brief
 from rlml_slam.se2 import Array
 from rlml_slam.types import Scan
 
 
-@kernel
+@brief
 def _project(
     ranges: NDArray[np.float32],
     angle_min: float,
