@@ -24,6 +24,7 @@ from rlml_slam.params import Parameters
 from rlml_slam.rlml.coasting import Coasting
 from rlml_slam.rlml.confirmation import START_SIGMA, Confirmation
 from rlml_slam.rlml.correction import Correction, Known
+from rlml_slam.rlml.distant import Distant
 from rlml_slam.rlml.doubt import Doubt, consents
 from rlml_slam.rlml.grid_fix import Fix, SavedGrid
 from rlml_slam.rlml.health import Evidence, HealthMonitor, weak_direction
@@ -48,6 +49,7 @@ from rlml_slam.types import (
     Status,
 )
 
+NONE = np.zeros(0, dtype=np.int64)
 BURST = 50_000_000  # [ns] between two scans that tell a velocity
 
 
@@ -81,6 +83,8 @@ class FrontEnd:
         self._coasting = Coasting(self._p.motion)
         self._map: SavedMap | None = None
         self._window: MapWindow | None = None
+        r = self._p.reflector
+        self._distant = Distant(r.max_range, r.min_sightings)
         self.confirmation = Confirmation(self._p)
         self._last_fit = 0
         self._reach = 0.0
@@ -164,19 +168,15 @@ class FrontEnd:
         Both come from the same detections, so a difference beyond the gate is no noise: one of
         them linearised too early, or took one reflector for another, and it is not the graph.
         """
-        mine, theirs = self._common(belief)
+        keys, places, covs = self._distant.everything(self.state, self.tracks)
+        _, mine, theirs = np.intersect1d(keys, belief.keys, return_indices=True)
         if not len(mine):
             return False
         points = se2.transform(se2.inverse(self.T_map_local), belief.points[theirs])
-        d = points - self.state.landmarks()[mine]
-        spread = self.state.landmark_covs()[mine]
+        d = points - places[mine]
+        spread = covs[mine]
         d2 = np.einsum('ni,ni->n', d, np.linalg.solve(spread, d[..., None])[..., 0])
         return bool((d2 > self._contradiction).any())
-
-    def _common(self, belief: Belief) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Indices of the same reflectors here and in the belief."""
-        _, mine, theirs = np.intersect1d(self.tracks.keys, belief.keys, return_indices=True)
-        return mine, theirs
 
     def adopt(self, belief: Belief) -> None:
         """Go on from the back end's reflectors, and its covariance of them and of the pose.
@@ -184,8 +184,9 @@ class FrontEnd:
         The local pose stays as it is; candidates that the back end does not know start anew.
         Call it for the frame that became the newest keyframe, after :meth:`correct`.
         """
+        self._distant.gather(self.state, self.tracks)
         self.tracks.rename(belief.aliases)
-        mine, theirs = self._common(belief)
+        _, mine, theirs = np.intersect1d(self.tracks.keys, belief.keys, return_indices=True)
         keep = np.zeros(len(self.tracks), dtype=np.bool_)
         keep[mine] = True
         order = theirs[np.argsort(mine, kind='stable')]
@@ -204,7 +205,10 @@ class FrontEnd:
 
     def forget(self, keys: Iterable[int]) -> None:
         """Drop reflectors that the back end knows to be gone."""
-        keep = ~np.isin(self.tracks.keys, list(keys))
+        gone = np.array(list(keys), dtype=np.int64)
+        if self._distant.has(gone):
+            self._distant.gather(self.state, self.tracks)
+        keep = ~np.isin(self.tracks.keys, gone)
         if not keep.all():
             self.state.remove_landmarks(keep)
             self.tracks.keep(keep)
@@ -213,8 +217,7 @@ class FrontEnd:
         """The pose at the observation's stamp; never raises for what was measured."""
         began = time.perf_counter()
         coasts = self._predict(observation)
-        if self._window is not None:
-            self._window.follow(self.state, self.tracks)
+        self._follow_map(observation.detections)
         matched = _Matched.none(observation.detections)
         self._use_reflectors(observation, matched)
         evidence = self._use_scan(observation, matched)
@@ -237,6 +240,14 @@ class FrontEnd:
         frame = self._frame(observation, matched, evidence, health, doubtful, began)
         self._jumped = False
         return frame
+
+    def _follow_map(self, detections: Detections | None) -> None:
+        """Only reflectors in reach are in the state."""
+        if self._window is not None:
+            self._window.follow(self.state, self.tracks)
+        elif self._p.node.mode == 'mapping':
+            ids = NONE if detections is None else detections.ids
+            self._distant.follow(self.state, self.tracks, ids)
 
     # --- prior -----------------------------------------------------------------------------
 
@@ -521,6 +532,7 @@ class FrontEnd:
 
     def reflectors(self) -> Reflectors:
         """The confirmed reflectors in the map frame."""
+        self._distant.gather(self.state, self.tracks)
         keep = self.tracks.confirmed(self._p.reflector.min_sightings)
         R = se2.rotation(self.T_map_local[2])
         return Reflectors(

@@ -32,7 +32,9 @@ class JointState:
     """Mean ``x`` (13 + 2m,) and covariance ``P`` of all that is estimated together.
 
     In this order: the pose, the gyro's bias, the velocity (forward, left, turn) of the base, which
-    a robot with odometry does not need (:mod:`coasting`), two anchors, the reflectors.
+    a robot with odometry does not need (:mod:`coasting`), two anchors, the reflectors; and
+    ``extra`` rows, zero but while reflectors are left out (:mod:`distant`): of what they depend
+    on, the rows ``tied``, those that are nothing else any more.
     """
 
     def __init__(
@@ -46,11 +48,18 @@ class JointState:
         self.P[BIAS, BIAS] = bias_sigma**2
         self._unknown = np.diag(np.array(speeds) ** 2)
         self.P[MOVING, MOVING] = self._unknown
+        self.extra = 0
+        self.tied = np.zeros(0, dtype=np.int64)
 
     @property
     def num_landmarks(self) -> int:
         """Number m of reflectors in the state."""
-        return (len(self.x) - LANDMARKS) // 2
+        return (self._end - LANDMARKS) // 2
+
+    @property
+    def _end(self) -> int:
+        """One past the row of the last reflector."""
+        return len(self.x) - self.extra
 
     @property
     def pose(self) -> Array:
@@ -64,20 +73,22 @@ class JointState:
 
     def landmarks(self) -> Array:
         """Positions (m, 2) in the local frame."""
-        return self.x[LANDMARKS:].reshape(-1, 2)
+        return self.x[LANDMARKS : self._end].reshape(-1, 2)
 
     def landmark_covs(self) -> Array:
         """Marginal covariances (m, 2, 2)."""
         m = self.num_landmarks
         k = np.arange(m)
-        P: Array = self.P[LANDMARKS:, LANDMARKS:].reshape(m, 2, m, 2)[k, :, k, :]
+        rows = slice(LANDMARKS, self._end)
+        P: Array = self.P[rows, rows].reshape(m, 2, m, 2)[k, :, k, :]
         return P
 
     def pose_and_landmarks_cov(self) -> Array:
         """Joint covariance (3 + 2m, 3 + 2m) without the anchors."""
-        P = np.empty((len(self.x) - LANDMARKS + 3,) * 2)
-        P[:3, :3], P[:3, 3:] = self.P[:3, :3], self.P[:3, LANDMARKS:]
-        P[3:, :3], P[3:, 3:] = self.P[LANDMARKS:, :3], self.P[LANDMARKS:, LANDMARKS:]
+        rows = slice(LANDMARKS, self._end)
+        P = np.empty((self._end - LANDMARKS + 3,) * 2)
+        P[:3, :3], P[:3, 3:] = self.P[:3, :3], self.P[:3, rows]
+        P[3:, :3], P[3:, 3:] = self.P[rows, :3], self.P[rows, rows]
         return P
 
     def predict(self, motion: Motion, walk: float) -> None:
@@ -159,7 +170,7 @@ class JointState:
 
     def add_landmark(self, z: Array, R: Array) -> int:
         """Append the reflector seen at z (2,) with covariance R (2, 2) in base; its index."""
-        n = len(self.x)
+        n, end = len(self.x), self._end
         rot = se2.rotation(self.x[2])
         G = np.empty((2, 3))
         G[:, :2] = np.eye(2)
@@ -174,7 +185,9 @@ class JointState:
         P[:n, n:] = P[n:, :n].T
         P[n:, n:] = G @ self.P[:3, :3] @ G.T + rot @ R @ rot.T
         self.x, self.P = x, P
-        return (n - LANDMARKS) // 2
+        if self.extra:
+            self._take(np.r_[:end, n : n + 2, end:n])
+        return (end - LANDMARKS) // 2
 
     def fix_landmarks(self, points: Array, cov: Array) -> None:
         """Append reflectors (k, 2) of a given map with covariances (k, 2, 2), all independent."""
@@ -187,8 +200,36 @@ class JointState:
 
     def remove_landmarks(self, keep: NDArray[np.bool_]) -> None:
         """Marginalise out the reflectors where ``keep`` (m,) is false."""
-        rows = np.concatenate([np.ones(LANDMARKS, dtype=np.bool_), np.repeat(keep, 2)])
-        self.x = self.x[rows]
+        landmarks = np.arange(LANDMARKS, self._end)
+        kept = np.repeat(keep, 2)
+        needed = landmarks[~kept & np.isin(landmarks, self.tied)]
+        others = np.arange(self._end, len(self.x))
+        self._take(np.concatenate([np.arange(LANDMARKS), landmarks[kept], others, needed]))
+        self.extra = len(others) + len(needed)
+
+    def leave_out(self, away: NDArray[np.bool_]) -> None:
+        """Take out the reflectors where ``away`` (m,) is true, keeping what they depend on."""
+        near = LANDMARKS + np.flatnonzero(np.repeat(~away, 2))
+        end = LANDMARKS + len(near)
+        self._take(np.r_[0:LANDMARKS, near, 0:LANDMARKS])
+        self.extra = LANDMARKS
+        self.tied = np.r_[end : end + LANDMARKS, LANDMARKS:end]
+
+    def put_back(self, points: Array, cross: Array, cov: Array) -> None:
+        """Append reflectors (2k,) with covariances (n, 2k) with the state and (2k, 2k) of them."""
+        end, n = self._end, self._end + len(points)
+        x, P = np.empty(n), np.empty((n, n))
+        x[:end], x[end:] = self.x[:end], points
+        P[:end, :end], P[end:, end:] = self.P[:end, :end], cov
+        P[:end, end:] = cross[:end]
+        P[end:, :end] = P[:end, end:].T
+        self.x, self.P, self.extra, self.tied = x, P, 0, self.tied[:0]
+
+    def _take(self, rows: NDArray[np.int64]) -> None:
+        """Only these rows, in this order."""
+        where = np.full(len(self.x), -1)
+        where[rows] = np.arange(len(rows))
+        self.x, self.tied = self.x[rows], where[self.tied]
         self.P = np.ascontiguousarray(self.P[np.ix_(rows, rows)])
 
     def apply(self, columns: NDArray[np.int64], H: Array, R: Array, v: Array) -> None:

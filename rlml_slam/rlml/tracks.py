@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,9 @@ from rlml_slam.se2 import Array
 from rlml_slam.types import ANONYMOUS
 
 MEMORY = 50  # occasions over which the spread of a group is averaged
+COLUMNS = (
+    'keys', 'ids', 'sightings', 'last_seen', 'surveyed', 'diameters', 'spread2', 'doubles',
+)  # fmt: skip
 MAX_CANDIDATES = 40  # seldom seen ones beyond this make room: ghosts must not fill the state
 
 
@@ -107,6 +110,17 @@ class Tracks:
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Forget all where the mask (m,) is false."""
-        for name in ('keys', 'ids', 'sightings', 'last_seen', 'surveyed', 'diameters',
-                     'spread2', 'doubles'):  # fmt: skip
+        for name in COLUMNS:
             setattr(self, name, getattr(self, name)[mask])
+
+    def take(self, mask: NDArray[np.bool_]) -> Tracks:
+        """Take out all where the mask (m,) is true, which are returned."""
+        taken = replace(self)
+        taken.keep(mask)
+        self.keep(~mask)
+        return taken
+
+    def extend(self, others: Tracks) -> None:
+        """Append what was taken out."""
+        for name in COLUMNS:
+            setattr(self, name, np.concatenate([getattr(self, name), getattr(others, name)]))

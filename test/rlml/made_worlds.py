@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -145,6 +146,17 @@ def observations(
                 odom_pose=pose if odometry else None,
             )
         )
+    return out
+
+
+def within(seen, reach):
+    """The observations with only those detections that are nearer than ``reach`` [m]."""
+    out = []
+    for o in seen:
+        d = o.detections
+        near = np.hypot(*d.points.T) < reach
+        columns = {n: getattr(d, n)[near] for n in ('points', 'cov', 'ids', 'diameters')}
+        out.append(dataclasses.replace(o, detections=dataclasses.replace(d, **columns)))
     return out
 
 

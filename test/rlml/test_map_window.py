@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Of a large map, only what is in reach is in the state."""
 
-import dataclasses
-
 import numpy as np
 import pytest
-from made_worlds import TinyWorld, drive, errors, observations
+from made_worlds import TinyWorld, drive, errors, observations, within
 
 from rlml_slam.maps.saved import SavedMap
 from rlml_slam.params import Node, Parameters, Reflector
@@ -72,14 +70,7 @@ def test_drive_through_a_large_map(reach):
     world = TinyWorld(np.zeros((0, 4)), AISLE)
     path = drive((1.0, 0.0, 60.0))
     seen = observations(world, path, scan=False, rng=np.random.default_rng(1))
-    close = [
-        dataclasses.replace(o, detections=dataclasses.replace(
-            o.detections, **{
-                name: getattr(o.detections, name)[np.hypot(*o.detections.points.T) < REACH]
-                for name in ('points', 'cov', 'ids', 'diameters')
-            },
-        )) for o in seen
-    ]  # fmt: skip
+    close = within(seen, REACH)
     p = Parameters(node=Node(mode='localization'), reflector=Reflector(max_range=reach))
     front_end = FrontEnd(p)
     front_end.use_map(SavedMap(MAP).reflectors)
