@@ -71,25 +71,15 @@ def constraints(points: Array) -> Array:
     """
     n = len(points)
     out = np.zeros((n, 3))
+    joined = np.zeros(n, dtype=np.bool_)  # with the next one
+    for k in range(n - 1):
+        dx, dy = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
+        joined[k] = dx * dx + dy * dy < MAX_STEP * MAX_STEP
     for k in range(n):
         first = last = k
-        while (
-            first > 0
-            and k - first < REACH
-            and np.hypot(
-                points[first, 0] - points[first - 1, 0], points[first, 1] - points[first - 1, 1]
-            )
-            < MAX_STEP
-        ):
+        while first > 0 and k - first < REACH and joined[first - 1]:
             first -= 1
-        while (
-            last < n - 1
-            and last - k < REACH
-            and np.hypot(
-                points[last, 0] - points[last + 1, 0], points[last, 1] - points[last + 1, 1]
-            )
-            < MAX_STEP
-        ):
+        while last - k < REACH and joined[last]:
             last += 1
         m = last - first + 1
         if m < 4:

@@ -471,7 +471,7 @@ class FrontEnd:
             lost=self.confirmation.is_lost,
             contradicted=self._lasts(observation.stamp) and not self.confirmation.is_pending,
             expected=int(due.sum()),
-            seen=int(np.isin(self.tracks.keys[due], used).sum()),
+            seen=len(set(self.tracks.keys[due].tolist()).intersection(used.tolist())),
         )
 
     def _due(self, observation: Observation, matched: _Matched) -> NDArray[np.bool_]:
@@ -525,6 +525,8 @@ class FrontEnd:
 
         It is published alone: one stamp's error is nearly that of the next, and of the map's.
         """
+        if sigma == 0.0:
+            return np.zeros((3, 3))
         R = np.eye(3)
         R[:2, :2] = se2.rotation(self.state.pose[2])
         gone = R @ self._velocity * sigma

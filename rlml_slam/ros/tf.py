@@ -26,11 +26,13 @@ class Extrinsics:
 
     def __init__(self) -> None:
         self._parent: dict[str, Transform] = {}
+        self._found: dict[tuple[str, str], tuple[Array, Array] | None] = {}  # until it changes
 
     def add(self, transforms: Iterable[Transform]) -> None:
         """Take over transforms; a later one of the same child replaces the earlier."""
         for t in transforms:
             self._parent[t.child] = t
+        self._found = {}
 
     def pose(self, base: str, frame: str) -> Array | None:
         """Planar T_base_frame (3,), None if the tree does not connect the two.
@@ -58,6 +60,11 @@ class Extrinsics:
 
     def _between(self, base: str, frame: str) -> tuple[Array, Array] | None:
         """R (3, 3) and t (3,) of T_base_frame."""
+        if (base, frame) not in self._found:
+            self._found[base, frame] = self._find(base, frame)
+        return self._found[base, frame]
+
+    def _find(self, base: str, frame: str) -> tuple[Array, Array] | None:
         to_base, to_frame = self._ancestors(base), self._ancestors(frame)
         shared = next((f for f in to_frame if f in to_base), None)
         if shared is None:

@@ -119,8 +119,9 @@ class Sequencer:
             return []
         if self._parks('odom', sample):
             return self._release()
-        sample = dataclasses.replace(sample, stamp=self._steady('odom', '', sample.stamp))
-        valid = np.shape(sample.pose) == (3,) and bool(np.all(np.isfinite(sample.pose)))
+        stamp = self._steady('odom', '', sample.stamp)
+        sample = sample if stamp == sample.stamp else Odometry(stamp, sample.pose)
+        valid = np.shape(sample.pose) == (3,) and all(map(math.isfinite, sample.pose))
         if self._accept('odom', sample.stamp, valid, 'pose is not finite'):
             self.buffer.add_odometry(sample)
             self._carry(sample.stamp)
@@ -133,8 +134,9 @@ class Sequencer:
             return []
         if self._parks('imu', sample):
             return self._release()
-        sample = dataclasses.replace(sample, stamp=self._steady('imu', '', sample.stamp))
-        if self._accept('imu', sample.stamp, np.isfinite(sample.yaw_rate), 'rate is not finite'):
+        stamp = self._steady('imu', '', sample.stamp)
+        sample = sample if stamp == sample.stamp else Imu(stamp, sample.yaw_rate)
+        if self._accept('imu', stamp, math.isfinite(sample.yaw_rate), 'rate is not finite'):
             self.buffer.add_imu(sample)
             self.inputs.count('imu', 'used')
         return self._release()

@@ -59,6 +59,7 @@ class SteadyClock:
 
     def _restart(self) -> None:
         self._stamps: deque[tuple[int, int]] = deque()  # number of the message, stamp
+        self._now: Line | None = None  # the line through them
         self._first = 0
         self._is_steady = False
         self._lost = 0  # messages thought lost before the newest
@@ -72,14 +73,13 @@ class SteadyClock:
         """The stamp [ns] less its jitter, if the sensor is steady; the same for the same one."""
         if self._told is not None and stamp == self._told[0]:
             return self._told[1]
-        line = self._line()
         number = 0
         if self._stamps:
             number = self._stamps[-1][0] + 1
-            if line is not None:
-                number = self._numbered(stamp, number, line)
+            if self._now is not None:
+                number = self._numbered(stamp, number, self._now)
         self._add(number, stamp)
-        line = self._line()
+        self._now = line = self._line()
         out, self.sigma = stamp, 0.0
         if line is None or not self._is_jitter(line):
             self._is_steady = False
@@ -162,14 +162,21 @@ class SteadyClock:
 
     def _count(self, k: int, stamp: int, sign: int) -> None:
         s = stamp - self._first
-        for i, value in enumerate((1, k, k * k, s, k * s, s * s)):
-            self._sums[i] += sign * value
+        sums, signed_k, signed_s = self._sums, sign * k, sign * s
+        sums[0] += sign
+        sums[1] += signed_k
+        sums[2] += signed_k * k
+        sums[3] += signed_s
+        sums[4] += signed_s * k
+        sums[5] += signed_s * s
 
     def _count_step(self, a: tuple[int, int], b: tuple[int, int], sign: int) -> None:
         n, d = b[0] - a[0], b[1] - a[1]
         self._overtakes += sign * (d < 0)
-        for i, value in enumerate((n * n, n * d, d * d)):
-            self._steps[i] += sign * value
+        steps, signed_n = self._steps, sign * n
+        steps[0] += signed_n * n
+        steps[1] += signed_n * d
+        steps[2] += sign * d * d
 
     def _line(self) -> Line | None:
         """The line through the window, None through too few or those of a clock that stands."""
