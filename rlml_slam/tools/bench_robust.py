@@ -3,7 +3,8 @@
 
 Every solver starts from odometry. An error is the ATE, aligned, against the optimum of the graph
 without wrong closures: 0 is a solver that found exactly the right ones. GTSAM's GNC is told that
-odometry is right, and has its truncation at 99 %, as ours.
+odometry is right, and has its truncation at 99 %, as ours. A rival that takes longer than it may
+is stopped, and told apart from those that came to an end.
 """
 
 from __future__ import annotations
@@ -11,40 +12,36 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
-
-from rlml_slam import params, se2
 from rlml_slam.errors import RlmlError
 from rlml_slam.graph.gnc import graduate
 from rlml_slam.graph.graph import Graph
-from rlml_slam.graph.initialize import initialize
 from rlml_slam.graph.robust import Loss, Losses, LossKind
 from rlml_slam.graph.selection import select_closures
-from rlml_slam.graph.solver import optimize, warm_up
+from rlml_slam.graph.solver import optimize
 from rlml_slam.graph.table import FactorKind
-from rlml_slam.se2 import Array
 from rlml_slam.tools.bench_back_end import read_graphs
+from rlml_slam.tools.bench_graphs import city
 from rlml_slam.tools.bench_rivals import single_thread, timed
 from rlml_slam.tools.progress import Progress
-from rlml_slam.tools.wrong_closures import add_clustered, add_random, copied
+from rlml_slam.tools.robust_cases import (
+    EXACT,
+    Cases,
+    Judged,
+    Method,
+    Outcome,
+    Wrong,
+    parse_wrong,
+    summary,
+)
 
 COUNTS = ('0', '10', '50', '100', '500', '1000', '20%')
-EXACT = params.Solver(max_iterations=200, relative_tolerance=1e-10)
 KERNEL = 1.0  # sigmas, of Cauchy and DCS
-
-
-class Outcome(NamedTuple):
-    """CPU time [ms], and which closures are in the graph afterwards (k,), None of a kernel."""
-
-    cpu_ms: float
-    accepted: Any
-
-
-Method = Callable[[Graph], Outcome]
+SELECT = 'select'  # what this package does; the others are there to be compared with
+# an error is worse if it is larger by this share and by a millimetre, which no sensor sees
+SAME, NOTHING = 0.01, 1e-3
 
 
 def add_parser(subparsers: Any) -> None:
@@ -61,6 +58,18 @@ def add_parser(subparsers: Any) -> None:
         help='numbers of random ones, or like 20%% of clustered ones (default: %(default)s)',
     )  # fmt: skip
     parser.add_argument('--seeds', type=int, default=10, help='draws of each (default 10)')
+    parser.add_argument(
+        '--rival-seeds', type=int, metavar='N',
+        help='draws that all but select solve (default: all): the others are much slower',
+    )  # fmt: skip
+    parser.add_argument(
+        '--limit', type=float, default=300.0, metavar='SECONDS',
+        help='CPU time after which a solve of a rival is stopped (default %(default)g)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--keep', type=Path, metavar='DIR',
+        help='write every result there at once; what is there is not measured again',
+    )  # fmt: skip
     parser.add_argument('--without', action='append', default=[], help='leave out a solver')
     parser.add_argument('--json', action='store_true', help='one JSON object on stdout')
 
@@ -68,48 +77,59 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure and print."""
     single_thread()
-    if args.seeds < 1:
-        raise RlmlError(f'--seeds {args.seeds} is not at least 1')
-    counts = [_count(word) for word in args.wrong]
-    warm_up()
-    chosen = {name: m for name, m in methods().items() if name not in args.without}
+    rival_seeds = args.seeds if args.rival_seeds is None else args.rival_seeds
+    for name, value in (('--seeds', args.seeds), ('--rival-seeds', rival_seeds)):
+        if value < 1:
+            raise RlmlError(f'{name} {value} is not at least 1')
+    if not args.limit > 0.0:
+        raise RlmlError(f'--limit {args.limit:g} is not more than 0')
+    counts = [parse_wrong(word) for word in args.wrong]
+    methods = _methods()
+    for method in methods.values():  # compiles what it needs
+        method(city(60))
+    rivals, close = _rivals(args.limit)
+    methods = {name: m for name, m in {**methods, **rivals}.items() if name not in args.without}
     results = []
-    for name, graph in read_graphs(args.graphs):
-        if len(graph.landmarks) or not (graph.edges.kinds == FactorKind.CLOSURE).any():
-            continue
-        result = {'graph': name, **study(graph, chosen, counts, args.seeds, args.json)}
-        results.append(result)
-        if not args.json:
-            _print(result)
+    try:
+        for name, graph in read_graphs(args.graphs):
+            if len(graph.landmarks) or not (graph.edges.kinds == FactorKind.CLOSURE).any():
+                continue
+            cases = Cases(name, graph, args.keep)
+            results.append({'graph': name, 'poses': len(graph.poses), 'closures': cases.right})
+            if not args.json:
+                _print_head(results[-1])
+            results[-1]['rows'] = rows = []
+            for wrong in counts:
+                rows += study(cases, wrong, methods, args.seeds, rival_seeds, args.json)
+    finally:
+        close()
     if args.json:
         print(json.dumps({'results': results}))
     return 0
 
 
-def _count(word: str) -> float:
-    """A number of random closures, or minus the share of clustered ones."""
-    number = word.removesuffix('%')
-    if not number.isdecimal():
-        raise RlmlError(f'--wrong {word}: neither a number nor a percentage')
-    return -float(number) / 100.0 if word.endswith('%') else float(number)
-
-
-def methods() -> dict[str, Method]:
-    """The solvers that are there, by name."""
-    out: dict[str, Method] = {
-        'select': _select, 'gnc': _gnc,
+def _methods() -> dict[str, Method]:
+    """The solvers of this package, by name."""
+    return {
+        SELECT: _select, 'gnc': _gnc,
         'cauchy': lambda graph: _kernel(graph, LossKind.CAUCHY),
         'dcs': lambda graph: _kernel(graph, LossKind.DCS),
     }  # fmt: skip
-    if importlib.util.find_spec('gtsam'):
-        from rlml_slam.tools import robust_rivals as rivals
 
-        out['gtsam gnc'] = lambda graph: Outcome(*rivals.run_gnc(graph))
-        out['gtsam cauchy'] = lambda graph: Outcome(
-            rivals.run_kernel(graph, 'Cauchy', KERNEL), None
-        )
-        out['gtsam dcs'] = lambda graph: Outcome(rivals.run_kernel(graph, 'DCS', KERNEL), None)
-    return out
+
+def _rivals(limit: float) -> tuple[dict[str, Method], Any]:
+    """(The solvers of GTSAM where it is installed, what ends their process)."""
+    if not importlib.util.find_spec('gtsam'):
+        return {}, lambda: None
+    from rlml_slam.tools.robust_rivals import Rivals, run_gnc, run_kernel
+
+    rivals = Rivals(limit)
+    out: dict[str, Method] = {
+        'gtsam gnc': lambda graph: rivals.run(run_gnc, graph),
+        'gtsam cauchy': lambda graph: rivals.run(run_kernel, graph, 'Cauchy', KERNEL),
+        'gtsam dcs': lambda graph: rivals.run(run_kernel, graph, 'DCS', KERNEL),
+    }
+    return out, rivals.close
 
 
 def _select(graph: Graph) -> Outcome:
@@ -124,70 +144,60 @@ def _gnc(graph: Graph) -> Outcome:
 
 def _kernel(graph: Graph, kind: LossKind) -> Outcome:
     graph.losses = Losses(closure=Loss(kind, KERNEL))
-    return Outcome(timed(lambda: optimize(graph, EXACT))[0], None)
+    return Outcome(timed(lambda: optimize(graph, EXACT))[0])
 
 
 def study(
-    graph: Graph, methods: dict[str, Method], counts: list[float], seeds: int, quiet: bool
-) -> dict[str, Any]:
-    """Errors of all methods over counts and seeds."""
-    right = int(np.sum(graph.edges.kinds == FactorKind.CLOSURE))
-    best = copied(graph)
-    initialize(best, 'chordal')
-    optimize(best, EXACT)
-    rows = []
-    with Progress('wrong closures', float(len(counts) * seeds), quiet) as progress:
-        for c, count in enumerate(counts):
-            outcomes: dict[str, list[dict[str, float]]] = {name: [] for name in methods}
-            for seed in range(seeds if count else 1):
-                rng = np.random.default_rng(seed)
-                spoilt = copied(graph)
-                if count < 0.0:
-                    add_clustered(spoilt, best.poses, round(-count * right), rng)
-                elif count > 0.0:
-                    add_random(spoilt, int(count), rng)
-                initialize(spoilt, 'odometry')
-                for name, method in methods.items():
-                    outcomes[name].append(_judge(spoilt, method, best.poses, right))
-                progress.update(float(c * seeds + seed + 1), '')
-            for name, each in outcomes.items():
-                rows.append({'wrong': _named(count), 'method': name, **_summary(each)})
-    return {'poses': len(graph.poses), 'closures': right, 'rows': rows}
+    cases: Cases, wrong: Wrong, methods: dict[str, Method], seeds: int, rival_seeds: int,
+    quiet: bool,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """One row per solver over the draws, printed when they are done.
+
+    ``worse_than`` has, per rival, in how many of the draws that both solved to the end the error
+    of select is larger than the rival's.
+    """
+    draws: list[dict[str, Judged]] = []
+    num = seeds if wrong.number or wrong.share else 1
+    with Progress(f'{wrong} wrong closures', float(num), quiet) as progress:
+        for seed in range(num):
+            own = {name: m for name, m in methods.items() if name == SELECT or seed < rival_seeds}
+            draws.append(cases.solve(wrong, seed, own))
+            progress.update(float(seed + 1))
+    rows: list[dict[str, Any]] = []
+    for name in methods:
+        each = [one[name] for one in draws if name in one]
+        rows.append({'wrong': str(wrong), 'method': name, **summary(each)})
+        if name == SELECT:
+            rows[-1]['worse_than'] = {m: _worse(draws, m) for m in methods if m != SELECT}
+        if not quiet:
+            _print_row(rows[-1])
+    return rows
 
 
-def _named(count: float) -> str:
-    return f'{-100.0 * count:.0f}%' if count < 0.0 else f'{count:.0f}'
+def _worse(draws: list[dict[str, Judged]], rival: str) -> int:
+    """In how many draws the error of select is larger than that of a rival."""
+    both = [one for one in draws if rival in one and 'stopped' not in one[rival]]
+    return sum(one[SELECT]['ate_m'] > (1.0 + SAME) * one[rival]['ate_m'] + NOTHING for one in both)
 
 
-def _judge(graph: Graph, method: Method, best: Array, right: int) -> dict[str, float]:
-    """One solver on a copy of a graph."""
-    own = copied(graph)
-    cpu_ms, accepted = method(own)
-    T = se2.align(own.poses[:, :2], best[:, :2])
-    error = np.hypot(*(se2.transform(T, own.poses[:, :2]) - best[:, :2]).T)
-    out = {'ate_m': float(np.sqrt(np.mean(error**2))), 'cpu_ms': cpu_ms}
-    if accepted is not None:
-        out['missed'] = float(np.sum(~accepted[:right]))
-        out['accepted_wrong'] = float(np.sum(accepted[right:]))
-    return out
-
-
-def _summary(each: list[dict[str, float]]) -> dict[str, float]:
-    ate = [one['ate_m'] for one in each]
-    out = {'runs': len(each), 'ate_median_m': float(np.median(ate)), 'ate_max_m': max(ate)}
-    for name in each[0].keys() - {'ate_m'}:
-        out[name] = float(np.mean([one[name] for one in each]))
-    return out
-
-
-def _print(result: dict[str, Any]) -> None:
+def _print_head(result: dict[str, Any]) -> None:
     print(f'{result["graph"]}: {result["poses"]} poses, {result["closures"]} right closures')
-    print('  wrong method          ATE median m       max m  missed  wrong in    CPU ms')
-    for row in result['rows']:
-        selected = (
-            f'{row["missed"]:7.1f} {row["accepted_wrong"]:9.1f}' if 'missed' in row else ' ' * 17
-        )
-        print(
-            f'  {row["wrong"]:>5} {row["method"]:14} {row["ate_median_m"]:13.4f} '
-            f'{row["ate_max_m"]:11.4f} {selected} {row["cpu_ms"]:9.0f}'
-        )
+    columns = 'wrong method       runs  ATE median m       max m  missed  wrong in    CPU ms'
+    print(f'  {columns}  worse than')
+
+
+def _print_row(row: dict[str, Any]) -> None:
+    error = ' ' * 25
+    if 'ate_median_m' in row:
+        error = f'{row["ate_median_m"]:13.4f} {row["ate_max_m"]:11.4f}'
+    selected = ' ' * 17
+    if 'missed' in row:
+        selected = f'{row["missed"]:7.1f} {row["accepted_wrong"]:9.1f}'
+    worse = [f'{rival} in {k}' for rival, k in row.get('worse_than', {}).items() if k]
+    stopped = [f'{row["stopped"].count(why)} {why}' for why in dict.fromkeys(row['stopped'])]
+    notes = ', '.join([*worse, *(f'stopped: {one}' for one in stopped)])
+    line = (
+        f'  {row["wrong"]:>5} {row["method"]:13} {row["runs"]:3d} {error} {selected} '
+        f'{row["cpu_ms"]:9.0f}  {notes}'
+    )
+    print(line.rstrip(), flush=True)

@@ -1,8 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""GTSAM's robust solvers for ``rlml bench robust``: GNC, and Levenberg-Marquardt with kernels."""
+"""GTSAM's robust solvers for ``rlml bench robust``: GNC, and Levenberg-Marquardt with kernels.
+
+They run in a process of their own, which the system ends where a solve takes more CPU time than
+it may: a call into GTSAM cannot be interrupted otherwise.
+"""
 
 from __future__ import annotations
 
+import math
+import multiprocessing
+import resource
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 import gtsam
@@ -11,10 +22,57 @@ from numpy.typing import NDArray
 
 from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.table import FactorKind
+from rlml_slam.se2 import Array
 from rlml_slam.tools.bench_rivals import timed
+from rlml_slam.tools.robust_cases import Outcome
 
 PROBABILITY = 0.99  # of an inlier to be inside GNC's truncation
 ITERATIONS = 200
+
+# CPU time [ms], poses (n, 3), closures accepted (k,) or None
+Solved = tuple[float, Array, NDArray[np.bool_] | None]
+
+
+class Rivals:
+    """Runs the functions of this module with ``limit`` [s] of CPU time each."""
+
+    def __init__(self, limit: float) -> None:
+        self._limit = limit
+        self._pool: ProcessPoolExecutor | None = None
+
+    def run(self, solve: Callable[..., Solved], graph: Graph, *rest: Any) -> Outcome:
+        """Solve, and write the poses into the graph if that comes to an end."""
+        if self._pool is None:
+            context = multiprocessing.get_context('spawn')
+            self._pool = ProcessPoolExecutor(1, mp_context=context)
+        try:
+            done = self._pool.submit(_limited, self._limit, solve, graph, *rest).result()
+        except BrokenProcessPool:
+            self.close()
+            return Outcome(self._limit * 1e3, stopped=f'over {self._limit:g} s')
+        if isinstance(done, Outcome):
+            return done
+        graph.poses[:] = done[1]
+        return Outcome(done[0], done[2])
+
+    def close(self) -> None:
+        """End the process."""
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
+
+
+def _limited(limit: float, solve: Callable[..., Solved], *rest: Any) -> Solved | Outcome:
+    """Call, in a process that ends if this takes more CPU time than ``limit`` [s]."""
+    start = time.process_time()
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    most = resource.getrlimit(resource.RLIMIT_CPU)[1]
+    resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(start + limit), most))
+    try:
+        return solve(*rest)
+    except RuntimeError as e:  # GTSAM's, of equations that it cannot solve
+        words = str(e).strip().partition('\n')[0]
+        return Outcome((time.process_time() - start) * 1e3, stopped=words)
 
 
 def _problem(graph: Graph, kernel: Any = None) -> tuple[Any, Any]:
@@ -34,14 +92,13 @@ def _problem(graph: Graph, kernel: Any = None) -> tuple[Any, Any]:
     return factors, values
 
 
-def _write(graph: Graph, result: Any) -> None:
-    for i in range(len(graph.poses)):
-        T = result.atPose2(i)
-        graph.poses[i] = [T.x(), T.y(), T.theta()]
+def _poses(n: int, result: Any) -> Array:
+    T = [result.atPose2(i) for i in range(n)]
+    return np.array([[one.x(), one.y(), one.theta()] for one in T])
 
 
-def run_gnc(graph: Graph) -> tuple[float, NDArray[np.bool_]]:
-    """(CPU time [ms], closures accepted (k,)): truncated least squares, odometry known."""
+def run_gnc(graph: Graph) -> Solved:
+    """Truncated least squares, odometry known."""
     factors, values = _problem(graph)
     closures = np.flatnonzero(graph.edges.kinds == FactorKind.CLOSURE)
     known = np.flatnonzero(graph.edges.kinds != FactorKind.CLOSURE).tolist()
@@ -51,16 +108,15 @@ def run_gnc(graph: Graph) -> tuple[float, NDArray[np.bool_]]:
     optimizer = gtsam.GncLMOptimizer(factors, values, options)
     optimizer.setInlierCostThresholdsAtProbability(PROBABILITY)
     ms, result = timed(optimizer.optimize)
-    _write(graph, result)
-    return ms, np.asarray(optimizer.getWeights())[closures] >= 0.5
+    accepted = np.asarray(optimizer.getWeights())[closures] >= 0.5
+    return ms, _poses(len(graph.poses), result), accepted
 
 
-def run_kernel(graph: Graph, name: str, scale: float) -> float:
-    """CPU time [ms] of Levenberg-Marquardt with the M-estimator ``name`` on the closures."""
+def run_kernel(graph: Graph, name: str, scale: float) -> Solved:
+    """Levenberg-Marquardt with the M-estimator ``name`` on the closures."""
     factors, values = _problem(graph, getattr(gtsam.noiseModel.mEstimator, name).Create(scale))
     options = gtsam.LevenbergMarquardtParams()
     options.setMaxIterations(ITERATIONS)
     optimizer = gtsam.LevenbergMarquardtOptimizer(factors, values, options)
     ms, result = timed(optimizer.optimize)
-    _write(graph, result)
-    return ms
+    return ms, _poses(len(graph.poses), result), None

@@ -74,6 +74,62 @@ def test_gtsam_agrees_where_nothing_is_wrong(graph_file, capsys):
     assert max(gnc['ate_max_m'], ours['ate_max_m']) < 0.1
 
 
+def test_a_run_that_was_broken_off_goes_on(graph_file, tmp_path, capsys):
+    def rows(*more):
+        words = [
+            'bench',
+            'robust',
+            str(graph_file),
+            '--wrong',
+            '20',
+            '--keep',
+            str(tmp_path / 'kept'),
+        ]
+        rivals = ('gnc', 'cauchy', 'gtsam gnc', 'gtsam cauchy', 'gtsam dcs')
+        assert main([*words, '--json', *more, *(w for r in rivals for w in ('--without', r))]) == 0
+        result = json.loads(capsys.readouterr().out)['results'][0]
+        return {row['method']: row for row in result['rows']}
+
+    assert [row['runs'] for row in rows('--seeds', '1').values()] == [1, 1]
+    (path,) = (tmp_path / 'kept').iterdir()
+    kept = json.loads(path.read_text())
+    kept['results']['select']['ate_m'] = 7.0
+    path.write_text(json.dumps(kept))
+    more = rows('--seeds', '2', '--rival-seeds', '1')
+    assert more['select']['ate_max_m'] == 7.0
+    assert (more['select']['runs'], more['dcs']['runs']) == (2, 1)
+    assert more['select']['worse_than'] == {'dcs': 1}
+    # that of another graph under the same name is none
+    write_graph(graph_file, city(150, seed=4))
+    assert rows('--seeds', '1')['select']['ate_max_m'] < 1e-4
+
+
+def _without_end(_graph):
+    while True:
+        pass
+
+
+def _in_vain(_graph):
+    raise RuntimeError('Indeterminant linear system\nnear x7')
+
+
+def test_a_rival_that_does_not_come_to_an_end_is_told():
+    pytest.importorskip('gtsam')
+    from rlml_slam.tools.robust_rivals import Rivals, run_kernel
+
+    graph = city(30)
+    start = graph.poses.copy()
+    rivals = Rivals(1.0)
+    try:
+        assert rivals.run(_without_end, graph).stopped == 'over 1 s'
+        assert rivals.run(_in_vain, graph).stopped == 'Indeterminant linear system'
+        assert_array_equal(graph.poses, start)
+        assert rivals.run(run_kernel, graph, 'DCS', 1.0).stopped is None
+    finally:
+        rivals.close()
+    assert np.abs(graph.poses - start).max() > 1e-3
+
+
 def test_a_word_that_is_no_count_is_refused(graph_file, capsys):
     assert main(['bench', 'robust', str(graph_file), '--wrong', 'many']) == 1
     assert 'neither a number nor a percentage' in capsys.readouterr().err
