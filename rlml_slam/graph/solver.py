@@ -23,13 +23,15 @@ from rlml_slam.graph.system import System, Tables, set_up
 from rlml_slam.se2 import Array
 from rlml_slam.types import EdgeKind
 
-# a start is bad, and one is computed from the edges, above this cost per residual
-BAD_START = 4.0
+# a start is bad, and one is computed from the edges, above this cost per residual: beyond three
+# sigmas in the root mean square. Nearer ones might be noise, and Gauss-Newton is there sooner.
+BAD_START = 9.0
 # costs below this per residual are rounding
 NOTHING = 1e-18
 # the memory that the last solves of a thread needed: taking it anew from the operating system, a
 # page at a time, would cost as much as a factorisation of a small graph
 _KEPT = threading.local()
+DEFAULT = params.Solver()
 # when headings are relaxed first
 NEVER, IF_BAD, ALWAYS = 0, 1, 2
 
@@ -51,14 +53,14 @@ class Solution:
     wall_ms: float
 
 
-def optimize(graph: Graph, parameters: params.Solver | None = None) -> Solution:
+def optimize(graph: Graph, parameters: params.Solver = DEFAULT) -> Solution:
     """Move the free nodes of ``graph`` to a minimum of the cost.
 
     Nodes that no enabled factor touches stay. Raises SolverError if a value is not finite or a
     part of the graph is not tied to the map.
     """
     began = time.perf_counter()
-    p = parameters or params.Solver()
+    p = parameters
     relaxing = {'auto': IF_BAD, 'chordal': ALWAYS}.get(p.initialization, NEVER)
     start = None
     if p.initialization in ('odometry', 'spanning_tree'):

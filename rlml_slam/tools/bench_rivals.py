@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam import params
 from rlml_slam.graph import factors
 from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.solver import optimize
@@ -66,7 +65,7 @@ def installed() -> dict[str, dict[str, Solver]]:
 
 def run_rlml(graph: Graph, iterations: int) -> Run:
     """This package with its default parameters (``iterations`` is not a limit here)."""
-    ms, solution = timed(lambda: optimize(graph, params.Solver()))
+    ms, solution = timed(lambda: optimize(graph))
     return Run(ms, solution.iterations)
 
 
