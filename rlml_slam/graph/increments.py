@@ -23,21 +23,25 @@ from rlml_slam.se2 import Array
 # and ``late`` are the last steps that asked for it and that brought a factor to it; ``moved`` is
 # the last step that moved it. The estimate is x, y, theta + d; ``s`` is the d that the cliques
 # below know. ``stiff`` [1/m^2] and ``turn`` [1/rad^2] bound the information on it of all factors.
+# The factors from a pose were linearised at headings between ``low`` and ``high``, and have arms
+# up to ``reach``. In the chain of a landmark those factors come first that are on it alone.
 UNKNOWN = np.dtype(
     # what the back-substitution reads comes first, in one line of the cache
     [('size', np.int64), ('moved', np.int64)]
     + [(k, np.float64) for k in ('dx', 'dy', 'dtheta', 'x', 'y', 'theta')]
     + [(k, np.float64) for k in ('sx', 'sy', 'stheta', 'stiff', 'turn')]
     + [(k, np.int64) for k in ('index', 'head', 'clique', 'links', 'local', 'seeded', 'late')]
+    + [(k, np.float64) for k in ('low', 'high', 'reach')]
 )
 
 # A factor of any table, in the form of an edge from i to j with unknowns a and b (-1: none): a
 # sighting has no information on the angle, a prior has no i. c to I22 as in system.EDGE. Its
 # linearisation: ``from`` theta_i, ``C`` and ``S`` cosine and sine of theta_i + theta_delta, dx and
 # dy t_j - t_i, ``arm`` their length in sigmas, e the residual where all d are zero, the robust
-# weight. ``checked`` is the last step that judged it.
+# weight. ``checked`` is the last step that judged it, ``after`` the next one to be assembled.
 FACTOR = np.dtype(
-    [(k, np.int64) for k in ('table', 'i', 'j', 'a', 'b', 'next_a', 'next_b', 'kind', 'checked')]
+    [(k, np.int64) for k in ('table', 'i', 'j', 'a', 'b', 'next_a', 'next_b', 'kind')]
+    + [(k, np.int64) for k in ('checked', 'after')]
     + [(k, np.float64) for k in ('from', 'arm', 'c', 's', 'x', 'y', 'theta')]
     + [(k, np.float64) for k in ('I00', 'I01', 'I02', 'I11', 'I12', 'I22')]
     + [(k, np.float64) for k in ('C', 'S', 'dx', 'dy', 'e0', 'e1', 'e2', 'weight')]

@@ -18,6 +18,11 @@ from rlml_slam.graph.increments import SEEDS, STEP, State, drop_clique
 from rlml_slam.graph.ordering import minimum_degree
 from rlml_slam.graph.structure import Ints, Records, adjacency, elimination_tree, supernodes
 
+# rows that a clique owns at most: what the next step touches is near the end of the root, and a
+# wide root in one piece would be factored as a whole for it. Wider ones save little: taking an
+# update matrix over costs some operations per number, making it as many as there are rows.
+WIDEST = 48
+
 
 class Part(NamedTuple):
     """Unknowns (m,) that are eliminated anew and cliques (k,) that stay below them.
@@ -47,7 +52,8 @@ def take_out(state: State, numbers: Ints) -> Part:
     for n in range(k):
         num += cliques[below[n]]['members'] - cliques[below[n]]['own']
     for n in range(m):
-        num += state.unknowns[unknowns[n]]['links'] + 1
+        u = state.unknowns[unknowns[n]]
+        num += 1 + (u['links'] if u['size'] == 3 else 0)
     pairs = np.empty((num, 2), np.int64)
     w = 0
     for n in range(k):
@@ -66,7 +72,8 @@ def take_out(state: State, numbers: Ints) -> Part:
             pairs[w, 0], pairs[w, 1] = m, n
             w += 1
             late += 1
-        link = state.unknowns[v]['head']
+        # every factor between two unknowns starts from a pose
+        link = state.unknowns[v]['head'] if dims[n] == 3 else -1
         while link >= 0:
             z = state.factors[link // 2]
             if link % 2 == 0 and z['b'] >= 0 and state.unknowns[z['b']]['local'] >= 0:
@@ -79,7 +86,7 @@ def take_out(state: State, numbers: Ints) -> Part:
     order = minimum_degree(start, neighbours, dims)
     dims[m] = 0
     order, parent, count = elimination_tree(start, neighbours, _eliminated_first(order, m))
-    structure = supernodes(start, neighbours, order, parent, count, pairs[:0], dims)
+    structure = supernodes(start, neighbours, order, parent, count, pairs[:0], dims, WIDEST)
     fronts, entries, _ = lay_out(structure, dims)
     return Part(unknowns, below, structure.order, structure.position, fronts, entries)
 

@@ -93,6 +93,7 @@ def refactor(
     column = np.empty(most, np.int64)
     rows = np.empty(most, np.int64)
     floor = np.empty(most)
+    first = _by_elimination(state, anew)
     assembled = 0
     for s in range(len(fronts) - 1):
         c = of_front[s]
@@ -112,7 +113,7 @@ def refactor(
             n = anew.order[k]
             if n < len(anew.unknowns):
                 assembled += _assemble(
-                    state, pool, anew, n, row_of, column, height, losses, poses, landmarks
+                    state, pool, first[n], row_of, column, height, losses, poses, landmarks
                 )
         child = clique['child']
         while child >= 0:
@@ -131,37 +132,59 @@ def refactor(
 
 
 @part
+def _by_elimination(state: State, anew: Part) -> Ints:
+    """First factor (m,) of those of which each unknown of the part is eliminated first, or -1.
+
+    The chains of the poses have all factors of the part but those on a landmark alone: that of a
+    landmark, which may have been seen from all over the map, is left where these end.
+    """
+    unknowns, position = state.unknowns, anew.position
+    out = np.empty(len(anew.unknowns), np.int64)
+    for n in range(len(out)):
+        out[n] = -1
+    for n in range(len(out)):
+        u = unknowns[anew.unknowns[n]]
+        link = u['head']
+        while link >= 0:
+            f, end = link // 2, link % 2
+            z = state.factors[f]
+            if u['size'] == 2 and z['a'] >= 0:
+                break
+            link = z['next_a'] if end == 0 else z['next_b']
+            fetch(state.factors, link // 2, 0)
+            first = n
+            if end == 0 and z['b'] >= 0:
+                m = unknowns[z['b']]['local']
+                if m < 0:
+                    continue
+                first = m if position[m] < position[n] else n
+            elif end == 1 and z['a'] >= 0:
+                continue
+            z['after'] = out[first]
+            out[first] = f
+    return out
+
+
+@part
 def _assemble(
-    state: State, pool: Array, anew: Part, n: int, row_of: Ints, column: Ints, height: int,
+    state: State, pool: Array, f: int, row_of: Ints, column: Ints, height: int,
     losses: Array, poses: Array, landmarks: Array,
 ) -> int:  # fmt: skip
-    """Add the factors of which unknown n of the part is eliminated first; how many."""
-    unknowns, position, num = state.unknowns, anew.position, 0
-    link = unknowns[anew.unknowns[n]]['head']
-    while link >= 0:
-        f, end = link // 2, link % 2
+    """Add the chain of factors from f on; how many."""
+    unknowns, num = state.unknowns, 0
+    while f >= 0:
         z = state.factors[f]
-        link = z['next_a'] if end == 0 else z['next_b']
         for k in range(0, 256, 64):  # all of the next record
-            fetch(state.factors, link // 2, k)
-        other = z['b'] if end == 0 else z['a']
-        m = n
-        if other >= 0:
-            m = unknowns[other]['local']
-            if m < 0 or position[m] < position[n]:
-                continue
+            fetch(state.factors, z['after'], k)
         linearize_factor(state, f, losses, poses, landmarks)
-        row, row_other = row_of[n], row_of[m]
-        a, b = (row, row_other) if end == 0 else (row_other, row)
-        size = 3
-        if z['a'] < 0:
-            a = -1
-        if z['b'] < 0:
-            b = -1
-        else:
-            size = unknowns[z['b']]['size']
+        a, b, size = -1, -1, 3
+        if z['a'] >= 0:
+            a = row_of[unknowns[z['a']]['local']]
+        if z['b'] >= 0:
+            b, size = row_of[unknowns[z['b']]['local']], unknowns[z['b']]['size']
         _add_factor(z, pool, column, height, a, b, size)
         num += 1
+        f = z['after']
     return num
 
 

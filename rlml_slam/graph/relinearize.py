@@ -87,6 +87,7 @@ def _refer(state: State, v: int, x: float, y: float, theta: float) -> None:
     """Measure d from this estimate on."""
     u = state.unknowns[v]
     u['x'], u['y'], u['theta'] = x, y, theta
+    u['low'], u['high'], u['reach'] = theta, theta, 0.0
     u['dx'] = u['dy'] = u['dtheta'] = u['sx'] = u['sy'] = u['stheta'] = 0.0
 
 
@@ -169,11 +170,7 @@ def _switch(state: State, f: int, on: bool) -> None:
             continue
         u = state.unknowns[v]
         if on:
-            if end == 0:
-                z['next_a'] = u['head']
-            else:
-                z['next_b'] = u['head']
-            u['head'] = 2 * f + end
+            _link(state, v, 2 * f + end)
             u['links'] += 1
         else:
             _unlink(state, v, 2 * f + end)
@@ -188,6 +185,21 @@ def _switch(state: State, f: int, on: bool) -> None:
 
 
 @part
+def _link(state: State, v: int, link: int) -> None:
+    """Put a factor's end into the chain of unknown v."""
+    z, u = state.factors[link // 2], state.unknowns[v]
+    before, after = -1, u['head']
+    if u['size'] == 2 and z['a'] >= 0:
+        while after >= 0 and state.factors[after // 2]['a'] < 0:
+            before, after = after, _next(state, after)
+    _set_next(state, link, after)
+    if before < 0:
+        u['head'] = link
+    else:
+        _set_next(state, before, link)
+
+
+@part
 def _unlink(state: State, v: int, link: int) -> None:
     """Take a factor's end out of the chain of unknown v."""
     after = _next(state, link)
@@ -197,10 +209,7 @@ def _unlink(state: State, v: int, link: int) -> None:
         return
     while _next(state, k) != link:
         k = _next(state, k)
-    if k % 2 == 0:
-        state.factors[k // 2]['next_a'] = after
-    else:
-        state.factors[k // 2]['next_b'] = after
+    _set_next(state, k, after)
 
 
 @part
@@ -208,6 +217,15 @@ def _next(state: State, link: int) -> int:
     z = state.factors[link // 2]
     after: int = z['next_a'] if link % 2 == 0 else z['next_b']
     return after
+
+
+@part
+def _set_next(state: State, link: int, after: int) -> None:
+    z = state.factors[link // 2]
+    if link % 2 == 0:
+        z['next_a'] = after
+    else:
+        z['next_b'] = after
 
 
 @part
@@ -229,6 +247,8 @@ def linearize_factor(state: State, f: int, losses: Array, poses: Array, landmark
     z['C'], z['S'], z['dx'], z['dy'] = c, s, dx, dy
     z['from'] = unknowns[a]['theta'] + unknowns[a]['dtheta'] if a >= 0 else theta
     z['arm'] = math.sqrt((z['I00'] + z['I11']) * (dx * dx + dy * dy))
+    if a >= 0:
+        _widen(unknowns[a], z)
     z['weight'] = loss(losses[z['kind'], 0], losses[z['kind'], 1], _squared(z, e0, e1, e2))[1]
     # e + J d is linear, so where all d are zero it is e - J d
     x = y = t = 0.0
@@ -241,6 +261,13 @@ def linearize_factor(state: State, f: int, losses: Array, poses: Array, landmark
         t -= t_a
     z['e0'], z['e1'] = e0 - (c * x + s * y), e1 - (c * y - s * x)
     z['e2'] = 0.0 if on_landmark else e2 - t
+
+
+@part
+def _widen(u: np.void, z: np.void) -> None:
+    """Have factor z from pose u within its bounds."""
+    u['low'], u['high'] = min(u['low'], z['from']), max(u['high'], z['from'])
+    u['reach'] = max(u['reach'], z['arm'])
 
 
 @part
@@ -276,16 +303,22 @@ def judge(
         fetch(state.factors, soon, 64)
         if not robust and u['size'] == 2:
             continue
+        theta = u['theta'] + u['dtheta']
+        if not robust:
+            phi = max(theta - u['low'], u['high'] - theta)
+            if _harmless(phi, u['reach'], due, turn):
+                continue
+            u['low'], u['high'], u['reach'] = theta, theta, 0.0  # the true bounds are found below
         link = u['head']
         while link >= 0:
             f, end = link // 2, link % 2
             z = state.factors[f]
             link = z['next_a'] if end == 0 else z['next_b']
             if not robust:
-                # factors are stretched by some sigmas at most: most need no closer look
-                phi = abs(u['theta'] + u['dtheta'] - z['from'])
-                small = phi < NEAR * turn and phi * (USUAL + 0.5 * phi * z['arm']) < NEAR * due
-                if end == 1 or small:
+                if end == 1:
+                    continue
+                _widen(u, z)
+                if _harmless(abs(theta - z['from']), z['arm'], due, turn):
                     continue
             if z['checked'] == counts[STEP]:
                 continue
@@ -297,6 +330,15 @@ def judge(
                 counts[LISTED] += 1
     if worst < 1.0:
         counts[LISTED] = 0
+
+
+@part
+def _harmless(phi: float, arm: float, due: float, turn: float) -> bool:
+    """Whether a pose that turned by phi leaves its factors with arms up to this well modelled.
+
+    They are stretched by some sigmas at most: most need no closer look.
+    """
+    return phi < NEAR * turn and phi * (USUAL + 0.5 * phi * arm) < NEAR * due
 
 
 @part

@@ -172,24 +172,25 @@ def _postorder(parent: Ints) -> Ints:
 
 
 @part
-def _merge(parent: Ints, count: Ints, order: Ints, dims: Ints) -> Ints:
+def _merge(parent: Ints, count: Ints, order: Ints, dims: Ints, widest: int) -> Ints:
     """Last position of the supernode of each position: exact supernodes, then relaxed ones.
 
     A supernode joins its parent's where that adds few zeros: little work is wasted and much
-    overhead saved, because dense loops are longer.
+    overhead saved, because dense loops are longer. None gets wider than ``widest`` rows; what
+    would is cut from its end on.
     """
     n = len(parent)
     last = np.empty(n, np.int64)
     cols = _filled(n, 0)  # by last position: own rows, rows of the front, zeros so far
     rows = _filled(n, 0)
     zeros = _filled(n, 0)
-    for k in range(n):
+    for k in range(n - 1, -1, -1):
+        own = dims[order[k]]
         last[k] = k
-    for k in range(n - 2, -1, -1):
-        if parent[k] == k + 1 and count[k] == count[k + 1] + 1:
+        alike = k + 1 < n and parent[k] == k + 1 and count[k] == count[k + 1] + 1
+        if alike and cols[last[k + 1]] + own <= widest:
             last[k] = last[k + 1]
-    for k in range(n):
-        cols[last[k]] += dims[order[k]]
+        cols[last[k]] += own
     # rows below a supernode: the front of the parent holds them all, so a sum of rows suffices
     for k in range(n - 1, -1, -1):
         if last[k] == k:
@@ -201,7 +202,7 @@ def _merge(parent: Ints, count: Ints, order: Ints, dims: Ints) -> Ints:
         wide = cols[k] + cols[up]
         new = zeros[k] + zeros[up] + cols[k] * (rows[up] + cols[k] - rows[k])
         share = new / (wide * (rows[up] + cols[k]))
-        if (
+        if wide <= widest and (
             (wide <= 16 and share < 0.45)
             or (wide <= 48 and share < 0.2)
             or (wide <= 96 and share < 0.08)
@@ -218,11 +219,12 @@ def _merge(parent: Ints, count: Ints, order: Ints, dims: Ints) -> Ints:
 
 @part
 def supernodes(
-    start: Ints, neighbours: Ints, order: Ints, parent: Ints, count: Ints, pairs: Ints, dims: Ints
-) -> Structure:
-    """Fronts of the relaxed supernodes."""
+    start: Ints, neighbours: Ints, order: Ints, parent: Ints, count: Ints, pairs: Ints, dims: Ints,
+    widest: int,
+) -> Structure:  # fmt: skip
+    """Fronts of the relaxed supernodes, of ``widest`` own rows at most."""
     n = len(order)
-    last = _merge(parent, count, order, dims)
+    last = _merge(parent, count, order, dims, widest)
     # supernodes by their last position; members of one become neighbours in the order
     index = _filled(n, -1)
     num = 0

@@ -138,7 +138,7 @@ def set_up(tables: Tables, memory: Array) -> tuple[int, System]:
     start, neighbours = adjacency(pairs, num)
     order = elimination_order(start, neighbours, dims)
     order, parent, count = elimination_tree(start, neighbours, order)
-    structure = supernodes(start, neighbours, order, parent, count, pairs, dims)
+    structure = supernodes(start, neighbours, order, parent, count, pairs, dims, 3 * num)
     fronts, entries, stack = lay_out(structure, dims)
     place(structure, fronts, entries, variables, edges, sightings)
     rows = 0
