@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from enum import IntEnum
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rlml_slam.compiled import brief
 from rlml_slam.errors import SolverError
 from rlml_slam.graph.system import Factors
 from rlml_slam.se2 import Array
@@ -178,7 +180,8 @@ class FactorTable:
         same = np.zeros(len(nodes), dtype=np.bool_)
         if self.node_names == ('pose', 'pose'):
             same = nodes[:, 0] == nodes[:, 1]
-        bad = ~known.all(-1) | nonfinite | ~is_positive_definite(information) | same
+        regular = is_positive_definite(np.ascontiguousarray(information))
+        bad = ~known.all(-1) | nonfinite | ~regular | same
         if not bad.any():
             return
         i = int(np.argmax(bad))
@@ -199,22 +202,31 @@ def renumbered(kept: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.where(kept, np.cumsum(kept) - 1, -1)
 
 
+@brief
 def is_positive_definite(matrices: Array) -> NDArray[np.bool_]:
     """Per matrix ``(k, d, d)``, d <= 3: finite, symmetric to 1e-6 and all leading minors > 0."""
-    d = matrices.shape[-1]
-    with np.errstate(invalid='ignore', over='ignore'):
-        scale = np.abs(matrices).max((1, 2), initial=0.0)
-        good: NDArray[np.bool_] = np.isfinite(scale) & (scale > 0.0)
-        asymmetry = np.abs(matrices - np.swapaxes(matrices, 1, 2)).max((1, 2), initial=0.0)
-        good &= asymmetry <= 1e-6 * scale
+    d = matrices.shape[1]
+    out = np.zeros(len(matrices), dtype=np.bool_)
+    c = np.zeros((3, 3))
+    for k in range(len(matrices)):
+        M = matrices[k]
+        scale, asymmetry, good = 0.0, 0.0, True
+        for i in range(d):
+            good = good and M[i, i] > 0.0
+            for j in range(d):
+                good = good and math.isfinite(M[i, j])
+                scale = max(scale, abs(M[i, j]))
+                asymmetry = max(asymmetry, abs(M[i, j] - M[j, i]))
+        if not good or asymmetry > 1e-6 * scale:
+            continue
         # scaled to a unit diagonal: units of metres and radians may lie far apart
-        diagonal = np.einsum('kii->ki', matrices)
-        good &= (diagonal > 0.0).all(-1)
-        root = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-        c = matrices / (root[:, :, None] * root[:, None, :])
+        for i in range(d):
+            for j in range(d):
+                c[i, j] = M[i, j] / (math.sqrt(M[i, i]) * math.sqrt(M[j, j]))
         if d >= 2:
-            good &= 1.0 - c[:, 0, 1] ** 2 > 1e-12
+            good = 1.0 - c[0, 1] ** 2 > 1e-12
         if d == 3:
-            a, b, e = c[:, 0, 1], c[:, 0, 2], c[:, 1, 2]
-            good &= 1.0 + 2.0 * a * b * e - a * a - b * b - e * e > 1e-12
-    return good
+            minor = 1.0 + 2.0 * c[0, 1] * c[0, 2] * c[1, 2]
+            good = good and minor - c[0, 1] ** 2 - c[0, 2] ** 2 - c[1, 2] ** 2 > 1e-12
+        out[k] = good
+    return out

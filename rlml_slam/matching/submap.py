@@ -33,7 +33,7 @@ FEWEST = 64  # of so many rays, one is followed from the sensor on
 CLOSE = 0.99  # [cells] between two rays, so that a cell does not fit in between
 DIAGONAL = 1.5  # [cells] that one cell covers of a ray at most
 ENDS = 3.0 * DIAGONAL  # [cells] of the last cells of a ray, which it does not miss, and one more
-EMPTY = np.zeros(0, dtype=np.int64)
+EMPTY = np.zeros(0, dtype=np.int32)
 FIRST_LIST = 4096
 
 
@@ -113,7 +113,7 @@ class Submap:
             )  # fmt: skip
             if used >= 0:
                 break
-            self._list = np.zeros(max(2 * len(self._list), FIRST_LIST), dtype=np.int64)
+            self._list = np.zeros(max(2 * len(self._list), FIRST_LIST), dtype=np.int32)
         self.insertions += 1
 
     def complete(self) -> None:
@@ -220,7 +220,7 @@ def carve(
     scale: float,
     hit: NDArray[np.uint16],
     miss: NDArray[np.uint16],
-    touched: NDArray[np.int64],
+    touched: NDArray[np.int32],
 ) -> int:
     """Apply one scan to ``values``; number of cells touched, or -1 if ``touched`` is too short.
 
@@ -305,7 +305,7 @@ def touch_ray(
     y0: float,
     x1: float,
     y1: float,
-    touched: NDArray[np.int64],
+    touched: NDArray[np.int32],
     n: int,
 ) -> int:
     """Mark and list the cells from (x0, y0) to (x1, y1) [cells], but the last two (Amanatides).

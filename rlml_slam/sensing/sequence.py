@@ -182,7 +182,10 @@ class Sequencer:
         """The stamp less its jitter, where the stream is one of a steady sensor."""
         if not self._node.steady_stamps or stamp <= 0:
             return stamp
-        return self._clocks.setdefault((stream, source), SteadyClock()).steady(stamp)
+        clock = self._clocks.get((stream, source))
+        if clock is None:
+            clock = self._clocks[stream, source] = SteadyClock()
+        return clock.steady(stamp)
 
     def _clock_of(self, item: Scan | Detections) -> tuple[str, str]:
         """Both halves of an instant have one clock, whichever comes first."""
