@@ -66,7 +66,9 @@ def test_sensor_that_hangs_upside_down_is_told_from_one_that_is_tilted():
 
 def test_later_transform_replaces_the_earlier():
     tree = Extrinsics()
+    assert tree.pose('base_link', 'laser') is None
     tree.add(planar('base_link', 'laser', [1, 0, 0]))
+    assert tree.pose('base_link', 'laser')[0] == 1.0
     tree.add(planar('base_link', 'laser', [2, 0, 0]))
     assert tree.pose('base_link', 'laser')[0] == 2.0
 
