@@ -11,6 +11,7 @@ from rlml_slam import se2
 from rlml_slam.errors import SolverError
 from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.incremental import Incremental, Step, Thresholds
+from rlml_slam.graph.partial import WIDEST
 from rlml_slam.graph.robust import Loss, Losses, LossKind
 from rlml_slam.graph.solver import optimize
 from rlml_slam.tools.bench_graphs import city, warehouse
@@ -122,6 +123,32 @@ def test_a_closure_costs_the_path_and_not_the_graph() -> None:
     assert ours.solver.update().refactored < 60
 
 
+def test_a_step_factors_the_end_of_a_wide_root_and_not_all_of_it() -> None:
+    rng = np.random.default_rng(5)
+    points = rng.uniform(-5.0, 5.0, (60, 2))
+    graph = Graph()
+    graph.add_landmarks(points)
+    graph.add_pose([0.0, 0.0, 0.0], fixed=True)
+
+    def see(x: float, landmarks: range) -> None:
+        i = graph.add_pose([x, 0.0, 0.0])
+        graph.add_edge(EdgeKind.ODOMETRY, i - 1, i, [0.1, 0.0, 0.0], 1e4 * np.eye(3))
+        for k in landmarks:
+            z = points[k] - [x, 0.0] + 0.02 * rng.standard_normal(2)
+            graph.add_sighting(i, k, z, 2500.0 * np.eye(2))
+
+    # what all poses see, they tie to one clique
+    for i in range(1, 9):
+        see(0.1 * i, range(60))
+    solver = Incremental(graph)
+    assert solver.update().refactored == 68
+    for i in range(9, 12):
+        see(0.1 * i, range(2))
+        step = solver.update()
+    assert step.refactored <= WIDEST // 2 + 1
+    assert graph.chi2() == pytest.approx(batch_chi2(graph), rel=1e-3)
+
+
 def test_nothing_new_costs_nothing() -> None:
     ours = driven(loop_graph(2)[0])
     while any(ours.solver.update()):
@@ -224,6 +251,31 @@ def test_priors_hold_a_graph_without_a_fixed_pose() -> None:
     before = graph.poses.copy()
     optimize(graph)
     np.testing.assert_allclose(before, graph.poses, atol=1e-3)
+
+
+def test_a_landmark_that_was_seen_before_is_surveyed() -> None:
+    graph, _, points = loop_graph(4)
+    solver = Incremental(graph, EXACT)
+
+    def at_the_optimum() -> None:
+        for _ in range(10):
+            solver.update()
+        assert graph.chi2() == pytest.approx(batch_chi2(graph), rel=1e-7)
+
+    at_the_optimum()
+    free = graph.chi2()
+    for k in range(4):
+        graph.add_landmark_prior(k, points[k] + [0.1, -0.2], 1e4 * np.eye(2))
+    graph.add_sighting(7, 1, [1.0, 2.0], np.eye(2))
+    at_the_optimum()
+    assert graph.chi2() > 2.0 * free
+    graph.landmark_priors.enabled[1:3] = False
+    graph.add_sighting(9, 0, [2.0, 1.0], np.eye(2))
+    at_the_optimum()
+    graph.landmark_priors.enabled[:] = False
+    graph.sightings.enabled[-2:] = False
+    at_the_optimum()
+    assert graph.chi2() == pytest.approx(free, rel=1e-7)
 
 
 def test_a_loose_pose_is_named_and_can_be_tied() -> None:
