@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether the camera's metre is the laser's: ranges, camera track and true map alone.
 
-No wheels and no filter take part. The track is shifted, turned and scaled until the distances
-from it to the cylinders are those that the laser measured, up to one offset of all ranges.
+Neither wheels nor the filter's places take part. The track is shifted, turned and scaled until the
+distances from it to the cylinders are those that the laser measured, up to one offset of all
+ranges; given headings, the point of the robot that the camera follows is found as well.
 """
 
 from __future__ import annotations
@@ -34,16 +35,20 @@ class Ranges:
 
 @dataclass(frozen=True)
 class ScaleFit:
-    """``places`` (n, 2) of the laser, which have ``scale`` times the track's size, 1 sigma apart.
+    """``places`` (n, 2) of the laser, from a track ``scale`` times its size, 1 sigma apart.
 
-    ``offset`` [m] lies between a range and a cylinder's centre; ``rms`` [m] is what remains.
+    ``offset`` [m] lies between a range and a cylinder's centre; the camera follows the ``point``
+    (2,) [m] ahead of the laser and to its left. ``rms`` [m] is what remains of so many ``ranges``.
     """
 
     places: Array
     scale: float
     sigma: float
     offset: float
+    point: Array
+    point_sigma: Array
     rms: float
+    ranges: int
 
 
 def ranges_of(data: Lego, scanner: Array, params: Spikes) -> Ranges:
@@ -62,23 +67,41 @@ def ranges_of(data: Lego, scanner: Array, params: Spikes) -> Ranges:
     return Ranges(np.array(measured), np.array(cylinders), np.array(scans))
 
 
-def fit_scale(track: Array, landmarks: Array, ranges: Ranges, rigid: bool = False) -> ScaleFit:
-    """Fit track (n, 2) and landmarks (m, 2) to ranges; ``rigid`` keeps the track's size."""
-    middle = track.mean(axis=0)
-    to = landmarks[ranges.cylinders]
+def fit_scale(
+    track: Array,
+    landmarks: Array,
+    ranges: Ranges,
+    rigid: bool = False,
+    headings: Array | None = None,
+) -> ScaleFit:
+    """Fit track (n, 2) and landmarks (m, 2) to ranges; ``rigid`` keeps the track's size.
+
+    ``headings`` (n,) of the laser, in the track's frame; without them the camera is taken to
+    follow the laser itself.
+    """
+    middle, to = track.mean(axis=0), landmarks[ranges.cylinders]
+    # shift, turn, offset of the ranges, growth, point
+    free = np.array([True] * 4 + [not rigid] + [headings is not None] * 2)
+    ahead = np.zeros(len(track)) if headings is None else headings
+
+    def whole(q: Array) -> Array:
+        out = np.zeros(len(free))
+        out[free] = q
+        return out
 
     def places(q: Array) -> Array:
-        out: Array = middle + q[:2] + (1.0 + q[4]) * (track - middle) @ se2.rotation(q[2]).T
+        grown = middle + q[:2] + (1.0 + q[4]) * (track - middle) @ se2.rotation(q[2]).T
+        out: Array = grown - se2.rotation(ahead + q[2]) @ q[5:]
         return out
 
     def errors(q: Array) -> Array:
-        at = places(np.append(q, 0.0) if rigid else q)[ranges.scans]
-        return np.asarray(np.hypot(*(to - at).T) - q[3] - ranges.measured)
+        at = places(whole(q))[ranges.scans]
+        return np.asarray(np.hypot(*(to - at).T) - whole(q)[3] - ranges.measured)
 
-    found = least_squares(errors, np.zeros(4 if rigid else 5), loss='soft_l1', f_scale=ROBUST)
-    q = np.append(found.x, 0.0) if rigid else found.x
-    e = errors(found.x)
+    found = least_squares(errors, np.zeros(free.sum()), loss='soft_l1', f_scale=ROBUST)
+    q, e = whole(found.x), errors(found.x)
     rms = float(np.sqrt(np.mean(e**2)))
-    cov = rms**2 * np.linalg.inv(found.jac.T @ found.jac)
-    sigma = 0.0 if rigid else float(np.sqrt(cov[4, 4]))
-    return ScaleFit(places(q), 1.0 + float(q[4]), sigma, float(q[3]), rms)
+    sigma = whole(rms * np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac))))
+    return ScaleFit(
+        places(q), 1.0 + float(q[4]), float(sigma[4]), float(q[3]), q[5:], sigma[5:], rms, len(e)
+    )

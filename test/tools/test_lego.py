@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -107,6 +108,21 @@ def test_ranges_alone_tell_how_large_the_track_is(scale):
     assert rigid.rms > 2.0 * free.rms if scale != 1.0 else rigid.rms < 1.01 * free.rms
 
 
+def test_ranges_and_headings_tell_which_point_the_camera_follows():
+    rng = np.random.default_rng(4)
+    landmarks, true = rng.uniform(-1.0, 1.0, (6, 2)), rng.uniform(-1.0, 1.0, (80, 2))
+    headings, point = rng.uniform(-3.0, 3.0, 80), np.array([0.04, -0.01])
+    followed = true + se2.rotation(headings) @ point
+    track = followed.mean(axis=0) + 1.1 * (followed - followed.mean(axis=0))
+    k, j = np.divmod(np.arange(80 * 6), 6)
+    d = np.hypot(*(landmarks[j] - true[k]).T)
+    ranges = Ranges(d - 0.09 + 0.01 * rng.standard_normal(len(d)), j, k)
+    fit = fit_scale(track, landmarks, ranges, headings=headings)
+    assert_allclose(fit.point, point, atol=4.0 * fit.point_sigma.max())
+    assert fit.point_sigma.max() < 0.005
+    assert_allclose(fit.places, true, atol=0.01)
+
+
 @real_data
 def test_all_cylinders_and_no_other_are_found(tmp_path, capsys):
     out = tmp_path / 'lego.png'
@@ -115,10 +131,20 @@ def test_all_cylinders_and_no_other_are_found(tmp_path, capsys):
     assert figures['cylinders_found'] == figures['cylinders'] == 6
     assert figures['landmarks_false'] == 0
     assert figures['landmark_rmse_m'] <= 0.02
-    # rigidly 6.4 cm: the camera's metre is larger than that of laser, wheels and map (docs)
+    assert figures['position_rmse_track_corrected_m'] <= 0.03
+    # 6.4 cm with the track as it is: its metre is larger than that of laser, wheels and map (docs)
     assert figures['track_scale_by_ranges'] - 1.0 > 20.0 * figures['track_scale_sigma']
     assert figures['position_rmse_by_ranges_m'] > 0.05
     assert figures['position_rmse_as_camera_m'] <= 0.03
     assert abs(figures['arena_scale'] - 1.0) < 0.01
     assert figures['camera_scale'] > 1.07
     assert out.read_bytes().startswith(b'\x89PNG')
+
+
+@real_data
+def test_the_text_says_what_is_met_and_what_is_not(capsys):
+    assert main(['study', 'lego', str(SHARED)]) == 0
+    text = capsys.readouterr().out
+    assert re.search(r'the track as it is +6\.4\d cm, not met', text)
+    assert re.search(r'the track 1\.1\d\d times smaller +3\.1\d cm, not met', text)
+    assert re.search(r'of a point 2\.\d cm ahead +2\.\d\d cm, met', text)
