@@ -64,6 +64,10 @@ def add_parser(subparsers: Any) -> None:
     )
     clam.add_argument('--robot', type=int, required=True, choices=range(1, 6), metavar='N')
     clam.add_argument('--no-ids', action='store_true', help='the detections are anonymous')
+    clam.add_argument(
+        '--depths', action='store_true',
+        help="make ranges of what is logged as such: the camera's depths",
+    )  # fmt: skip
 
     park = kinds.add_parser('victoria-park', help='Victoria Park: tree trunks become reflectors')
     park.add_argument('folder', metavar='DIR', type=Path, help='folder of the .mat files')
@@ -113,7 +117,7 @@ def _read_carmen(args: argparse.Namespace) -> tuple[Recording, dict[str, int]]:
 
 
 def _read_mrclam(args: argparse.Namespace) -> tuple[Recording, dict[str, int]]:
-    data = mrclam.read_mrclam(args.folder, args.robot, not args.no_ids)
+    data = mrclam.read_mrclam(args.folder, args.robot, not args.no_ids, args.depths)
     n = len(data.landmark_ids)
     known = Detections(
         data.odometry[0].stamp, WORLD, data.landmark_points, np.zeros((n, 2, 2)),

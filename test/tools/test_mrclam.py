@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from rlml_slam import se2
 from rlml_slam.errors import FileFormatError
 from rlml_slam.tools.ate import interpolate, trajectory_errors
-from rlml_slam.tools.mrclam import chain, read_mrclam
+from rlml_slam.tools.mrclam import HALF_VIEW, chain, read_mrclam
 from rlml_slam.tools.tum import Trajectory
 from rlml_slam.types import ANONYMOUS
 
@@ -60,6 +60,16 @@ def test_rows_of_one_stamp_are_one_message(folder):
     assert first.frame_id == 'base_link'
     # straight ahead, the covariance is diagonal: along is x
     assert_allclose(second.cov[0], np.diag([(0.045 * 3) ** 2 + 0.04**2, (3 * 0.01) ** 2]))
+
+
+def test_logged_ranges_are_depths_that_are_right_in_the_mean_over_the_picture(folder):
+    (at_rim, _), (ahead,) = (d.points for d in read_mrclam(folder, 3, depths=True).detections)
+    # logged as 3 m straight ahead and as 2 m half a radian aside: depths along x
+    assert at_rim[0] / ahead[0] == pytest.approx(2.0 / 3.0)
+    bearings = np.linspace(-HALF_VIEW, HALF_VIEW, 1001)
+    depth_of_one_metre = np.cos(bearings) * 3.0 / ahead[0]
+    # the rule of rectangles, 1001 of them
+    assert depth_of_one_metre.mean() == pytest.approx(1.0, abs=1e-3)
 
 
 def test_robots_and_misreads_are_counted(folder):
@@ -117,18 +127,26 @@ def test_chain_is_repeated_composition():
 
 @pytest.mark.skipif(not SHARED.exists(), reason=f'the data set is not at {SHARED}')
 def test_dataset_6_agrees_with_its_truth():
-    data = read_mrclam(SHARED, 4)
+    data = read_mrclam(SHARED, 4, depths=True)
     stamps = np.array([o.stamp for o in data.odometry])[::50]
     dead = Trajectory(stamps, np.array([o.pose for o in data.odometry])[::50])
     # dead reckoning of this robot drifts by 1.3 m in 888 s
     assert trajectory_errors(dead, data.truth, aligned=True).summary()['rmse_m'] == pytest.approx(
         1.3, abs=0.1
     )
-    errors = []
+    errors, shares, bearings = [], [], []
     for d in data.detections:
         (pose,), (known,) = interpolate(data.truth, np.array([d.stamp]))
         if known:
             true = [data.landmark_points[data.landmark_ids == i][0] for i in d.ids]
-            errors.extend(se2.transform(se2.inverse(pose), np.array(true)) - d.points)
+            true = se2.transform(se2.inverse(pose), np.array(true))
+            errors.extend(true - d.points)
+            shares.extend(np.hypot(*d.points.T) / np.hypot(*true.T))
+            bearings.extend(np.abs(np.arctan2(d.points[:, 1], d.points[:, 0])))
     # frames, signs and barcodes are right: without that it would be metres
     assert np.median(np.abs(errors), axis=0).max() < 0.12
+    # of ranges as logged they are 6.5 % apart; beside the bearing only its own offset is left
+    middle, rim = (
+        np.median(np.array(shares)[b]) for b in (np.less(bearings, 0.2), np.greater(bearings, 0.3))
+    )
+    assert abs(rim - middle) < 0.03
