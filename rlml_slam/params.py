@@ -437,7 +437,10 @@ class LoopClosure(Group):
     """Candidates and their verification by scan match."""
 
     enabled: bool = param(True, 'look for loop closures')
-    max_distance: float = param(8.0, 'candidates nearer than this are tried', 'm', 0.1, 100.0)
+    max_distance: float = param(
+        8.0, 'candidates nearer than this are tried; farther ones as the pose is uncertain', 'm',
+        0.1, 100.0,
+    )  # fmt: skip
     min_score: float = param(0.55, 'mean hit probability that a closure must reach', '', 0.1, 1.0)
     every: int = param(3, 'try every n-th keyframe', '', 1, 1000)
     floor2: tuple[float, ...] = param(
@@ -446,12 +449,18 @@ class LoopClosure(Group):
     )  # fmt: skip
     candidates: int = param(3, 'submaps tried per keyframe, nearest first', '', 1, 100)
     max_second: float = param(0.95, 'score of the second place relative to the best', '', 0.1, 1.0)
-    search_window: float = param(3.0, 'half width of the search', 'm', 0.1, 100.0)
-    search_angle: float = param(0.5, 'half width of the search', 'rad', 0.01, 3.2)
+    search_window: float = param(3.0, 'least half width of the search', 'm', 0.1, 100.0)
+    search_angle: float = param(0.5, 'least half width of the search', 'rad', 0.01, 3.2)
+    widest_window: float = param(
+        12.0, 'the search is as wide as the pose is uncertain, but no wider', 'm', 0.1, 100.0
+    )
+    widest_angle: float = param(
+        1.5, 'the search turns as far as the pose is uncertain, but no farther', 'rad', 0.01, 3.2
+    )
 
     @property
     def searched(self) -> float:
-        """Area [m²] of the search, were it made at all headings: of as many places as it is."""
+        """Area [m²] of the least search, were it made at all headings."""
         return (2.0 * self.search_window) ** 2 * self.search_angle / math.pi
 
 

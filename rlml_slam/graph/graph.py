@@ -161,23 +161,32 @@ class Graph:
         self.poses[:] = compose(T, self.poses)
         self.landmarks[:] = transform(T, self.landmarks)
 
-    def keep(self, poses: NDArray[np.bool_], landmarks: NDArray[np.bool_]) -> Renumbering:
-        """Let go of all other poses and landmarks with their factors, and of disabled sightings.
+    def keep(
+        self,
+        poses: NDArray[np.bool_],
+        landmarks: NDArray[np.bool_],
+        disabled: NDArray[np.bool_] | None = None,
+    ) -> Renumbering:
+        """Let go of all other poses and landmarks with their factors, and of disabled factors.
 
-        Disabled edges stay, for they may be enabled again. What was made of the graph, such as an
-        Incremental, has to be made anew.
+        Of the disabled edges those of ``disabled`` (e,) stay, for they may be enabled again, all
+        of them by default. What was made of the graph, such as an Incremental, has to be made
+        anew.
         """
         new_poses, new_landmarks = renumbered(poses), renumbered(landmarks)
         e, s = self.edges.nodes, self.sightings.nodes
         seen = self.sightings.enabled & poses[s[:, 0]] & landmarks[s[:, 1]]
+        known = np.all(poses[e], axis=-1)
+        if disabled is not None:
+            known &= self.edges.enabled | disabled
         out = Renumbering(
             new_poses, new_landmarks,
-            self.edges.keep(np.all(poses[e], axis=-1), (new_poses, new_poses)),
+            self.edges.keep(known, (new_poses, new_poses)),
             self.sightings.keep(seen, (new_poses, new_landmarks)),
         )  # fmt: skip
         self.pose_priors.keep(poses[self.pose_priors.nodes[:, 0]], (new_poses,))
-        known = self.landmark_priors.nodes[:, 0]
-        self.landmark_priors.keep(landmarks[known], (new_landmarks,))
+        prior = self.landmark_priors.nodes[:, 0]
+        self.landmark_priors.keep(landmarks[prior], (new_landmarks,))
         for column, kept in (
             (self._poses, poses), (self._fixed_poses, poses),
             (self._landmarks, landmarks), (self._fixed_landmarks, landmarks),

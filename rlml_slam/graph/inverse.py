@@ -20,12 +20,19 @@ from rlml_slam.se2 import Array
 
 
 @kernel
-def diagonal_blocks(system: System) -> Array:
-    """Diagonal block of H^-1 of each variable (v, 3, 3), with the factor of H in the panels."""
+def selected_blocks(system: System, of_edges: bool) -> tuple[Array, Array]:
+    """Blocks of H^-1: of each variable (v, 3, 3), of each edge (e, 3, 3) rows i and columns j.
+
+    The factor of H is in the panels. Without ``of_edges`` the latter are zeros.
+    """
     fronts, entries, values = system.fronts, system.entries, system.values
     variables, order = system.variables, system.structure.order
     num = len(fronts) - 1
     blocks = np.zeros((len(variables), 3, 3))
+    edges = system.edges
+    cross = np.zeros((len(edges), 3, 3))
+    by_front = np.argsort(edges['block']) if of_edges else np.empty(0, np.int64)
+    left = len(by_front)
     # full inverses of the fronts from the root to the current one
     stack = np.empty(_deepest(fronts))
     pending = np.empty(num + 1, np.int64)
@@ -48,11 +55,25 @@ def diagonal_blocks(system: System) -> Array:
                 for c in range(variables[a]['size']):
                     blocks[a, r, c] = stack[top + (i + c) * height + i + r]
             p += 1
+        while left > 0 and edges[by_front[left - 1]]['block'] >= at:
+            left -= 1
+            f = by_front[left]
+            # of the variable that goes first are the columns
+            first, later = edges[f]['a'], edges[f]['b']
+            turned = variables[first]['scalar'] < variables[later]['scalar']
+            k = top + edges[f]['block'] - at
+            for r in range(3):
+                for c in range(3):
+                    value = stack[k + c * height + r]
+                    if turned:
+                        cross[f, c, r] = value
+                    else:
+                        cross[f, r, c] = value
         pending[depth] = s
         base[depth] = top
         depth += 1
         top += height * height
-    return blocks
+    return blocks, cross
 
 
 @part

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from rlml_slam.errors import SolverError
 from rlml_slam.graph.equations import system_of
 from rlml_slam.graph.graph import Graph
-from rlml_slam.graph.inverse import columns, diagonal_blocks, joint
+from rlml_slam.graph.inverse import columns, joint, selected_blocks
 from rlml_slam.graph.iterate import factor
 from rlml_slam.graph.linearize import linearize
 from rlml_slam.se2 import Array
@@ -41,7 +41,7 @@ class Marginals:
 
     @cached_property
     def _blocks(self) -> Array:
-        return diagonal_blocks(self._system)
+        return selected_blocks(self._system, False)[0]
 
     def poses(self, indices: ArrayLike) -> Array:
         """Covariances (k, 3, 3) of the poses ``indices`` (k,)."""
@@ -69,6 +69,10 @@ class Marginals:
             free = q >= 0
             out[:, free] = columns(self._system, p)[:, q[free]]
         return np.swapaxes(out.reshape(3, -1, 3), 0, 1)
+
+    def edges(self) -> Array:
+        """Covariances (e, 3, 3) between the poses i and j of each enabled edge."""
+        return selected_blocks(self._system, True)[1]
 
     def joint(self, poses: ArrayLike, landmarks: ArrayLike = ()) -> Array:
         """Joint covariance (3k + 2l, 3k + 2l) of the poses (k,), then the landmarks (l,)."""
@@ -108,4 +112,5 @@ def warm_up() -> None:
     graph.add_edge(EdgeKind.ODOMETRY, 0, 1, [1.0, 0.0, 0.0], np.eye(3))
     marginals = Marginals(graph)
     marginals.poses([1])
+    marginals.edges()
     marginals.joint([1])

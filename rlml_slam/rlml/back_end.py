@@ -24,6 +24,7 @@ from rlml_slam.maps.survey import Survey, same
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.closure import Closure
 from rlml_slam.rlml.closure_watch import ClosureWatch
+from rlml_slam.rlml.constellation_closure import Constellations
 from rlml_slam.rlml.correction import Correction, Known, either
 from rlml_slam.rlml.deferred import DeferredMatches
 from rlml_slam.rlml.keyframes import Interval, Keyframe
@@ -84,6 +85,7 @@ class BackEnd:
         self.keyframes: list[Keyframe] = []
         self.scans = ScanGraph(p, self.graph)
         self.reflector_graph = ReflectorGraph(p.reflector, self.graph)
+        self.constellations = Constellations(p, self.graph, self.reflector_graph)
         self.deferred = DeferredMatches(p.reflector, self.reflector_graph)
         self.sparsifier = Sparsifier(p, self.graph, self.scans, self.reflector_graph)
         self.path = Path(p.back_end.path_frames)
@@ -137,9 +139,9 @@ class BackEnd:
     def _add_keyframe(self, frame: Frame, began: float) -> Update:
         self._optimized, self._changed, self._gone = False, (), ()
         key = self._node(frame)
-        closures: tuple[Closure, ...] = ()
+        closures = self._return()
         if key.points is not None:
-            closures = self.scans.add(key)
+            closures += self.scans.add(key)
         self._since_optimized += 1
         due = self._since_optimized >= self._p.back_end.optimize_every
         if due and self._is_behind:
@@ -195,6 +197,22 @@ class BackEnd:
         self.keyframes.append(key)
         self._interval = Interval(frame.T_local_base)
         return key
+
+    def _return(self) -> tuple[Closure, ...]:
+        """Loops that reflectors close at the keyframe before the newest, which has seen none yet.
+
+        Those that are the same are one from then on.
+        """
+        place = self.constellations.look(self.keyframes[:-1])
+        if place is None:
+            return ()
+        closures = self.scans.enter(place)
+        if any(c.accepted and c.j == place.key.index for c in closures):
+            for old, new in place.pairs:
+                self.reflector_graph.join(old, new)
+            self.deferred.drop()
+            self.rejoin()
+        return closures
 
     @property
     def _is_behind(self) -> bool:

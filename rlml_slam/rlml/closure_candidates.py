@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,10 +11,13 @@ import numpy as np
 
 from rlml_slam import se2
 from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.reach import reach
 from rlml_slam.params import LoopClosure
 from rlml_slam.rlml.key_submap import KeySubmap
 from rlml_slam.rlml.keyframes import Keyframe
 from rlml_slam.se2 import Array
+
+SIGMAS = 3.0  # how far off a keyframe is looked for: the bound holds all but the ends of the tails
 
 
 @dataclass(frozen=True)
@@ -28,17 +32,43 @@ class Candidate:
     window: float
     angle: float
 
+    @property
+    def searched(self) -> float:
+        """Area [m²] of the search, were it made at all headings: of as many places as it is."""
+        return (2.0 * self.window) ** 2 * self.angle / math.pi
+
 
 def candidates(
     graph: Graph, key: Keyframe, among: Sequence[KeySubmap], p: LoopClosure
 ) -> list[Candidate]:
-    """Those ``among`` submaps whose centres are near the keyframe, the nearest first."""
+    """Those ``among`` submaps where the keyframe may be, the nearest first.
+
+    How far it may be off from each, the graph bounds (graph/reach.py). Where that is more than
+    the least window, there may be more submaps in reach than are tried at a time: of the others,
+    that one is tried as well whose last turn is longest ago.
+    """
     pose = graph.poses[key.index]
-    near = []
-    for k, m in enumerate(among):
-        grid = se2.compose(graph.poses[m.anchor.index], m.T_anchor_grid)
-        distance = float(np.linalg.norm(se2.transform(grid, m.centre[None])[0] - pose[:2]))
-        if distance < p.max_distance:
-            guess = se2.between(grid, pose)
-            near.append((distance, k, Candidate(m, guess, p.search_window, p.search_angle)))
-    return [candidate for _, _, candidate in sorted(near, key=lambda n: n[:2])[: p.candidates]]
+    grids = [se2.compose(graph.poses[m.anchor.index], m.T_anchor_grid) for m in among]
+    gaps = [
+        float(np.linalg.norm(se2.transform(T, m.centre[None])[0] - pose[:2]))
+        for T, m in zip(grids, among, strict=True)
+    ]
+    order = [int(k) for k in np.argsort(gaps, kind='stable')]
+    order = [k for k in order if gaps[k] < p.max_distance + p.widest_window - p.search_window]
+    if not order:
+        return []
+    anchors = np.array([among[k].anchor.index for k in order], dtype=np.int64)
+    off = SIGMAS * reach(graph, key.index, anchors)
+    windows = np.clip(off[:, 0], p.search_window, p.widest_window)
+    angles = np.clip(off[:, 1], p.search_angle, p.widest_angle)
+    found = [
+        Candidate(among[k], se2.between(grids[k], pose), float(window), float(angle))
+        for k, window, angle in zip(order, windows, angles, strict=True)
+        if gaps[k] < p.max_distance + window - p.search_window
+    ]
+    first, others = found[: p.candidates], found[p.candidates :]
+    lost = [c for c in others if c.window > p.search_window]
+    chosen = first + sorted(lost, key=lambda c: c.m.turn)[:1]
+    for c in chosen:
+        c.m.turn = key.stamp
+    return chosen

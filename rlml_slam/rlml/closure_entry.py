@@ -31,21 +31,23 @@ RISK = 0.1  # chances that any of the closures that wait agrees with another by 
 
 
 def may_enter(
-    graph: Graph, nodes: Ints, deltas: Array, covs: Array, wrong: Array
+    graph: Graph, nodes: Ints, deltas: Array, covs: Array, wrong: Array, odds: Array | float = 0.0
 ) -> NDArray[np.bool_]:
     """Which (k,) of the closures between poses (k, 2), none of them in the graph yet, may enter.
 
-    ``deltas`` (k, 3) with ``covs`` (k, 3, 3) of their residuals; ``wrong`` is the log density of
-    wrong errors. The estimate need not be the optimum. Raises SolverError as Marginals.
+    ``deltas`` (k, 3) with ``covs`` (k, 3, 3) of their residuals; ``wrong`` (k,) is the log
+    density of wrong errors, ``odds`` (k,) the logarithm of what else speaks for each. The estimate
+    need not be the optimum. Raises SolverError as Marginals.
     """
     between = _Between(graph, np.unique(nodes))
+    wrong = np.broadcast_to(wrong, len(nodes))
     i, j = nodes.T
     e = factors.relative_pose(graph.poses[i], graph.poses[j], deltas)[0]
     alone = evidence(e, between.covs(i, j) + covs, 1.0, wrong)
     agree = _agreement(graph, between, nodes, deltas, covs, wrong)
     views = np.array([_views(graph.poses[np.unique(j[row]), :2]) for row in agree])
     # likelier right than wrong, had half of them been wrong beforehand: of matches it is 1 %
-    return np.asarray(alone - (views - 1) * math.log(ALIKE) > 0.0)
+    return np.asarray(odds + alone - (views - 1) * math.log(ALIKE) > 0.0)
 
 
 class _Between:
@@ -85,7 +87,8 @@ def _agreement(
     A, B = se2.adjoint(se2.inverse(T_j)), se2.adjoint(se2.inverse(rest))
     S = covs[b] + between.covs(j[a], j[b]) + A @ covs[a] @ np.swapaxes(A, 1, 2)
     S = S + B @ between.covs(i[b], i[a]) @ np.swapaxes(B, 1, 2)
-    out[a, b] = out[b, a] = evidence(e, S, 1.0, wrong) > math.log(k / RISK)
+    likelier = np.maximum(wrong[a], wrong[b])  # in the smaller area, accidents are
+    out[a, b] = out[b, a] = evidence(e, S, 1.0, likelier) > math.log(k / RISK)
     return out
 
 

@@ -30,7 +30,8 @@ PYRAMIDS = 16  # search pyramids kept: each is several times as large as its sub
 class Match:
     """A keyframe that fits a submap at ``T_grid_key`` (3,), with the information (3, 3) there.
 
-    The others as in Closure.
+    ``searched`` is the area [m²] of its candidate, ``odds`` the logarithm of how much likelier
+    right than any match it is, ``source`` what proposed it; the others as in Closure.
     """
 
     m: KeySubmap
@@ -40,6 +41,9 @@ class Match:
     score: float
     overlap: float
     second: float
+    searched: float
+    odds: float = 0.0
+    source: str = ''
 
     def closure(self, why: str, edge: int = -1, number: int = -1) -> Closure:
         """Its record."""
@@ -85,7 +89,9 @@ class Matcher:
         term = linearize(m.submap, points, found.pose)
         second = math.nan if result.second is None else result.second.score / result.best.score
         overlap = term.inliers / max(term.count, 1)
-        return Match(m, key, found.pose, information, found.score, overlap, second)
+        return Match(
+            m, key, found.pose, information, found.score, overlap, second, candidate.searched
+        )
 
     def _pyramid(self, m: KeySubmap) -> search.Pyramid:
         if m not in self._pyramids:

@@ -61,6 +61,10 @@ class DeferredMatches:
             belief.T_map_base, belief.keys, belief.points, belief.cov, self._p.density
         )
 
+    def drop(self) -> None:
+        """The questions are answered by others: the map was laid anew."""
+        self._hypotheses = None
+
     def see(self, interval: Interval) -> None:
         """The reflectors seen near the newest keyframe, before the graph has them.
 

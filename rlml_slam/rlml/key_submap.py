@@ -21,6 +21,7 @@ class KeySubmap:
     """A submap of ``size`` keyframes, at ``T_anchor_grid`` (3,) from keyframe ``anchor``.
 
     While it is being built that is the first of them, and the submap is turned by GRID_TURN.
+    ``turn`` is the stamp of the last keyframe that was looked for in it.
     """
 
     anchor: Keyframe
@@ -28,6 +29,7 @@ class KeySubmap:
     size: int = 0
     centre: Array = field(default_factory=lambda: np.zeros(2))
     T_anchor_grid: Array = field(default_factory=lambda: TURN)
+    turn: int = 0
 
     @cached_property
     def walls(self) -> Array:

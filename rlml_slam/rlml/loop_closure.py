@@ -9,6 +9,7 @@ waits.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -25,9 +26,10 @@ from rlml_slam.matching.scan_match import match
 from rlml_slam.matching.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.closure import Closure, Fate, State
-from rlml_slam.rlml.closure_candidates import candidates
+from rlml_slam.rlml.closure_candidates import Candidate, candidates
 from rlml_slam.rlml.closure_entry import may_enter
 from rlml_slam.rlml.closure_match import OPEN, Match, Matcher
+from rlml_slam.rlml.constellation_closure import Place
 from rlml_slam.rlml.key_submap import TURN, KeySubmap
 from rlml_slam.rlml.keyframes import Keyframe
 from rlml_slam.se2 import Array
@@ -37,6 +39,8 @@ COVERED = 0.8  # share of a submap's walls that a newer one must know to take it
 RECORDS = 2000  # of closures; beyond, the oldest rejected ones go
 WAITING = 60  # closures that wait for others to agree with them, the newest
 WAITS = 'waits for others that agree'
+BY_REFLECTORS = 'proposed by reflectors: '
+CONFIRMED = 1.0, 0.2  # [m], [rad] around the place that reflectors tell, where its scan has to fit
 
 
 class ScanGraph:
@@ -54,7 +58,6 @@ class ScanGraph:
         self._finished: list[KeySubmap] = []
         self._matcher = Matcher(params)
         self._waiting: list[Match] = []
-        self._wrong = uniform(params.loop_closure.searched)
         self._count = 0
         self._accepted = 0
         self.closures: list[Closure] = []
@@ -166,6 +169,10 @@ class ScanGraph:
         T = se2.between(self._grid(new), self._grid(old))
         return len(old.walls) > 0 and new.submap.knows(se2.transform(T, old.walls)) >= COVERED
 
+    def edges_of_closures(self) -> list[int]:
+        """Of those that were accepted."""
+        return [c.edge for c in self.closures if c.accepted]
+
     def take_over(self, pose: int, onto: Keyframe) -> None:
         """Keyframe ``pose`` goes: let submaps that stand on it stand on another one."""
         for m in self._finished:
@@ -178,10 +185,14 @@ class ScanGraph:
     ) -> None:
         """The graph has let go of keyframes: what of the closures' records speaks of now.
 
-        ``edges`` and ``poses`` map what went to what stands for it, by the numbers until now.
+        ``edges`` and ``poses`` map what went to what stands for it, by the numbers until now. Of
+        several closures that one edge stands for, the newest has the record.
         """
         self._waiting = [
-            c for c in self._waiting if c.key.index not in poses and c.m in self._finished
+            c
+            for c in self._waiting
+            if c.key.index not in poses
+            and (c.m in self._finished if c.m.size else c.m.anchor.index not in poses)
         ]
         kept = []
         for c in self.closures:
@@ -195,6 +206,8 @@ class ScanGraph:
             edge = int(new.edges[edge]) if c.accepted else -1
             same = (i, j, edge) == (c.i, c.j, c.edge)
             kept.append(c if same else replace(c, i=i, j=j, edge=edge))
+        newest = {c.edge: k for k, c in enumerate(kept) if c.accepted}
+        kept = [c for k, c in enumerate(kept) if not c.accepted or newest[c.edge] == k]
         # only of a rejected one is the record all there is: of the others, an edge is in the graph
         rejected = [k for k, c in enumerate(kept) if not c.accepted]
         gone = set(rejected[: max(len(kept) - RECORDS, 0)])
@@ -269,6 +282,42 @@ class ScanGraph:
         """Try those ``among`` finished submaps that are near the keyframe."""
         near = candidates(self._graph, key, among, self._p.loop_closure)
         tried = [self._matcher.match(candidate, key, points) for candidate in near]
+        return self._record(tried)
+
+    def enter(self, place: Place) -> tuple[Closure, ...]:
+        """Close the loop to a place that reflectors tell, unless the scan says otherwise."""
+        key, here = place.key, place.T_map_key
+        anchor = KeySubmap(place.anchor, Submap(self._p.submap), T_anchor_grid=np.zeros(3))
+        information = np.asarray(np.linalg.inv(place.cov), dtype=np.float64)
+        confirmed: Match | Closure = Match(
+            anchor, key, place.T_anchor_key, information, place.share, math.nan, math.nan,
+            place.area, place.odds, BY_REFLECTORS,
+        )  # fmt: skip
+        gaps = [
+            math.dist(se2.transform(self._grid(m), m.centre[None])[0], here[:2])
+            for m in self._finished
+        ]
+        p, scanned = self._p, key.points is not None
+        if key.points is not None and len(key.points) < p.scan_match.min_points:
+            scanned = False
+        if scanned and gaps and min(gaps) < p.loop_closure.max_distance:
+            assert key.points is not None
+            m = self._finished[int(np.argmin(gaps))]
+            points = thinning.thin(
+                key.points.astype(np.float64), p.scan_match.voxel, p.scan_match.max_points
+            )
+            candidate = Candidate(m, se2.between(self._grid(m), here), *CONFIRMED)
+            found = self._matcher.match(candidate, key, points)
+            if isinstance(found, Match):
+                confirmed = replace(
+                    found, searched=place.area, odds=place.odds, source=BY_REFLECTORS
+                )
+            else:
+                confirmed = replace(found, why=BY_REFLECTORS + found.why)
+        return self._record([confirmed])
+
+    def _record(self, tried: Sequence[Match | Closure]) -> tuple[Closure, ...]:
+        """Let in what may, and remember all."""
         fit = [match for match in tried if isinstance(match, Match)]
         out = [closure for closure in tried if isinstance(closure, Closure)]
         if fit:
@@ -289,16 +338,18 @@ class ScanGraph:
             np.array([c.information for c in matches]),
         )
         covs: Array = np.asarray(np.linalg.inv(informations), dtype=np.float64)
-        may = may_enter(self._graph, nodes, deltas, covs, self._wrong)
+        wrong = uniform(np.array([c.searched for c in matches]))
+        odds = np.array([c.odds for c in matches])
+        may = may_enter(self._graph, nodes, deltas, covs, wrong, odds)
         out, waited = [], len(self._waiting)
         for n, (c, enters) in enumerate(zip(matches, may.tolist(), strict=True)):
             if enters:
                 edge = self._edge(EdgeKind.CLOSURE, c.m, c.key, c.T_grid_key, c.information)
-                why = 'fits' if n >= waited else 'fits, and others agree'
-                out.append(c.closure(why, edge, self._accepted))
+                why = 'fits' if n >= waited else 'fits and others agree'
+                out.append(c.closure(c.source + why, edge, self._accepted))
                 self._accepted += 1
             elif n >= waited:
-                out.append(c.closure(WAITS))
+                out.append(c.closure(c.source + WAITS))
         entered = {(c.i, c.j) for c in out if c.accepted}
         kept = [c for c in self.closures if c.accepted or (c.i, c.j) not in entered]
         self.tried[False] -= len(self.closures) - len(kept)

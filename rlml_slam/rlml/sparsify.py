@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bounded growth: where a place has keyframes enough, older ones take over what a new one tells.
 
-What the new one knows of its neighbours goes on between these (graph/eliminate.py), its
-sightings are seen from the neighbour it was tied to best, and the place shows its scan instead of
-the oldest one, so that the map keeps up with a hall in which things are moved.
+What the new one knows of its neighbours goes on between these (graph/eliminate.py), its sightings
+are seen from the neighbour it was tied to best, and the place shows its scan instead of the oldest
+one, so that the map keeps up with a hall in which things are moved. Of the edges between those
+that stay, the least telling ones go where there are too many (graph/prune.py).
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ from scipy.spatial import cKDTree
 from rlml_slam import se2
 from rlml_slam.graph.eliminate import Ties, eliminate
 from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.prune import prune
+from rlml_slam.graph.table import FactorKind
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.keyframes import Keyframe
 from rlml_slam.rlml.loop_closure import ScanGraph
@@ -21,6 +24,10 @@ from rlml_slam.rlml.path import Path
 from rlml_slam.rlml.reflector_graph import ReflectorGraph
 from rlml_slam.se2 import Array
 
+# Edges per keyframe, as many as one comes with: odometry, two submaps, and a closure. Their mean
+# leverage is a quarter, so that those which go have less.
+EDGES = 4
+SPARE = 20  # more of them are let go together, for judging them takes as long as a solve
 RECENT = 10  # keyframes that stay in any case: the next ones may be matched to them
 
 
@@ -53,9 +60,13 @@ class Sparsifier:
         before = poses.copy()
         edges, ties = self._eliminate(list(covers))
         self._reflectors.move(ties)
+        self._prune(edges, end)
         kept = np.ones(len(keys), dtype=np.bool_)
         kept[list(covers)] = False
-        new = self._graph.keep(kept, self._reflectors.keep_alive())
+        recorded = np.zeros(len(self._graph.edges), dtype=np.bool_)
+        of = [edges.get(k, k) for k in self._scans.edges_of_closures()]
+        recorded[[k for k in of if k >= 0]] = True
+        new = self._graph.keep(kept, self._reflectors.keep_alive(), recorded)
         self._reflectors.renumber(new)
         self._scans.renumber(new, edges, {k: onto for k, (onto, _) in ties.items()})
         onto_of = np.full(len(keys), -1)
@@ -88,6 +99,16 @@ class Sparsifier:
         for first, last in reversed(edges.items()):
             edges[first] = edges.get(last, last)
         return edges, ties
+
+    def _prune(self, edges: dict[int, int], end: int) -> None:
+        """Let go of edges before keyframe ``end`` where there are too many; not of odometry."""
+        e = self._graph.edges
+        poses = len(np.unique(e.nodes[e.enabled]))
+        if e.enabled.sum() <= EDGES * poses + SPARE:
+            return
+        may = (e.kinds != FactorKind.ODOMETRY) & (e.nodes < end).all(-1)
+        nothing = dict.fromkeys(prune(self._graph, may, EDGES * poses).tolist(), -1)
+        edges.update({first: nothing.get(last, last) for first, last in edges.items()} | nothing)
 
     def _redundant(self, poses: Array, scan_stamps: list[int], end: int) -> dict[int, int]:
         """Keyframes before ``end`` that are not needed, each with the one whose scan it renews."""

@@ -7,10 +7,11 @@ from made_worlds import ROOM, TinyWorld, drive, errors, observations, polygon
 
 from rlml_slam import se2
 from rlml_slam.params import BackEnd as BackEndParameters
-from rlml_slam.params import Parameters
+from rlml_slam.params import LoopClosure, Parameters
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.front_end import FrontEnd
 from rlml_slam.rlml.path import Path
+from rlml_slam.rlml.sparsify import EDGES, SPARE
 
 LAPS = 5
 ROUND = [(0.8, 0.0, 3.0), (0.8, np.pi / 2, 1.0)] * 4
@@ -61,6 +62,36 @@ def test_map_stops_growing_where_all_is_mapped(runs):
     assert max(counts[1:]) - min(counts[1:]) <= 5
     assert len(few.graph.poses) == len(few.keyframes)
     assert len(few.graph.edges) < 12 * counts[-1]
+
+
+def test_what_closures_leave_behind_does_not_grow_with_the_laps():
+    """Neither edges that were replaced, nor records of closures that others stand for now."""
+    path = drive(*ROUND * 8, start=START)
+    observed = observations(SQUARE, path, reflectors=False, rng=np.random.default_rng(0))
+    closes = LoopClosure(max_distance=4.0, every=1)
+    parameters = replace(
+        params(), node=replace(Parameters().node, map_start_pose=START), loop_closure=closes
+    )
+    front_end, back_end = FrontEnd(parameters), BackEnd(parameters)
+    keys, rows, records, tried = [], [], [], []
+    for k, o in enumerate(observed):
+        update = back_end.add(front_end.process(o))
+        if update is not None and update.optimized:
+            front_end.correct(update.T_map_local)
+        if (k + 1) % (len(observed) // 4) == 0:
+            keys.append(len(back_end.keyframes))
+            rows.append(len(back_end.graph.edges))
+            records.append(sum(c.accepted for c in back_end.scans.closures))
+            tried.append(back_end.scans.tried[True])
+    assert tried[-1] > 2 * tried[1]  # loops are closed all the time
+    recent = 10 + 20  # keyframes that were not judged yet, with their edges of each sort
+    assert rows[-1] <= EDGES * keys[-1] + SPARE + 4 * recent
+    assert records[-1] <= rows[-1]
+    e = back_end.graph.edges
+    recorded = {c.edge for c in back_end.scans.closures if c.accepted}
+    assert set(np.flatnonzero(~e.enabled)) <= recorded
+    accepted = [c.edge for c in back_end.scans.closures if c.accepted]
+    assert len(accepted) == len(set(accepted))
 
 
 def test_every_frame_keeps_its_pose(runs):
