@@ -25,6 +25,7 @@ WINDOW = 8  # neighbours on each side that are looked at
 FLAT = 0.05  # scatter across per scatter along, below which the neighbours are a line
 CLUTTER = 0.25  # weight per axis of an end point that is on no line
 OPEN = 0.01  # share of the strongest direction's information below which one is left open
+REGULAR = 1e-6  # added to what may be singular
 
 
 @part
@@ -87,31 +88,26 @@ def _accumulate(
     return H
 
 
-def share_open(odometry: bool) -> float:
-    """Share of the strongest direction's information below which one is left open.
-
-    Along a corridor, odometry is better than what the beams on a door frame or two say. A robot
-    without it has nothing better, and is told by them whether it moves at all.
-    """
-    return OPEN if odometry else 0.0
-
-
 def information(
-    submap: Submap, points: Array, pose: Array, params: ScanMatch, share: float = OPEN
+    submap: Submap, points: Array, pose: Array, params: ScanMatch, alone: Array | None = None
 ) -> Array:
     """Information (3, 3) of a match of ``points`` (n, 2), in scan order, at ``pose`` (3,).
 
     Coordinates are those of the pose in the submap frame. ``params.sigma_point`` is the error of
     one end point across its surface, neighbours' correlation included; ``params.floor2`` (3,) the
     variances of what more points do not average out. A direction that the scan leaves open, for
-    it has less than ``share`` of the information of the strongest one, has information zero.
+    it has less than OPEN of the information of the strongest one, has information zero.
+
+    Along a corridor, odometry is better than what the beams on a door frame or two say. A robot
+    without it has nothing better. Then ``alone`` (3, 3), the information by the curvature of the
+    scan term (eq. 11), is believed in such a direction, up to what counts as open.
     """
     j, i = submap.corner
     return _information(
         submap.values, float(j), float(i), 1.0 / submap.resolution,
         np.ascontiguousarray(points, dtype=np.float64),
         np.ascontiguousarray(pose, dtype=np.float64),
-        params.sigma_point, np.array(params.floor2), share,
+        params.sigma_point, np.array(params.floor2), np.zeros((3, 3)) if alone is None else alone,
     )  # fmt: skip
 
 
@@ -125,7 +121,7 @@ def _information(
     pose: Array,
     sigma_point: float,
     floor2: Array,
-    share: float,
+    alone: Array,
 ) -> Array:
     """Kernel of information()."""
     H = _accumulate(values, corner_j, corner_i, scale, points, pose)
@@ -135,7 +131,12 @@ def _information(
     unit = np.array([1.0, 1.0, 1.0 / lever])
     units = np.outer(unit, unit)
     strength, axes = np.linalg.eigh(H * units)
-    strength = np.maximum(strength - share * max(strength[2], 0.0), 0.0)
+    least = OPEN * max(strength[2], 0.0)
+    # what a direction has by the curvature, the two others being estimated with it
+    curved = np.linalg.inv(alone * units * sigma_point**2 + REGULAR * np.eye(3))
+    for k in range(3):
+        by_curve = 1.0 / np.dot(axes[:, k], np.dot(curved, axes[:, k])) - REGULAR
+        strength[k] = max(strength[k] - least, min(by_curve, least), 0.0)
     H = np.dot(axes * strength, axes.T.copy()) / units / sigma_point**2
     # (H^-1 + floor)^-1, written so that an open direction stays open
     out = np.linalg.solve(np.eye(3) + H * floor2, H)

@@ -9,7 +9,7 @@ the raw coordinates (x, y, theta).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +49,8 @@ class ScanMatchResult:
     """Pose (3,) of base in the submap frame, and how far to trust it.
 
     ``information`` (3, 3) is that of the scan alone (H / sigma_s^2), ``prior_weight`` the share
-    of the prior that was left after truncation (1 = scan and prior agree).
+    of the prior that was left after truncation (1 = scan and prior agree), ``pull`` (3,) the
+    gradient of the prior's cost, which that of the scan holds in balance.
     """
 
     pose: Array
@@ -58,6 +59,7 @@ class ScanMatchResult:
     iterations: int
     converged: bool
     prior_weight: float
+    pull: Array
 
 
 @kernel
@@ -351,27 +353,37 @@ def match(
     prior_information: Array,
     parameters: params.ScanMatch | None = None,
     searched: bool = True,
+    window: tuple[float, float] | None = None,
+    usual: float = 0.0,
 ) -> ScanMatchResult:
     """Pose of base in the submap from ``points`` (n, 2), base frame, and an odometry prior.
 
     ``prior_pose`` (3,), ``prior_information`` (3, 3) in raw coordinates of the submap frame.
     Points are in scan order and thinned here. With ``searched`` a correlative search in the
     window of the parameters gives the start, and where the fit is poor another one in the wide
-    window; else the prior does. With no points, or no submap, the prior is returned with no
-    information and score 0.
+    window; else the prior does. A ``window`` [m, rad] replaces that of the parameters, and then
+    the prior is tried as well; a fit below ``usual`` counts as poor. With no points, or no submap,
+    the prior is returned with no information and score 0.
     """
     p = parameters or params.ScanMatch()
     prior_pose = np.ascontiguousarray(prior_pose, dtype=np.float64)
     points = thinning.thin(points, p.voxel, p.max_points)
     if not len(points) or not submap.values.size:
-        return ScanMatchResult(prior_pose.copy(), np.zeros((3, 3)), 0.0, 0, False, 1.0)
+        return ScanMatchResult(
+            prior_pose.copy(), np.zeros((3, 3)), 0.0, 0, False, 1.0, np.zeros(3)
+        )
     W = whitening_of(
         np.ascontiguousarray(prior_information, dtype=np.float64), float(prior_pose[2])
     )
     solve = _Solve(submap, points, surfaces.constraints(points), prior_pose, W, p)
     if not searched:
         return solve.refined(prior_pose)
-    result = solve.refined(solve.found(p.search_window, p.search_angle, 1))
+    width, angle = (p.search_window, p.search_angle) if window is None else window
+    result = solve.refined(solve.found(width, angle, 1))
+    if window is not None:
+        other = solve.refined(prior_pose)
+        result = other if solve.merit(other) >= solve.merit(result) else result
+    p = replace(p, poor_score=max(p.poor_score, usual))
     if result.score < p.poor_score:
         other = solve.refined(solve.found(p.wide_window, p.wide_angle, WIDE_STRIDE))
         if solve.merit(other) > solve.merit(result):
@@ -406,9 +418,11 @@ class _Solve:
             self.constraints, start, self.prior, self.whitening, p.prior_scale, p.sigma,
             p.max_iterations, out,
         )  # fmt: skip
+        A, pull = np.empty((3, 3)), np.empty(3)
+        prior_term(np.array([x, y, theta]), self.prior, self.whitening, p.prior_scale, A, pull)
         return ScanMatchResult(
             np.array([x, y, wrapped(theta)]), symmetric(out[4:10]) / p.sigma**2,
-            float(out[10]) / len(self.points), iterations, converged, weight,
+            float(out[10]) / len(self.points), iterations, converged, weight, pull,
         )  # fmt: skip
 
     def merit(self, result: ScanMatchResult) -> float:

@@ -58,7 +58,6 @@ class Matcher:
 
     def __init__(self, params: Parameters) -> None:
         self._p = params
-        self._open = observability.share_open(params.node.use_odom)
         self._pyramids: OrderedDict[KeySubmap, search.Pyramid] = OrderedDict()
 
     def match(self, candidate: Candidate, key: Keyframe, points: Array) -> Match | Closure:
@@ -81,9 +80,7 @@ class Matcher:
         found = match(m.submap, points, result.best.pose, weak, self._p.scan_match, searched=False)
         if found.score < p.min_score:
             return rejected('the refined fit is too weak', found.score)
-        information = observability.information(
-            m.submap, points, found.pose, self._p.scan_match, self._open
-        )
+        information = observability.information(m.submap, points, found.pose, self._p.scan_match)
         if np.linalg.eigvalsh(np.linalg.inv(information + OPEN * np.eye(3))[:2, :2])[1] > HELD**2:
             return rejected('the scan leaves a direction open', found.score)
         term = linearize(m.submap, points, found.pose)

@@ -47,8 +47,9 @@ class Coasting:
         """
         p = self._p
         self._pose, (_, self._cov) = state.pose, relative(state.x, state.P)
-        elapsed, sigma = self._clock.elapsed(dt), np.array(p.free_speeds)
-        self._way = coast(state, elapsed, sigma, p.free_time, p.free_jitter, motion)
+        (elapsed, error), sigma = self._clock.elapsed(dt), np.array(p.free_speeds)
+        jitter = math.hypot(p.free_jitter, error)
+        self._way = coast(state, elapsed, sigma, p.free_time, jitter, motion)
         state.P[BIAS, BIAS] += p.imu_bias_walk**2 * dt
 
     def found(self, state: JointState, motion: Motion) -> Motion:

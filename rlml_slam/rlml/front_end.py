@@ -7,6 +7,7 @@ the latter two known exactly, the update below is eq. 3 and its covariance eq. 1
 
 from __future__ import annotations
 
+import copy
 import math
 import time
 from collections.abc import Iterable
@@ -19,21 +20,23 @@ from rlml_slam import se2
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved import SavedMap
 from rlml_slam.matching import association, observability, thinning
-from rlml_slam.matching.scan_match import match
+from rlml_slam.matching.scan_match import ScanMatchResult, match
+from rlml_slam.matching.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.coasting import Coasting
 from rlml_slam.rlml.confirmation import START_SIGMA, Confirmation
 from rlml_slam.rlml.correction import Correction, Known
 from rlml_slam.rlml.distant import Distant
 from rlml_slam.rlml.doubt import Doubt, consents
+from rlml_slam.rlml.free_sweep import Sweep, deskewed
 from rlml_slam.rlml.grid_fix import Fix, SavedGrid
-from rlml_slam.rlml.health import Evidence, HealthMonitor, weak_direction
+from rlml_slam.rlml.health import Evidence, HealthMonitor, ends_of, weak_direction
 from rlml_slam.rlml.joint_state import BIAS, JointState
 from rlml_slam.rlml.map_window import MapWindow
 from rlml_slam.rlml.reflector_update import use_reflectors
 from rlml_slam.rlml.relocalize import is_mapped
 from rlml_slam.rlml.scan_update import fuse, prior_of
-from rlml_slam.rlml.second_look import AS_USUAL, second_look
+from rlml_slam.rlml.second_look import AS_USUAL, TURN, second_look
 from rlml_slam.rlml.submaps import Submaps
 from rlml_slam.rlml.tracks import Tracks
 from rlml_slam.rlml.unseen import expected
@@ -51,6 +54,7 @@ from rlml_slam.types import (
 
 NONE = np.zeros(0, dtype=np.int64)
 BURST = 50_000_000  # [ns] between two scans that tell a velocity
+FAR = 3.0  # [sigma] a search without odometry reaches
 
 
 class FrontEnd:
@@ -217,10 +221,13 @@ class FrontEnd:
         """The pose at the observation's stamp; never raises for what was measured."""
         began = time.perf_counter()
         coasts = self._predict(observation)
+        sweep = Sweep()
+        if coasts:
+            observation, sweep = self._deskewed(observation)
         self._follow_map(observation.detections)
         matched = _Matched.none(observation.detections)
         self._use_reflectors(observation, matched)
-        evidence = self._use_scan(observation, matched)
+        evidence = self._use_scan(observation, matched, sweep)
         self._use_grid(observation)
         self._use_reflectors(observation, matched)
         doubtful = self._is_doubtful(observation, matched, evidence)
@@ -365,7 +372,62 @@ class FrontEnd:
 
     # --- scan term ---------------------------------------------------------------------------
 
-    def _use_scan(self, observation: Observation, matched: _Matched) -> Evidence:
+    def _deskewed(self, observation: Observation) -> tuple[Observation, Sweep]:
+        """The sweep at its stamp by the robot's own velocity: as it was, then as this tells it."""
+        p, reach = self._p.scan_match, self._p.submap.max_laser_range
+        first, sweep = deskewed(observation, self.state.velocity, reach)
+        submap = self.submaps.target
+        if not sweep.half.any() or submap is None or first.points is None:
+            return first, sweep
+        if len(first.points) < p.min_points:
+            return first, sweep
+        points = thinning.thin(first.points, p.voxel, p.max_points)
+        state = copy.deepcopy(self.state)
+        prior, strength = self._prior(sweep)
+        found = match(submap, points, prior, strength, p, searched=False)
+        if found.score < max(p.good_score, AS_USUAL * self.doubt.usual):
+            return first, sweep
+        self._fuse(state, found, self._information(submap, points, found), sweep)
+        return deskewed(observation, state.velocity, reach)
+
+    def _prior(self, sweep: Sweep) -> tuple[Array, Array]:
+        """Where a match is expected in the submap (3,), and its information (3, 3)."""
+        floor2 = np.array(self._p.scan_match.floor2)
+        return prior_of(self.state.x, self.state.P, floor2, sweep.half, sweep.velocity)
+
+    def _information(self, submap: Submap, points: Array, found: ScanMatchResult) -> Array:
+        """What a match is worth (3, 3)."""
+        alone = None if self._has_odometry else found.information
+        return observability.information(submap, points, found.pose, self._p.scan_match, alone)
+
+    def _fuse(
+        self, state: JointState, found: ScanMatchResult, information: Array, sweep: Sweep
+    ) -> None:
+        """Update a state with a match.
+
+        A speed is less sure than odometry: what it leads wrong by must not make a new one, and
+        what it holds the match back by is made up for.
+        """
+        gate, pull = self._p.scan_match.prior_scale, np.zeros(3)
+        if not self._has_odometry:
+            gate, pull = gate / math.sqrt(3.0), found.pull
+        fuse(
+            state.x, state.P, found.pose, information, gate, pull, found.information,
+            sweep.half, sweep.velocity,
+        )  # fmt: skip
+
+    def _matched_freely(
+        self, submap: Submap, points: Array, prior: Array, strength: Array
+    ) -> ScanMatchResult:
+        """The match of a robot that only its speed leads to where it is: searched as far."""
+        p = self._p.scan_match
+        spread: Array = np.asarray(np.linalg.inv(strength), dtype=np.float64)
+        reach = FAR * math.sqrt(ends_of(spread[:2, :2])[1])
+        turn = min(FAR * math.sqrt(spread[2, 2]), p.wide_angle)
+        window = (min(max(reach, p.search_window), p.wide_window), turn)
+        return match(submap, points, prior, strength, p, window=window, usual=self.doubt.usual)
+
+    def _use_scan(self, observation: Observation, matched: _Matched, sweep: Sweep) -> Evidence:
         """Match against the submap and update with the scan term (e_s of eq. 2)."""
         p = self._p.scan_match
         submap = self.submaps.target
@@ -374,8 +436,11 @@ class FrontEnd:
         if submap is None or len(observation.points) < p.min_points:
             return Evidence(scan=submap is None, beams=len(observation.points))
         points = thinning.thin(observation.points, p.voxel, p.max_points)
-        prior, strength = prior_of(self.state.x, self.state.P, np.array(p.floor2))
-        found = match(submap, points, prior, strength, p, searched=False)
+        prior, strength = self._prior(sweep)
+        if self._has_odometry:
+            found = match(submap, points, prior, strength, p, searched=False)
+        else:
+            found = self._matched_freely(submap, points, prior, strength)
         # where nothing but the speed leads to the start, a fit that is worse is of another place
         least = 0.0 if self._has_odometry else AS_USUAL * self.doubt.usual
         if found.score < max(p.good_score, least) or found.prior_weight < 0.5:
@@ -383,16 +448,14 @@ class FrontEnd:
             found = searched if searched.score > found.score else found
         misfit = self.doubt.misfits(found.score, submap.insertions)
         if misfit and not matched.agrees and not self._lasts(observation.stamp):
-            found = second_look(submap, points, prior, self.doubt.usual, self._p) or found
+            turn = TURN if self._has_odometry else math.pi
+            found = second_look(submap, points, prior, self.doubt.usual, self._p, turn) or found
             misfit = self.doubt.misfits(found.score, submap.insertions)
         if found.score < p.min_score or (misfit and not matched.agrees):
             return Evidence(scan=True, misfit=misfit, beams=len(points), score=found.score)
         self.doubt.learn(found.score)
-        share = observability.share_open(self._has_odometry)
-        information = observability.information(submap, points, found.pose, p, share)
-        # a speed is less sure than odometry: what it leads wrong by must not make a new one
-        gate = p.prior_scale if self._has_odometry else p.prior_scale / math.sqrt(3.0)
-        fuse(self.state.x, self.state.P, found.pose, information, gate)
+        information = self._information(submap, points, found)
+        self._fuse(self.state, found, information, sweep)
         heading = float(self.state.anchor(0)[2])
         return Evidence(
             scan=True,

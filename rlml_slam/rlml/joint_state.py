@@ -67,6 +67,11 @@ class JointState:
         return self.x[:3].copy()
 
     @property
+    def velocity(self) -> Array:
+        """Velocity (3,) of the base: forward, left, turn."""
+        return self.x[MOVING].copy()
+
+    @property
     def pose_cov(self) -> Array:
         """Covariance (3, 3) of the pose."""
         return self.P[:3, :3].copy()

@@ -53,7 +53,6 @@ class ScanGraph:
     def __init__(self, params: Parameters, graph: Graph) -> None:
         self._p = params
         self._graph = graph
-        self._open = observability.share_open(params.node.use_odom)
         self._active: list[KeySubmap] = []
         self._finished: list[KeySubmap] = []
         self._matcher = Matcher(params)
@@ -118,7 +117,7 @@ class ScanGraph:
         found = match(m.submap, points, guess, prior, p, searched=False)
         if found.score < p.min_score or key.index == m.anchor.index:
             return
-        information = observability.information(m.submap, points, found.pose, p, self._open)
+        information = observability.information(m.submap, points, found.pose, p)
         self._edge(EdgeKind.SCAN, m, key, found.pose, information)
 
     def _edge(

@@ -28,17 +28,22 @@ NEAR = np.diag(1.0 / SPREAD**2)  # a weak prior at the place found: odometry is 
 
 
 def second_look(
-    submap: Submap, points: Array, guess: Array, usual: float, p: Parameters
+    submap: Submap,
+    points: Array,
+    guess: Array,
+    usual: float,
+    p: Parameters,
+    turn: float = TURN,
 ) -> ScanMatchResult | None:
     """The only place near ``guess`` (3,), submap frame, where a scan fits as it should.
 
     ``points`` (n, 2) are thinned end points in the base frame, ``usual`` is the score of scans
-    lately. None where nothing fits, or a second place about as well. The result leaves nothing of
-    the prior: its weight is zero.
+    lately, ``turn`` [rad] how far off the heading may be. None where nothing fits, or a second
+    place about as well. The result leaves nothing of the prior: its weight is zero.
     """
     least = max(AS_USUAL * usual, p.loop_closure.min_score)
     found = search.wide(
-        search.Pyramid(submap), points, guess, REACH, TURN, MAX_SECOND * least,
+        search.Pyramid(submap), points, guess, REACH, turn, MAX_SECOND * least,
         second_share=MAX_SECOND,
     )  # fmt: skip
     if found.best is None or found.second is not None:

@@ -9,6 +9,7 @@ was between two sweeps, and the stamps are off by as much as its speed makes of 
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 WINDOW = 50  # intervals that tell the period
@@ -23,10 +24,17 @@ class SweepClock:
     def __init__(self) -> None:
         self._intervals: deque[float] = deque(maxlen=WINDOW)
 
-    def elapsed(self, dt: float) -> float:
-        """Time between the last two sweeps, whose stamps differ by ``dt``."""
+    def elapsed(self, dt: float) -> tuple[float, float]:
+        """Time [s] between the last two sweeps, whose stamps differ by ``dt``, and its error.
+
+        The error is 0 where the stamps tell the time. Else it is the spread of what they say: a
+        sweep that was lost, or came after a later one, is not told from one that came late.
+        """
         self._intervals.append(dt)
         n = len(self._intervals)
         period = sum(self._intervals) / n
         short = sum(interval < SHORT * period for interval in self._intervals)
-        return period if n >= ENOUGH and short > OFTEN * n else dt
+        if n < ENOUGH or short <= OFTEN * n:
+            return dt, 0.0
+        spread = sum((interval - period) ** 2 for interval in self._intervals)
+        return period, math.sqrt(spread / n)

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from rlml_slam.maps.atomic import write_atomically
 from rlml_slam.tools import page
 from rlml_slam.tools.outputs import make_folder
-from rlml_slam.tools.pictures import CLOSURE, LIVE, PATH, TRUTH, png
+from rlml_slam.tools.pictures import CLOSURE, LIVE, PATH, REFLECTOR, TRUTH, png
 from rlml_slam.tools.study_ablation_tables import (
     COLUMNS,
     FAULT_HEADER,
@@ -25,7 +25,7 @@ from rlml_slam.tools.study_ablation_tables import (
     kidnap_text,
 )
 
-COLORS = dict(zip(SENSORS, (TRUTH, LIVE, CLOSURE, PATH), strict=True))
+COLORS = dict(zip(SENSORS, (TRUTH, LIVE, REFLECTOR, CLOSURE, PATH), strict=True))
 
 
 def write_report(folder: Path, summary: Mapping[str, Any]) -> None:

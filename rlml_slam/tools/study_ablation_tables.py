@@ -9,6 +9,7 @@ from typing import Any
 SENSORS: dict[str, dict[str, bool]] = {
     'odometry': {'use_scan': False, 'use_reflectors': False},
     'scan': {'use_reflectors': False},
+    'scan alone': {'use_reflectors': False, 'use_odom': False, 'use_imu': False},
     'reflectors': {'use_scan': False},
     'both': {},
 }

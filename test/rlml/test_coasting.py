@@ -90,10 +90,13 @@ def test_motion_is_as_sure_as_the_scans_and_no_surer_than_the_speed_where_they_a
     assert cov[0, 0] == pytest.approx(0.08, rel=0.01)
 
 
-@pytest.mark.parametrize(('world', 'reflectors'), [('hall', False), ('yard', True)])
-def test_pose_is_held_without_odometry_and_as_sure_as_it_is_told(world, reflectors):
+@pytest.mark.parametrize(
+    ('world', 'reflectors', 'ray_times'),
+    [('hall', False, False), ('hall', False, True), ('yard', True, False)],
+)
+def test_pose_is_held_without_odometry_and_as_sure_as_it_is_told(world, reflectors, ray_times):
     drive: SimulatorParameters = from_mapping(
-        {'world': world, 'duration': 25.0, 'laser.ray_times': False}, SimulatorParameters
+        {'world': world, 'duration': 25.0, 'laser.ray_times': ray_times}, SimulatorParameters
     )
     messages, truth = simulate(drive, 3)
     node = Node(use_odom=False, use_imu=False, use_reflectors=reflectors)
