@@ -6,7 +6,6 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +17,7 @@ from rlml_slam.maps.saved import SavedMap
 from rlml_slam.maps.survey import Survey
 from rlml_slam.params import Parameters
 from rlml_slam.rlml import stored_map
+from rlml_slam.rlml.apart import Apart
 from rlml_slam.rlml.back_end import BackEnd, Update
 from rlml_slam.rlml.find_place import find_place
 from rlml_slam.rlml.front_end import FrontEnd
@@ -38,7 +38,7 @@ AHEAD = 200  # frames that the front end may be ahead of the back end
 class Slam(Driven):
     """Sequencer, front end and back end.
 
-    With ``parallel`` the back end works in a thread of its own, up to AHEAD frames behind, and
+    With ``parallel`` the back end works in a process of its own, up to AHEAD frames behind, and
     frames come later by as many; they are the same to the last bit. The front end's local frame
     depends on nothing that the back end says, as long as there are no reflectors and the robot is
     not lost: with the first reflector both take turns for good, and at a lost frame once. The
@@ -58,8 +58,9 @@ class Slam(Driven):
         self._saved: SavedMap | None = None
         self._begin_in: SavedMap | None = None
         self._path: list[tuple[int, Array]] = []
-        self._thread = ThreadPoolExecutor(1, 'back end') if parallel else None
-        self._pending: deque[tuple[Frame, float, Future[Update | None]]] = deque()
+        self._parallel = parallel
+        self._apart: Apart | None = None
+        self._pending: deque[tuple[Frame, float]] = deque()
 
     def use_map(self, saved: SavedMap) -> None:
         """Localise in a map that never changes, instead of making one."""
@@ -110,13 +111,15 @@ class Slam(Driven):
             if self._saved is not None:
                 self._path.append((frame.stamp, frame.T_map_base))
                 frames.append(frame)
-            elif self._thread is not None:
+            elif self._parallel:
                 spent = 1e3 * (time.thread_time() - began)
-                self._pending.append((frame, spent, self._thread.submit(self._add, frame)))
+                self._apart = self._apart or Apart(self.back_end, _add)
+                self._apart.add(frame)
+                self._pending.append((frame, spent))
                 is_lost = frame.health.level is Level.LOST or frame.doubtful
                 frames += self._settle(0 if is_lost else AHEAD)
             else:
-                if self._take_over(self._add(frame)):
+                if self._take_over(_add(self.back_end, frame)):
                     self._believe()
                 frames.append(frame)
             found = self.recovery.look(frame, self.map, self._saved is not None)
@@ -124,30 +127,24 @@ class Slam(Driven):
                 self.front_end.relocate(found.pose, found.cov)
         return frames
 
-    def _add(self, frame: Frame) -> Update | None:
-        """One frame to the back end, in whatever thread; with the time of the processor."""
-        began = time.thread_time()
-        update = self.back_end.add(frame)
-        if update is None:
-            return None
-        return replace(update, wall_ms=1e3 * (time.thread_time() - began))
-
     def _take_turns(self) -> list[Frame]:
-        """End the back end's thread, if there is one; the frames that waited for it."""
+        """End the back end's process, if there is one; the frames that waited for it."""
         frames = self._settle(0)
-        if self._thread is not None:
-            self._thread.shutdown()
-            self._thread = None
+        if self._apart is not None:
+            self.back_end = self._apart.bring_home()
+            self._apart = None
+        self._parallel = False
         return frames
 
     def _settle(self, most: int) -> list[Frame]:
         """The oldest of the frames that wait for the back end, so that ``most`` are left."""
         frames = []
         while len(self._pending) > most:
-            frame, spent, update = self._pending.popleft()
+            assert self._apart is not None
+            frame, spent = self._pending.popleft()
             T_map_base, cov_map = self.front_end.in_map(frame.T_local_base, frame.cov_local)
             frames.append(replace(frame, T_map_base=T_map_base, cov_map=cov_map, wall_ms=spent))
-            self._take_over(update.result())
+            self._take_over(self._apart.update())
         return frames
 
     def _take_over(self, update: Update | None) -> bool:
@@ -170,6 +167,8 @@ class Slam(Driven):
         """The map as it is now, or the one that never changes."""
         if self._saved is not None:
             return self._saved
+        if self._apart is not None:
+            return self._apart.map()
         return SavedMap(self.back_end.reflectors(), self.back_end.occupancy_grid())
 
     def trajectory(self) -> tuple[NDArray[np.int64], Array]:
@@ -188,3 +187,12 @@ class Slam(Driven):
         if self._saved is not None:
             return self._saved.grid
         return self.back_end.occupancy_grid()
+
+
+def _add(back_end: BackEnd, frame: Frame) -> Update | None:
+    """One frame to the back end, in whatever process; with the time of the processor."""
+    began = time.thread_time()
+    update = back_end.add(frame)
+    if update is None:
+        return None
+    return replace(update, wall_ms=1e3 * (time.thread_time() - began))

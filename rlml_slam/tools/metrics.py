@@ -157,6 +157,7 @@ def distribution(values: Any) -> dict[str, float | None]:
 
 
 def peak_rss_mb() -> float:
-    """Largest resident memory of this process so far [MB]."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    """Largest resident memory so far of this process and the largest that it started [MB]."""
+    both = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    peak = sum(resource.getrusage(who).ru_maxrss for who in both)
     return peak / 1e6 if sys.platform == 'darwin' else peak * 1024 / 1e6

@@ -132,8 +132,20 @@ def test_map_to_odom_joins_the_two_estimates(live):
     (got,) = convert.transforms(live.heard[TF[0]][-1])
     assert (got.parent, got.child) == ('map', 'odom')
     T = np.array([*got.t[:2], convert.yaw(got.R, '')])
-    want = se2.compose(back.mapper.back_end.T_map_local, newest.T_local_base)
-    np.testing.assert_allclose(se2.compose(T, newest.observation.odom_pose), want, atol=1e-9)
+    # it waits for no optimisation: one of the corrections, the newest but for a busy machine
+    corrections = [np.zeros(3)]
+    for heard in live.heard['correction']:
+        p = heard.pose.pose
+        corrections.append(
+            np.array(
+                [p.position.x, p.position.y, 2.0 * np.arctan2(p.orientation.z, p.orientation.w)]
+            )
+        )
+    assert len(corrections) > 2
+    in_map = se2.compose(T, newest.observation.odom_pose)
+    off = [np.abs(se2.between(se2.compose(C, newest.T_local_base), in_map)).max()
+           for C in corrections]  # fmt: skip
+    assert min(off) < 1e-9, off
 
 
 def test_back_end_is_told_of_by_its_diagnostics(live):

@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -6,6 +7,7 @@ import pytest
 from made_worlds import FIRST, ROOM, SECOND, STEP, detections_of, drive, errors, messages
 
 from rlml_slam import se2
+from rlml_slam.errors import SolverError
 from rlml_slam.params import BackEnd, LoopClosure, Node, Parameters
 from rlml_slam.rlml import slam as slam_module
 from rlml_slam.rlml.slam import Slam
@@ -169,7 +171,7 @@ def test_front_end_goes_on_from_the_newest_correction():
 
 
 @pytest.mark.parametrize('reflectors', [False, True])
-def test_back_end_in_a_thread_changes_no_bit(reflectors):
+def test_back_end_in_a_process_changes_no_bit(reflectors):
     sent = messages(ROOM, CURVE, reflectors=reflectors, rng=np.random.default_rng(5))
     # small submaps, so that loops are closed on a short way
     params = Parameters(back_end=BackEnd(submap_size=4), loop_closure=LoopClosure(every=1))
@@ -195,3 +197,34 @@ def test_frames_wait_for_the_back_end_by_a_fixed_number(monkeypatch):
         assert frames == max(processed - 7, 0)
     assert frames > 0
     assert frames + len(slam.finish()) == len(CURVE)
+
+
+def failing(monkeypatch, how):
+    """A parallel system whose back end fails at the third frame."""
+
+    def add_(self, frame):
+        return how() if frame.stamp >= FIRST + 2 * STEP else None
+
+    monkeypatch.setattr(slam_module.BackEnd, 'add', add_)
+    return Slam(Parameters(), parallel=True)
+
+
+def to_the_end(slam):
+    for m in messages(ROOM, CURVE[:10], reflectors=False):
+        add(slam, m)
+    slam.finish()
+
+
+def test_error_in_the_back_ends_process_is_raised_here(monkeypatch):
+    def fail():
+        raise SolverError('no solution')
+
+    slam = failing(monkeypatch, fail)
+    with pytest.raises(SolverError, match='no solution'):
+        to_the_end(slam)
+
+
+def test_end_of_the_back_ends_process_is_told(monkeypatch):
+    slam = failing(monkeypatch, lambda: os._exit(3))
+    with pytest.raises(RuntimeError, match='exit code 3'):
+        to_the_end(slam)

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The back end in a process of its own: two threads of Python mostly wait for one another.
+
+The process begins as a copy of this one, compiled kernels included. Frames go there through a pipe
+and updates come back through another, one for each frame and in their order.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import signal
+import warnings
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from typing import Any
+
+from rlml_slam.maps.saved import SavedMap
+from rlml_slam.rlml.back_end import BackEnd, Update
+from rlml_slam.types import Frame
+
+PIPE = 1 << 20  # bytes of a pipe, some hundred frames, where the system can
+MAP, HOME = 'map', 'home'  # asked instead of a frame
+
+
+class Apart:
+    """A back end that takes frames and is asked for what they did later."""
+
+    def __init__(self, back_end: BackEnd, add: Callable[[BackEnd, Frame], Update | None]) -> None:
+        context = multiprocessing.get_context('fork')
+        theirs, self._frames = _pipe(context)
+        self._updates, ours = _pipe(context)
+        self._came: deque[Any] = deque()
+        self._process = context.Process(
+            target=self._run, args=(back_end, add, theirs, ours), name='back end', daemon=True
+        )
+        with warnings.catch_warnings():
+            # the threads are those of BLAS, which takes care of forks itself
+            warnings.simplefilter('ignore', DeprecationWarning)
+            self._process.start()
+        theirs.close()
+        ours.close()
+
+    def add(self, frame: Frame) -> None:
+        """Send a frame; its answer is one of those that :meth:`update` gives, in order."""
+        while self._updates.poll():  # neither side may wait for the other to read
+            self._came.append(self._receive())
+        self._frames.send(replace(frame, observation=replace(frame.observation, scan=None)))
+
+    def update(self) -> Update | None:
+        """What the oldest frame did for which that was not asked yet."""
+        answer: Update | None = self._came.popleft() if self._came else self._receive()
+        return answer
+
+    def map(self) -> SavedMap:
+        """The map as it is after all frames, each of which was asked for."""
+        self._frames.send(MAP)
+        answer: SavedMap = self._receive()
+        return answer
+
+    def bring_home(self) -> BackEnd:
+        """The back end, after all frames, each of which was asked for; the process ends."""
+        self._frames.send(HOME)
+        back_end: BackEnd = self._receive()
+        self._process.join()
+        return back_end
+
+    def _run(
+        self,
+        back_end: BackEnd,
+        add: Callable[[BackEnd, Frame], Update | None],
+        frames: Connection,
+        updates: Connection,
+    ) -> None:
+        # the copies of this side's ends: with them, the process would not see that this one ended
+        self._frames.close()
+        self._updates.close()
+        _serve(back_end, add, frames, updates)
+
+    def _receive(self) -> Any:
+        try:
+            answer = self._updates.recv()
+        except EOFError as e:
+            self._process.join()
+            code = self._process.exitcode
+            raise RuntimeError(f"the back end's process ended with exit code {code}") from e
+        if isinstance(answer, BaseException):
+            raise answer
+        return answer
+
+
+def _pipe(context: Any) -> tuple[Connection, Connection]:
+    """Both ends of a pipe, the receiver's first."""
+    receiver, sender = context.Pipe(duplex=False)
+    with contextlib.suppress(ImportError, AttributeError, OSError):
+        import fcntl
+
+        fcntl.fcntl(sender.fileno(), fcntl.F_SETPIPE_SZ, PIPE)
+    return receiver, sender
+
+
+def _serve(
+    back_end: BackEnd,
+    add: Callable[[BackEnd, Frame], Update | None],
+    frames: Connection,
+    updates: Connection,
+) -> None:
+    """The process: one answer for everything that comes; an error is the last answer."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the other process, and so this one
+    inbox: deque[Any] = deque()
+    with contextlib.suppress(EOFError, BrokenPipeError):
+        while True:
+            while not inbox or frames.poll():  # read ahead: the sender must not wait
+                inbox.append(frames.recv())
+            asked = inbox.popleft()
+            answer: BackEnd | SavedMap | Update | Exception | None
+            try:
+                answer = _answer(back_end, add, asked)
+            except Exception as e:  # raised again by the other process, whatever it is
+                answer = e
+            updates.send(answer)
+            if asked == HOME or isinstance(answer, Exception):
+                return
+
+
+def _answer(
+    back_end: BackEnd, add: Callable[[BackEnd, Frame], Update | None], asked: Any
+) -> BackEnd | SavedMap | Update | None:
+    if isinstance(asked, Frame):
+        return add(back_end, asked)
+    if asked == MAP:
+        return SavedMap(back_end.reflectors(), back_end.occupancy_grid())
+    return back_end
