@@ -33,6 +33,7 @@ class Apart:
         theirs, self._frames = _pipe(context)
         self._updates, ours = _pipe(context)
         self._came: deque[Any] = deque()
+        self._owed = 0  # answers that did not come yet
         self._process = context.Process(
             target=self._run, args=(back_end, add, theirs, ours), name='back end', daemon=True
         )
@@ -45,8 +46,9 @@ class Apart:
 
     def add(self, frame: Frame) -> None:
         """Send a frame; its answer is one of those that :meth:`update` gives, in order."""
-        while self._updates.poll():  # neither side may wait for the other to read
+        while self._owed and self._updates.poll():  # neither side may wait for the other to read
             self._came.append(self._receive())
+        self._owed += 1
         self._frames.send(replace(frame, observation=replace(frame.observation, scan=None)))
 
     def update(self) -> Update | None:
@@ -55,15 +57,13 @@ class Apart:
         return answer
 
     def map(self) -> SavedMap:
-        """The map as it is after all frames, each of which was asked for."""
-        self._frames.send(MAP)
-        answer: SavedMap = self._receive()
+        """The map as it is after all frames."""
+        answer: SavedMap = self._ask(MAP)
         return answer
 
     def bring_home(self) -> BackEnd:
-        """The back end, after all frames, each of which was asked for; the process ends."""
-        self._frames.send(HOME)
-        back_end: BackEnd = self._receive()
+        """The back end, after all frames; the process ends."""
+        back_end: BackEnd = self._ask(HOME)
         self._process.join()
         return back_end
 
@@ -79,6 +79,13 @@ class Apart:
         self._updates.close()
         _serve(back_end, add, frames, updates)
 
+    def _ask(self, what: str) -> Any:
+        while self._owed:  # what frames did comes before the answer
+            self._came.append(self._receive())
+        self._owed += 1
+        self._frames.send(what)
+        return self._receive()
+
     def _receive(self) -> Any:
         try:
             answer = self._updates.recv()
@@ -86,6 +93,7 @@ class Apart:
             self._process.join()
             code = self._process.exitcode
             raise RuntimeError(f"the back end's process ended with exit code {code}") from e
+        self._owed -= 1
         if isinstance(answer, BaseException):
             raise answer
         return answer

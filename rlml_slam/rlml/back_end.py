@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -142,6 +142,7 @@ class BackEnd:
         closures = self._return()
         if key.points is not None:
             closures += self.scans.add(key)
+        self._join(self.scans.take_pairs())
         self._since_optimized += 1
         due = self._since_optimized >= self._p.back_end.optimize_every
         if due and self._is_behind:
@@ -199,20 +200,20 @@ class BackEnd:
         return key
 
     def _return(self) -> tuple[Closure, ...]:
-        """Loops that reflectors close at the keyframe before the newest, which has seen none yet.
-
-        Those that are the same are one from then on.
-        """
+        """Loops closed by reflectors at the keyframe before the newest, which saw none yet."""
         place = self.constellations.look(self.keyframes[:-1])
-        if place is None:
-            return ()
-        closures = self.scans.enter(place)
-        if any(c.accepted and c.j == place.key.index for c in closures):
-            for old, new in place.pairs:
-                self.reflector_graph.join(old, new)
+        return () if place is None else self.scans.enter(place)
+
+    def _join(self, pairs: Sequence[tuple[int, int]]) -> None:
+        """Reflectors that a closure tells to be the same are one from then on."""
+        alive = {m.key for m in self.reflector_graph.alive()}
+        resolve = self.reflector_graph.resolve
+        here = [(a, b) for a, b in pairs if {resolve(a), resolve(b)} <= alive]
+        for old, new in here:
+            self.reflector_graph.join(old, new)
+        if here:
             self.deferred.drop()
             self.rejoin()
-        return closures
 
     @property
     def _is_behind(self) -> bool:

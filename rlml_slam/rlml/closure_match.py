@@ -26,12 +26,17 @@ HELD = 1.0  # [m] a closure holds its place to this in any direction, or may be 
 PYRAMIDS = 16  # search pyramids kept: each is several times as large as its submap
 
 
+SECOND, OPEN_WAY = 'a second place fits as well', 'the scan leaves a direction open'
+UNDECIDED = (SECOND, OPEN_WAY)  # such a scan contradicts nothing
+
+
 @dataclass(frozen=True)
 class Match:
     """A keyframe that fits a submap at ``T_grid_key`` (3,), with the information (3, 3) there.
 
     ``searched`` is the area [m²] of its candidate, ``odds`` the logarithm of how much likelier
-    right than any match it is, ``source`` what proposed it; the others as in Closure.
+    right than any match it is, ``source`` what proposed it, ``pairs`` keys of reflectors that are
+    one with it; the others as in Closure.
     """
 
     m: KeySubmap
@@ -44,6 +49,7 @@ class Match:
     searched: float
     odds: float = 0.0
     source: str = ''
+    pairs: tuple[tuple[int, int], ...] = ()
 
     def closure(self, why: str, edge: int = -1, number: int = -1) -> Closure:
         """Its record."""
@@ -75,14 +81,14 @@ class Matcher:
         if result.best is None:
             return rejected('no place in the window fits')
         if result.second is not None and result.second.score > p.max_second * result.best.score:
-            return rejected('a second place fits as well', result.best.score)
+            return rejected(SECOND, result.best.score)
         weak = np.diag(1.0 / np.array([0.5, 0.5, 0.2]) ** 2)
         found = match(m.submap, points, result.best.pose, weak, self._p.scan_match, searched=False)
         if found.score < p.min_score:
             return rejected('the refined fit is too weak', found.score)
         information = observability.information(m.submap, points, found.pose, self._p.scan_match)
         if np.linalg.eigvalsh(np.linalg.inv(information + OPEN * np.eye(3))[:2, :2])[1] > HELD**2:
-            return rejected('the scan leaves a direction open', found.score)
+            return rejected(OPEN_WAY, found.score)
         term = linearize(m.submap, points, found.pose)
         second = math.nan if result.second is None else result.second.score / result.best.score
         overlap = term.inliers / max(term.count, 1)

@@ -15,6 +15,7 @@ accuracy of W, as the compressed filter of Guivant and Nebot (2001) does.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,7 +86,8 @@ class Distant:
             return
         self.gather(state, tracks)
         self._middle, self._sigma = at, sigma
-        away = np.hypot(*(state.landmarks() - at).T) > self._reach + MARGIN + 3.0 * sigma
+        gap = np.hypot(*(state.landmarks() - at).T)
+        away = gap > self._reach + MARGIN + 3.0 * np.maximum(_sigmas_from(state), sigma)
         away &= tracks.confirmed(self._min_sightings)
         away &= (tracks.ids == ANONYMOUS) | ~np.isin(tracks.ids, ids)
         if away.sum() > FEW:
@@ -105,6 +107,12 @@ class Distant:
             np.concatenate([state.landmark_covs(), covs]),
         )
 
+    def all_tracks(self, tracks: Tracks) -> Tracks:
+        """The tracks of those in and out of the state, in the order of :meth:`everything`."""
+        every = replace(tracks)
+        every.extend(self._tracks)
+        return every
+
     def has(self, keys: NDArray[np.int64]) -> bool:
         """Whether any of ``keys`` (k,) is out of the state."""
         return bool(np.isin(self._tracks.keys, keys).any())
@@ -116,6 +124,16 @@ class Distant:
             tracks.extend(self._tracks)
             self._left_out, self._tracks = None, Tracks()
         self._middle = np.full(2, np.inf)
+
+
+def _sigmas_from(state: JointState) -> Array:
+    """Sigmas (m,) [m] of where reflectors are from the pose, both directions together."""
+    x = slice(LANDMARKS, LANDMARKS + 2 * state.num_landmarks, 2)
+    y = slice(x.start + 1, x.stop, 2)
+    P = state.P
+    own = P.diagonal()[x] + P.diagonal()[y] + P[0, 0] + P[1, 1]
+    out: Array = np.sqrt(np.maximum(own - 2.0 * (P[0, x] + P[1, y]), 0.0))
+    return out
 
 
 def _rows(landmarks: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -562,7 +562,7 @@ class FrontEnd:
         began: float,
     ) -> Frame:
         pose, cov = self.state.pose, self.state.pose_cov
-        T_map_base, cov_map = self.in_map(pose, cov + self._late(observation.stamp_sigma))
+        T_map_base, cov_map = self.in_map(pose, cov + self.late(observation.stamp_sigma))
         used = matched.status == Status.USED
         return Frame(
             stamp=observation.stamp,
@@ -583,7 +583,7 @@ class FrontEnd:
             jumped=self._jumped,
         )
 
-    def _late(self, sigma: float) -> Array:
+    def late(self, sigma: float) -> Array:
         """Covariance (3, 3) of how far the robot goes in the error ``sigma`` [s] of a stamp.
 
         It is published alone: one stamp's error is nearly that of the next, and of the map's.
@@ -597,16 +597,18 @@ class FrontEnd:
 
     def reflectors(self) -> Reflectors:
         """The confirmed reflectors in the map frame."""
-        self._distant.gather(self.state, self.tracks)
-        keep = self.tracks.confirmed(self._p.reflector.min_sightings)
+        # those out of the state come after those in it, as in everything()
+        tracks = self._distant.all_tracks(self.tracks)
+        _, places, covs = self._distant.everything(self.state, self.tracks)
+        keep = tracks.confirmed(self._p.reflector.min_sightings)
         R = se2.rotation(self.T_map_local[2])
         return Reflectors(
-            self.tracks.keys[keep],
-            se2.transform(self.T_map_local, self.state.landmarks()[keep]),
-            R @ self.state.landmark_covs()[keep] @ R.T,
-            self.tracks.ids[keep],
-            self.tracks.sightings[keep],
-            self.tracks.diameters[keep],
+            tracks.keys[keep],
+            se2.transform(self.T_map_local, places[keep]),
+            R @ covs[keep] @ R.T,
+            tracks.ids[keep],
+            tracks.sightings[keep],
+            tracks.diameters[keep],
         )
 
 

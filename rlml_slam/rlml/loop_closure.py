@@ -28,7 +28,7 @@ from rlml_slam.params import Parameters
 from rlml_slam.rlml.closure import Closure, Fate, State
 from rlml_slam.rlml.closure_candidates import Candidate, candidates
 from rlml_slam.rlml.closure_entry import may_enter
-from rlml_slam.rlml.closure_match import OPEN, Match, Matcher
+from rlml_slam.rlml.closure_match import OPEN, UNDECIDED, Match, Matcher
 from rlml_slam.rlml.constellation_closure import Place
 from rlml_slam.rlml.key_submap import TURN, KeySubmap
 from rlml_slam.rlml.keyframes import Keyframe
@@ -40,6 +40,7 @@ RECORDS = 2000  # of closures; beyond, the oldest rejected ones go
 WAITING = 60  # closures that wait for others to agree with them, the newest
 WAITS = 'waits for others that agree'
 BY_REFLECTORS = 'proposed by reflectors: '
+ELSEWHERE = 16.3  # 99.9 % of a chi-square with 3 degrees of freedom
 CONFIRMED = 1.0, 0.2  # [m], [rad] around the place that reflectors tell, where its scan has to fit
 
 
@@ -57,6 +58,7 @@ class ScanGraph:
         self._finished: list[KeySubmap] = []
         self._matcher = Matcher(params)
         self._waiting: list[Match] = []
+        self._paired: list[tuple[int, int]] = []
         self._count = 0
         self._accepted = 0
         self.closures: list[Closure] = []
@@ -290,18 +292,21 @@ class ScanGraph:
         information = np.asarray(np.linalg.inv(place.cov), dtype=np.float64)
         confirmed: Match | Closure = Match(
             anchor, key, place.T_anchor_key, information, place.share, math.nan, math.nan,
-            place.area, place.odds, BY_REFLECTORS,
+            place.area, place.odds, BY_REFLECTORS, place.pairs,
         )  # fmt: skip
-        gaps = [
-            math.dist(se2.transform(self._grid(m), m.centre[None])[0], here[:2])
-            for m in self._finished
-        ]
+        # what was told of the same reflectors before is told again, not once more
+        fresh = {new for _, new in place.pairs}
+        self._waiting = [w for w in self._waiting if fresh.isdisjoint(n for _, n in w.pairs)]
+        # the robot's own last submaps are where it is, whatever that is of the old ones
+        size = self._p.back_end.submap_size
+        old = [m for m in self._finished if m.anchor.index + 2 * size <= key.index]
+        gaps = [math.dist(se2.transform(self._grid(m), m.centre[None])[0], here[:2]) for m in old]
         p, scanned = self._p, key.points is not None
         if key.points is not None and len(key.points) < p.scan_match.min_points:
             scanned = False
         if scanned and gaps and min(gaps) < p.loop_closure.max_distance:
             assert key.points is not None
-            m = self._finished[int(np.argmin(gaps))]
+            m = old[int(np.argmin(gaps))]
             points = thinning.thin(
                 key.points.astype(np.float64), p.scan_match.voxel, p.scan_match.max_points
             )
@@ -309,11 +314,22 @@ class ScanGraph:
             found = self._matcher.match(candidate, key, points)
             if isinstance(found, Match):
                 confirmed = replace(
-                    found, searched=place.area, odds=place.odds, source=BY_REFLECTORS
-                )
-            else:
+                    found, searched=place.area, odds=place.odds, source=BY_REFLECTORS,
+                    pairs=place.pairs,
+                )  # fmt: skip
+                off = se2.between(here, se2.compose(self._grid(m), found.T_grid_key))
+                R = np.eye(3)
+                R[:2, :2] = se2.rotation(place.T_anchor_key[2])
+                if off @ np.linalg.solve(R.T @ place.cov @ R, off) > ELSEWHERE:
+                    confirmed = found.closure(BY_REFLECTORS + 'the scan fits elsewhere')
+            elif found.why not in UNDECIDED:
                 confirmed = replace(found, why=BY_REFLECTORS + found.why)
         return self._record([confirmed])
+
+    def take_pairs(self) -> list[tuple[int, int]]:
+        """Keys of reflectors that are one by the closures that entered since the last call."""
+        pairs, self._paired = self._paired, []
+        return pairs
 
     def _record(self, tried: Sequence[Match | Closure]) -> tuple[Closure, ...]:
         """Let in what may, and remember all."""
@@ -343,6 +359,7 @@ class ScanGraph:
         out, waited = [], len(self._waiting)
         for n, (c, enters) in enumerate(zip(matches, may.tolist(), strict=True)):
             if enters:
+                self._paired += c.pairs
                 edge = self._edge(EdgeKind.CLOSURE, c.m, c.key, c.T_grid_key, c.information)
                 why = 'fits' if n >= waited else 'fits and others agree'
                 out.append(c.closure(c.source + why, edge, self._accepted))

@@ -60,7 +60,7 @@ class Slam(Driven):
         self._path: list[tuple[int, Array]] = []
         self._parallel = parallel
         self._apart: Apart | None = None
-        self._pending: deque[tuple[Frame, float]] = deque()
+        self._pending: deque[tuple[Frame, float, Array]] = deque()
 
     def use_map(self, saved: SavedMap) -> None:
         """Localise in a map that never changes, instead of making one."""
@@ -115,7 +115,8 @@ class Slam(Driven):
                 spent = 1e3 * (time.thread_time() - began)
                 self._apart = self._apart or Apart(self.back_end, _add)
                 self._apart.add(frame)
-                self._pending.append((frame, spent))
+                late = self.front_end.late(observation.stamp_sigma)
+                self._pending.append((frame, spent, frame.cov_local + late))
                 is_lost = frame.health.level is Level.LOST or frame.doubtful
                 frames += self._settle(0 if is_lost else AHEAD)
             else:
@@ -141,8 +142,8 @@ class Slam(Driven):
         frames = []
         while len(self._pending) > most:
             assert self._apart is not None
-            frame, spent = self._pending.popleft()
-            T_map_base, cov_map = self.front_end.in_map(frame.T_local_base, frame.cov_local)
+            frame, spent, cov = self._pending.popleft()
+            T_map_base, cov_map = self.front_end.in_map(frame.T_local_base, cov)
             frames.append(replace(frame, T_map_base=T_map_base, cov_map=cov_map, wall_ms=spent))
             self._take_over(self._apart.update())
         return frames

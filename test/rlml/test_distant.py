@@ -152,3 +152,12 @@ def test_drive_is_the_same_with_and_without_those_out_of_reach():
     np.testing.assert_allclose(mine.points[a], all_.points[b], atol=1e-7)
     np.testing.assert_allclose(mine.cov[a], all_.cov[b], atol=1e-9)
     np.testing.assert_array_equal(mine.sightings[a], all_.sightings[b])
+
+
+def test_reflector_that_may_be_in_reach_stays():
+    state, tracks, points = aisle(400.0)
+    state.P[LANDMARKS + 2 * 60, LANDMARKS + 2 * 60] = 40.0**2
+    Distant(20.0, 3).follow(state, tracks, NOBODY)
+    assert points[60, 0] > 2.0 * (20.0 + MARGIN)
+    assert 60 in tracks.keys
+    assert 61 not in tracks.keys

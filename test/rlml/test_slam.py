@@ -228,3 +228,13 @@ def test_end_of_the_back_ends_process_is_told(monkeypatch):
     slam = failing(monkeypatch, lambda: os._exit(3))
     with pytest.raises(RuntimeError, match='exit code 3'):
         to_the_end(slam)
+
+
+def test_map_can_be_asked_for_while_frames_wait():
+    slam = Slam(Parameters(), parallel=True)
+    for m in messages(ROOM, CURVE[:30], reflectors=False):
+        add(slam, m)
+    grid = slam.map().grid
+    assert grid is not None
+    assert (grid.cells == 100).sum() > 50
+    assert len(slam.finish()) == len(slam.trajectory()[0]) == 30
