@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from made_maps import whole
 from made_worlds import (
     FIRST,
     ROOM,
@@ -27,7 +28,6 @@ from rlml_slam.params import LoopClosure, Node, Parameters
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.closure_candidates import candidates
 from rlml_slam.rlml.closure_match import Matcher
-from rlml_slam.rlml.front_end import FrontEnd
 from rlml_slam.rlml.key_submap import KeySubmap
 from rlml_slam.rlml.keyframes import Interval, Keyframe, Sighting
 from rlml_slam.rlml.loop_closure import ScanGraph
@@ -82,18 +82,6 @@ def run(frames, params=None):
     updates = [back_end.add(f) for f in frames]
     back_end.finish()
     return back_end, [u for u in updates if u is not None]
-
-
-def whole(observed, params=None):
-    """The back end behind a real front end, as Slam has it."""
-    params = params or Parameters()
-    front_end, back_end = FrontEnd(params), BackEnd(params)
-    for o in observed:
-        update = back_end.add(front_end.process(o))
-        if update is not None and update.optimized:
-            front_end.correct(update.T_map_local)
-    back_end.finish()
-    return back_end
 
 
 # --- keyframes ---------------------------------------------------------------------------------

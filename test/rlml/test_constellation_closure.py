@@ -7,12 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from made_maps import whole
 from made_worlds import TinyWorld, drive, observations
 
 from rlml_slam import se2
 from rlml_slam.params import LoopClosure, Parameters
-from rlml_slam.rlml.back_end import BackEnd
-from rlml_slam.rlml.front_end import FrontEnd
 from rlml_slam.types import Detections, Motion
 
 # a yard of 45 by 30 m: posts stand where the drive begins and ends, and none on the way
@@ -44,14 +43,7 @@ def misled(observed):
 def mapped(posts, path, parameters, seed=0):
     rng = np.random.default_rng(seed)
     world = TinyWorld(np.zeros((0, 4)), posts)
-    observed = misled(observations(world, path, scan=False, rng=rng))
-    front_end, back_end = FrontEnd(parameters), BackEnd(parameters)
-    for o in observed:
-        update = back_end.add(front_end.process(o))
-        if update is not None and update.optimized:
-            front_end.correct(update.T_map_local)
-    back_end.finish()
-    return back_end
+    return whole(misled(observations(world, path, scan=False, rng=rng)), parameters)
 
 
 PATH = drive(*LAP, (1.0, 0.0, 12.0))
