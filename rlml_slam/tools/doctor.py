@@ -20,7 +20,8 @@ from rlml_slam.params import Detector, DetectorParameters, from_mapping, read_ya
 from rlml_slam.ros import convert
 from rlml_slam.ros.bag import BagReader, choose_topics
 from rlml_slam.se2 import Array
-from rlml_slam.sensing.reflector_detector import VENDOR_BIT, detect, threshold
+from rlml_slam.sensing.bright_level import VENDOR_BIT
+from rlml_slam.sensing.reflector_detector import detect, threshold
 from rlml_slam.tools.progress import Progress
 from rlml_slam.types import Scan
 

@@ -17,13 +17,10 @@ from scipy.optimize import least_squares
 
 from rlml_slam import se2
 from rlml_slam.params import Detector, Laser
-from rlml_slam.sensing.reflector_detector import (
-    Fate,
-    detect,
-    is_circular,
-    surface_depth,
-    threshold,
-)
+from rlml_slam.sensing.bright_level import is_circular
+from rlml_slam.sensing.bright_spot import Fate
+from rlml_slam.sensing.reflector_detector import detect, threshold
+from rlml_slam.sensing.spot_shape import surface_depth
 from rlml_slam.simulation.world import NO_REFLECTOR, Geometry
 from rlml_slam.tools.detector_scenes import Scene, StillLaser, cylinders, room, surface
 from rlml_slam.tools.study_detector import judge_cylinders, judge_hall, judge_rooms, judge_worlds
