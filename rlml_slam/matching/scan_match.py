@@ -9,7 +9,7 @@ the raw coordinates (x, y, theta).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -383,8 +383,7 @@ def match(
     if window is not None:
         other = solve.refined(prior_pose)
         result = other if solve.merit(other) >= solve.merit(result) else result
-    p = replace(p, poor_score=max(p.poor_score, usual))
-    if result.score < p.poor_score:
+    if result.score < max(p.poor_score, usual):
         other = solve.refined(solve.found(p.wide_window, p.wide_angle, WIDE_STRIDE))
         if solve.merit(other) > solve.merit(result):
             return other

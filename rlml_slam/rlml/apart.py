@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The back end in a process of its own: two threads of Python mostly wait for one another.
 
-The process begins as a copy of this one, compiled kernels included. Frames go there through a pipe
-and updates come back through another, one for each frame and in their order.
+The process begins as a copy of this one, compiled kernels included. Frames go there through a
+pipe, BATCH at a time, and updates come back through another, one for each frame and in their
+order.
 """
 
 from __future__ import annotations
@@ -13,16 +14,18 @@ import signal
 import warnings
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, TypeAlias
 
 from rlml_slam.maps.saved import SavedMap
 from rlml_slam.rlml.back_end import BackEnd, Update
+from rlml_slam.rlml.frame_batch import Batch, packed, unpacked
 from rlml_slam.types import Frame
 
 PIPE = 1 << 20  # bytes of a pipe, some hundred frames, where the system can
-MAP, HOME = 'map', 'home'  # asked instead of a frame
+BATCH = 32  # frames: by then a message more costs next to nothing per frame
+MAP, HOME = 'map', 'home'  # asked instead of frames
+Answer: TypeAlias = list[Update | None] | BackEnd | SavedMap
 
 
 class Apart:
@@ -32,7 +35,8 @@ class Apart:
         context = multiprocessing.get_context('fork')
         theirs, self._frames = _pipe(context)
         self._updates, ours = _pipe(context)
-        self._came: deque[Any] = deque()
+        self._waiting: list[Frame] = []  # not sent yet
+        self._came: deque[Update | None] = deque()
         self._owed = 0  # answers that did not come yet
         self._process = context.Process(
             target=self._run, args=(back_end, add, theirs, ours), name='back end', daemon=True
@@ -46,15 +50,17 @@ class Apart:
 
     def add(self, frame: Frame) -> None:
         """Send a frame; its answer is one of those that :meth:`update` gives, in order."""
-        while self._owed and self._updates.poll():  # neither side may wait for the other to read
-            self._came.append(self._receive())
-        self._owed += 1
-        self._frames.send(replace(frame, observation=replace(frame.observation, scan=None)))
+        self._waiting.append(frame)
+        if len(self._waiting) >= BATCH:
+            self._send()
 
     def update(self) -> Update | None:
         """What the oldest frame did for which that was not asked yet."""
-        answer: Update | None = self._came.popleft() if self._came else self._receive()
-        return answer
+        if not self._came:
+            if not self._owed:
+                self._send()
+            self._came += self._receive()
+        return self._came.popleft()
 
     def map(self) -> SavedMap:
         """The map as it is after all frames."""
@@ -79,9 +85,18 @@ class Apart:
         self._updates.close()
         _serve(back_end, add, frames, updates)
 
+    def _send(self) -> None:
+        while self._owed and self._updates.poll():  # neither side may wait for the other to read
+            self._came += self._receive()
+        self._owed += 1
+        self._frames.send(packed(self._waiting))
+        self._waiting = []
+
     def _ask(self, what: str) -> Any:
+        if self._waiting:
+            self._send()
         while self._owed:  # what frames did comes before the answer
-            self._came.append(self._receive())
+            self._came += self._receive()
         self._owed += 1
         self._frames.send(what)
         return self._receive()
@@ -123,7 +138,7 @@ def _serve(
             while not inbox or frames.poll():  # read ahead: the sender must not wait
                 inbox.append(frames.recv())
             asked = inbox.popleft()
-            answer: BackEnd | SavedMap | Update | Exception | None
+            answer: Answer | Exception
             try:
                 answer = _answer(back_end, add, asked)
             except Exception as e:  # raised again by the other process, whatever it is
@@ -135,9 +150,9 @@ def _serve(
 
 def _answer(
     back_end: BackEnd, add: Callable[[BackEnd, Frame], Update | None], asked: Any
-) -> BackEnd | SavedMap | Update | None:
-    if isinstance(asked, Frame):
-        return add(back_end, asked)
+) -> Answer:
+    if isinstance(asked, Batch):
+        return [add(back_end, frame) for frame in unpacked(asked)]
     if asked == MAP:
         return SavedMap(back_end.reflectors(), back_end.occupancy_grid())
     return back_end

@@ -37,16 +37,13 @@ class Fate:
     state: State = State.ACTIVE
     reason: str = ''
     residual: float = math.nan
+    weight: float = math.nan  # the last one noted
     notes: deque[Note] = field(default_factory=lambda: deque(maxlen=NOTES))
-
-    @property
-    def weight(self) -> float:
-        """The last one noted, NaN before the first."""
-        return self.notes[-1].weight if self.notes else math.nan
 
     def note(self, keyframe: int, residual: float, weight: float) -> None:
         """Remember a weight."""
         self.notes.append(Note(keyframe, residual, weight))
+        self.weight = weight
 
     def turn(self, state: State, reason: str) -> None:
         """Go over to another state."""

@@ -48,27 +48,35 @@ def candidates(
     that one is tried as well whose last turn is longest ago.
     """
     pose = graph.poses[key.index]
-    grids = [se2.compose(graph.poses[m.anchor.index], m.T_anchor_grid) for m in among]
-    gaps = [
-        float(np.linalg.norm(se2.transform(T, m.centre[None])[0] - pose[:2]))
-        for T, m in zip(grids, among, strict=True)
-    ]
-    order = [int(k) for k in np.argsort(gaps, kind='stable')]
+    if not among:
+        return []
+    bases = graph.poses[[m.anchor.index for m in among]]
+    grids = se2.compose(bases, np.array([m.T_anchor_grid for m in among]))
+    centres = se2.transform(grids, np.array([m.centre for m in among])[:, None])[:, 0]
+    gaps = np.hypot(*(centres - pose[:2]).T).tolist()
+    order = np.argsort(gaps, kind='stable').tolist()
     order = [k for k in order if gaps[k] < p.max_distance + p.widest_window - p.search_window]
     if not order:
         return []
     anchors = np.array([among[k].anchor.index for k in order], dtype=np.int64)
     off = SIGMAS * reach(graph, key.index, anchors)
-    windows = np.clip(off[:, 0], p.search_window, p.widest_window)
-    angles = np.clip(off[:, 1], p.search_angle, p.widest_angle)
+    windows = np.clip(off[:, 0], p.search_window, p.widest_window).tolist()
+    angles = np.clip(off[:, 1], p.search_angle, p.widest_angle).tolist()
     found = [
-        Candidate(among[k], se2.between(grids[k], pose), float(window), float(angle))
+        (among[k], window, angle)
         for k, window, angle in zip(order, windows, angles, strict=True)
         if gaps[k] < p.max_distance + window - p.search_window
     ]
     first, others = found[: p.candidates], found[p.candidates :]
-    lost = [c for c in others if c.window > p.search_window]
-    chosen = first + sorted(lost, key=lambda c: c.m.turn)[:1]
-    for c in chosen:
-        c.m.turn = key.stamp
-    return chosen
+    lost = [c for c in others if c[1] > p.search_window]
+    chosen = first + sorted(lost, key=lambda c: c[0].turn)[:1]
+    for m, _, _ in chosen:
+        m.turn = key.stamp
+    return [
+        Candidate(m, se2.between(_grid(graph, m), pose), window, angle)
+        for m, window, angle in chosen
+    ]
+
+
+def _grid(graph: Graph, m: KeySubmap) -> Array:
+    return se2.compose(graph.poses[m.anchor.index], m.T_anchor_grid)

@@ -59,6 +59,7 @@ class ScanGraph:
         self._matcher = Matcher(params)
         self._waiting: list[Match] = []
         self._paired: list[tuple[int, int]] = []
+        self._failed: set[tuple[int, int]] = set()  # keyframes of rejected closures
         self._count = 0
         self._accepted = 0
         self.closures: list[Closure] = []
@@ -213,6 +214,10 @@ class ScanGraph:
         rejected = [k for k, c in enumerate(kept) if not c.accepted]
         gone = set(rejected[: max(len(kept) - RECORDS, 0)])
         self.closures = [c for k, c in enumerate(kept) if k not in gone]
+        self._note_failed()
+
+    def _note_failed(self) -> None:
+        self._failed = {(c.i, c.j) for c in self.closures if not c.accepted}
 
     def _pose(self, key: Keyframe) -> Array:
         pose: Array = self._graph.poses[key.index]
@@ -273,6 +278,7 @@ class ScanGraph:
                 a['closure_fate'].tolist(), a['closure_reason'], strict=True
             )
         ]  # fmt: skip
+        self._note_failed()
         self._accepted = max((c.number for c in self.closures), default=-1) + 1
         rejected, accepted = a['closures_tried'].tolist()
         self.tried = {True: accepted, False: rejected}
@@ -340,6 +346,7 @@ class ScanGraph:
         self.closures += out
         for closure in out:
             self.tried[closure.accepted] += 1
+        self._failed.update((c.i, c.j) for c in out if not c.accepted)
         return tuple(out)
 
     def _admit(self, fresh: Sequence[Match]) -> list[Closure]:
@@ -366,10 +373,12 @@ class ScanGraph:
                 self._accepted += 1
             elif n >= waited:
                 out.append(c.closure(c.source + WAITS))
-        entered = {(c.i, c.j) for c in out if c.accepted}
-        kept = [c for c in self.closures if c.accepted or (c.i, c.j) not in entered]
-        self.tried[False] -= len(self.closures) - len(kept)
-        self.closures = kept
+        entered = {(c.i, c.j) for c in out if c.accepted} & self._failed
+        if entered:
+            kept = [c for c in self.closures if c.accepted or (c.i, c.j) not in entered]
+            self.tried[False] -= len(self.closures) - len(kept)
+            self.closures = kept
+            self._failed -= entered
         left = [c for c, enters in zip(matches, may.tolist(), strict=True) if not enters]
         self._waiting = left[-WAITING:]
         return out

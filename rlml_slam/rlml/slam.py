@@ -32,7 +32,7 @@ from rlml_slam.types import (
     Verdict,
 )
 
-AHEAD = 200  # frames that the front end may be ahead of the back end
+AHEAD = 1000  # frames that the front end may be ahead of the back end
 
 
 class Slam(Driven):
