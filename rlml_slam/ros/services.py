@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.srv import AddDiagnostics
 from nav_msgs.srv import GetMap, LoadMap
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.task import Future
 from std_srvs.srv import Empty, SetBool, Trigger
 
@@ -31,6 +32,8 @@ class MapServices:
         self._p = params
         self._mapper = mapper
         self._join = join
+        # in the node's group, every subscription would wait for the answer
+        own = MutuallyExclusiveCallbackGroup()
         for kind, name, answer in (
             (Trigger, '~/save_map', self.save_map),
             (LoadMap, '~/load_map', self.load_map),
@@ -44,13 +47,19 @@ class MapServices:
             (SetBool, '~/set_localization_mode', self.set_localization_mode),
             (Empty, 'reinitialize_global_localization', self.reinitialize),
         ):
-            node.create_service(kind, name, self._in_worker(answer))
+            node.create_service(kind, name, self._in_worker(answer), callback_group=own)
 
     def _in_worker(self, answer: Callable[[Any, Any], Any]) -> Any:
         async def call(request: Any, response: Any) -> Any:
-            done = Future(executor=self._node.executor)
-            job = self._mapper.worker.submit(lambda: answer(request, response))
-            job.add_done_callback(lambda _: done.set_result(None))
+            executor = self._node.executor
+            done = Future(executor=executor)
+
+            def finish(_: Any) -> None:
+                done.set_result(None)
+                # an executor that waits for messages does not see what became of a future
+                executor.wake()
+
+            self._mapper.worker.submit(lambda: answer(request, response)).add_done_callback(finish)
             await done
             return response
 
