@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import math
 from collections import Counter
 from collections.abc import Iterable
@@ -21,17 +23,19 @@ def closure_table(closures: Iterable[Closure]) -> str:
     ``residual`` is the squared Mahalanobis norm, chi-square with 3 degrees of freedom if all is
     well; ``score``, ``overlap`` and ``second`` are those of the match that it was accepted for.
     """
-    rows = [','.join(COLUMNS)]
+    out = io.StringIO()
+    table = csv.writer(out, lineterminator='\n')
+    table.writerow(COLUMNS)
     for c in closures:
         if c.accepted:
             fate = c.fate
             history = ' '.join(f'{n.keyframe}:{n.weight:.2f}' for n in fate.notes)
-            rows.append(
-                f'{c.number},{c.i},{c.j},{fate.state.name.lower()},{_number(fate.residual)},'
-                f'{_number(weight(c))},{c.score:.3f},{_number(c.overlap)},{_number(c.second)},'
-                f'{fate.reason or c.why},{history}'
-            )
-    return '\n'.join(rows) + '\n'
+            table.writerow((
+                c.number, c.i, c.j, fate.state.name.lower(), _number(fate.residual),
+                _number(weight(c)), f'{c.score:.3f}', _number(c.overlap), _number(c.second),
+                fate.reason or c.why, history,
+            ))  # fmt: skip
+    return out.getvalue()
 
 
 def weight(closure: Closure) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,9 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(summary_text(result.name, figures))
         print(f'report: {out / "report.html"}')
+    if result.problem:
+        print(f'rlml: {result.problem}', file=sys.stderr)
+        return 1
     return 0
 
 
@@ -76,6 +80,7 @@ def source(args: argparse.Namespace, world: World) -> Source:
         lambda recorder: recorder.distance / length,
         # where there is no tf2_msgs, /tf_static cannot tell it
         {'laser_pose': list(Simulator().laser_pose), 'map_update_interval': 1.0},
+        keeps_map=True,
     )  # fmt: skip
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import signal
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -17,7 +18,9 @@ import rclpy.utilities
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
+from rlml_slam import warm_up
 from rlml_slam.errors import RlmlError
+from rlml_slam.tools import live_map
 from rlml_slam.tools.metrics import distribution
 from rlml_slam.tools.processes import Processes, free_domain
 from rlml_slam.tools.progress import Progress
@@ -37,7 +40,7 @@ class Source:
 
     ``system`` are parameters of front end and back end, ``config`` their parameter file.
     ``sensor`` is the (topic, type) whose every message asks for a pose. ``progress`` tells the
-    share of the drive that is done.
+    share of the drive that is done. ``keeps_map``: the run gets the whole map at its end.
     """
 
     title: str
@@ -47,6 +50,7 @@ class Source:
     system: Mapping[str, Any] = field(default_factory=dict)
     config: Path | None = None
     sensor: tuple[str, str] = ('scan', 'sensor_msgs/msg/LaserScan')
+    keeps_map: bool = False
 
 
 def drive(source: Source, out: Path, quiet: bool) -> Run:
@@ -54,30 +58,37 @@ def drive(source: Source, out: Path, quiet: bool) -> Run:
 
     Raises RlmlError if a process dies, never answers or falls silent, with its last words.
     """
-    domain = free_domain()
+    _compile(quiet)
+    domain, problem = free_domain(), ''
     environment = {'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
     with (
         own_domain(domain, environment),
         held_interrupts() as check,
+        tempfile.TemporaryDirectory(prefix='rlml_map_') as maps,
         Processes(out / 'log', environment) as processes,
     ):
         recorder = Recorder(source.sensor)
         executor = SingleThreadedExecutor()
         executor.add_node(recorder)
         try:
-            _start(processes, source)
+            _start(processes, source, maps)
             load = Load(processes)
             with Progress('driving', 1.0, quiet) as progress:
                 for _ in _listen(processes, recorder, executor, source.executable):
                     check()
                     load.sample(recorder)
                     progress.update(source.progress(recorder), recorder.note())
+            if not recorder.frames.stamps:
+                raise RlmlError('the front end never published a pose')
+            if source.keeps_map:
+                problem = live_map.save(recorder, executor)
         finally:
             executor.shutdown(timeout_sec=1.0)
             recorder.destroy_node()
-    if not recorder.frames.stamps:
-        raise RlmlError('the front end never published a pose')
-    result = recorder.run(source.title)
+        result = recorder.run(source.title)
+        if source.keeps_map and not problem:
+            live_map.take(result, Path(maps))
+    result.problem = problem
     result.extra = _live_figures(recorder, load)
     return result
 
@@ -117,10 +128,23 @@ def held_interrupts() -> Iterator[Callable[[], None]]:
             signal.signal(n, handler)
 
 
-def _start(processes: Processes, source: Source) -> None:
+def _compile(quiet: bool) -> None:
+    """What the processes need, once and not by each of them at the same time."""
+    warm_up.import_core(also_others=False)
+    modules = warm_up.loaded()
+    with Progress('compiling, once', len(modules), quiet) as progress:
+        for k, (name, compile_module) in enumerate(modules):
+            progress.update(k, name.removeprefix('rlml_slam.'))
+            compile_module()
+
+
+def _start(processes: Processes, source: Source, maps: str) -> None:
     """The three nodes; the source waits until the others listen."""
+    system = dict(source.system)
+    if source.keeps_map:
+        system |= {'map_directory': maps, 'map_file_name': live_map.NAME}
     for name in SYSTEM:
-        processes.start(name, node(name, source.system, source.config))
+        processes.start(name, node(name, system, source.config))
     processes.start(source.executable, node(source.executable, source.parameters))
 
 

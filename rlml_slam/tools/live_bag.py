@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     with BagReader(args.bag) as bag:
         inputs = BagInputs(bag, params)
         truth = inputs.truth()
-        played = source(args, bag, inputs)
+        played = source(args, params, bag, inputs)
     out = make_folder(args.out)
     result = drive(played, out, args.json)
     result.truth = truth
@@ -50,10 +51,15 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(summary_text(result.name, figures))
         print(f'report: {out / "report.html"}')
+    if result.problem:
+        print(f'rlml: {result.problem}', file=sys.stderr)
+        return 1
     return 0
 
 
-def source(args: argparse.Namespace, bag: BagReader, inputs: BagInputs) -> Source:
+def source(
+    args: argparse.Namespace, params: Parameters, bag: BagReader, inputs: BagInputs
+) -> Source:
     """The bag in the place of a robot."""
     duration = max(1e-9 * (bag.end - bag.start), 1e-3)
 
@@ -76,6 +82,8 @@ def source(args: argparse.Namespace, bag: BagReader, inputs: BagInputs) -> Sourc
         system,
         args.config,
         (inputs.topics[sensor], STREAMS[sensor][1]),
+        # a survey and a map to localize in are in the map_directory that the file tells
+        keeps_map=not params.back_end.survey and params.node.mode == 'mapping',
     )  # fmt: skip
 
 

@@ -15,6 +15,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2 or its wheels')
 
+from rlml_slam.rlml import stored_map
 from rlml_slam.tools.demo import route_length
 from rlml_slam.tools.live import node
 from rlml_slam.tools.main import main
@@ -66,6 +67,11 @@ def test_demo_drives_maps_and_reports(world, tmp_path):
     assert 0.0 < f['back_end_ms']['median'] <= f['back_end_ms']['max']
     assert len(read_tum(tmp_path / 'out' / 'trajectory.tum')) == f['scans']
     assert (tmp_path / 'out' / 'report.html').stat().st_size > 50_000
+    # the whole map, as a replay has it: of no more than was mapped
+    stored = stored_map.load(tmp_path / 'out' / 'map.rlml')
+    assert len(stored_map.saved_map(stored).reflectors) == 3
+    states = (tmp_path / 'out' / 'reflector_states.csv').read_text().splitlines()
+    assert len(states) == 4
 
 
 def test_bag_over_dds_ends_where_its_replay_does(tmp_path, capsys):

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole map of a running back end, as a replay has it at its end."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from rclpy.executors import SingleThreadedExecutor
+from std_srvs.srv import Trigger
+
+from rlml_slam.rlml import stored_map
+from rlml_slam.rlml.back_end import BackEnd
+from rlml_slam.rlml.closure_table import closure_table
+from rlml_slam.tools.record import Run
+
+PATIENCE = 30.0  # [s] in which it answers: it may have keyframes to work off
+NAME = 'map'
+
+
+def save(node: Any, executor: SingleThreadedExecutor) -> str:
+    """Have the back end write its map into its map_directory; why it did not, or nothing."""
+    client = node.create_client(Trigger, 'back_end/save_map')
+    deadline = time.monotonic() + PATIENCE
+    while not client.service_is_ready() and time.monotonic() < deadline:
+        executor.spin_once(timeout_sec=0.1)
+    future = client.call_async(Trigger.Request())
+    while not future.done() and time.monotonic() < deadline:
+        executor.spin_once(timeout_sec=0.1)
+    if not future.done():
+        future.cancel()
+        return f'the map was not saved: no answer of the back end within {PATIENCE:g} s'
+    answer = future.result()
+    return '' if answer.success else f'the map was not saved: {answer.message}'
+
+
+def take(run: Run, folder: Path) -> None:
+    """Give a run the map that was saved into a folder, and what it tells."""
+    run.stored = stored_map.load(folder / f'{NAME}.rlml')
+    back_end = BackEnd(stored_map.parameters_of(run.stored))
+    stored_map.restore(run.stored, back_end)
+    run.closure_table = closure_table(back_end.scans.closures)
+    run.reflector_states = tuple(back_end.reflector_states())
