@@ -183,13 +183,16 @@ def branch_and_bound(
     """
     cells = cells_of(points, pose, thetas, scale, corner_j, corner_i)
     tiles = (2 * n + ROOT) // ROOT
-    roots = np.empty(len(thetas) * tiles * tiles, dtype=np.int64)
-    for m in range(len(roots)):
-        tile, a = divmod(m, len(thetas))
-        i, j = divmod(tile, tiles)
-        roots[m] = block_sum(levels[2], rows, columns, cells[a], j * ROOT - n, i * ROOT - n)
-    order = np.argsort(-roots, kind='mergesort')
-    evaluated = len(roots)
+    roots = np.full(len(thetas) * tiles * tiles, CARRY_FREE * len(points))
+    order = np.arange(len(roots))
+    evaluated = 0
+    if len(roots) > BATCH:  # of fewer, nearly all are divided anyway
+        for m in range(len(roots)):
+            a, tile = divmod(m, tiles * tiles)
+            i, j = divmod(tile, tiles)
+            roots[m] = block_sum(levels[2], rows, columns, cells[a], j * ROOT - n, i * ROOT - n)
+        order = np.argsort(-roots, kind='mergesort')
+        evaluated = len(roots)
     blocks = np.empty((min(BATCH, len(roots)) * BRANCH * BRANCH, 4), dtype=np.int32)
     sums = np.empty(BRANCH * BRANCH, dtype=np.int64)
     offsets = np.empty(len(points), dtype=np.int64)
@@ -207,7 +210,7 @@ def branch_and_bound(
                 for m in order[start : start + BATCH]:
                     if roots[m] <= best:
                         break
-                    tile, a = divmod(int(m), len(thetas))
+                    a, tile = divmod(int(m), tiles * tiles)
                     i, j = tile // tiles * ROOT - n, tile % tiles * ROOT - n
                     evaluated += divide(
                         levels[1], rows, columns, BITS, cells[a], j, i, n, offsets, sums
@@ -304,23 +307,44 @@ def divide(
     sums[:] = 0
     width = min(((n - j) >> h) + 1, BRANCH)
     height = min(((n - i) >> h) + 1, BRANCH)
-    for r in range(height):
-        down = (r << h) * columns
+    down, half = columns << h, np.uint64(8)
+    evens = np.uint64(BYTES)
+    for r in range(0, BRANCH, 4):  # four rows at once: as many sums as there are registers for
         for first in range(0, inside, CARRY_FREE):
-            even = odd = np.uint64(0)
+            even_0 = even_1 = even_2 = even_3 = np.uint64(0)
+            odd_0 = odd_1 = odd_2 = odd_3 = np.uint64(0)
             for k in range(first, min(first + CARRY_FREE, inside)):
-                word = load8(level, offsets[k] + down)
-                even += word & np.uint64(BYTES)
-                odd += (word >> np.uint64(8)) & np.uint64(BYTES)
-            for q in range(0, BRANCH, 2):
-                shift = np.uint64(8 * q)
-                sums[BRANCH * r + q] += np.int64((even >> shift) & np.uint64(0xFFFF))
-                sums[BRANCH * r + q + 1] += np.int64((odd >> shift) & np.uint64(0xFFFF))
+                at = offsets[k] + r * down
+                word = load8(level, at)
+                even_0 += word & evens
+                odd_0 += (word >> half) & evens
+                word = load8(level, at + down)
+                even_1 += word & evens
+                odd_1 += (word >> half) & evens
+                word = load8(level, at + 2 * down)
+                even_2 += word & evens
+                odd_2 += (word >> half) & evens
+                word = load8(level, at + 3 * down)
+                even_3 += word & evens
+                odd_3 += (word >> half) & evens
+            spread(even_0, odd_0, sums[BRANCH * r :])
+            spread(even_1, odd_1, sums[BRANCH * (r + 1) :])
+            spread(even_2, odd_2, sums[BRANCH * (r + 2) :])
+            spread(even_3, odd_3, sums[BRANCH * (r + 3) :])
     for r in range(BRANCH):
         for q in range(BRANCH):
             if r >= height or q >= width:
                 sums[BRANCH * r + q] = -1
     return width * height
+
+
+@part
+def spread(even: np.uint64, odd: np.uint64, sums: NDArray[np.int64]) -> None:
+    """Add the sums that lie side by side in two words to the first eight of ``sums``."""
+    for q in range(0, BRANCH, 2):
+        shift = np.uint64(8 * q)
+        sums[q] += np.int64((even >> shift) & np.uint64(0xFFFF))
+        sums[q + 1] += np.int64((odd >> shift) & np.uint64(0xFFFF))
 
 
 @part

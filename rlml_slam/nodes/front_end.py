@@ -48,6 +48,7 @@ class FrontEndNode(Node):
         frame = self.control.process(observation)
         self.answers.publish(frame)
         self.health.update(frame)
+        self.front_end.settle()
 
 
 def main() -> int:

@@ -26,7 +26,7 @@ from rlml_slam.rlml.free_sweep import Sweep
 from rlml_slam.rlml.grid_fix import Fix, SavedGrid
 from rlml_slam.rlml.health import Evidence, HealthMonitor
 from rlml_slam.rlml.joint_state import BIAS, JointState
-from rlml_slam.rlml.reflector_term import Matched, ReflectorTerm
+from rlml_slam.rlml.reflector_term import USED, Matched, ReflectorTerm
 from rlml_slam.rlml.relocalize import is_mapped
 from rlml_slam.rlml.scan_term import ScanTerm
 from rlml_slam.rlml.submaps import Submaps
@@ -39,7 +39,6 @@ from rlml_slam.types import (
     Health,
     Observation,
     Reflectors,
-    Status,
 )
 
 BURST = 50_000_000  # [ns] between two scans that tell a velocity
@@ -72,6 +71,7 @@ class FrontEnd:
         self._map: SavedMap | None = None
         self.confirmation = Confirmation(self._p)
         self._last_stamp: int | None = None
+        self._settling = 0.0  # [s] since the last frame
 
     def use_map(self, reflectors: Reflectors, grid: OccupancyGrid | None = None) -> None:
         """Localise against given reflectors and grid (map frame); nothing is added to them.
@@ -177,8 +177,11 @@ class FrontEnd:
         self._reflectors.forget(keys)
 
     def process(self, observation: Observation) -> Frame:
-        """The pose at the observation's stamp; never raises for what was measured."""
-        began = time.perf_counter()
+        """The pose at the observation's stamp; never raises for what was measured.
+
+        What the frame can do without is left for :meth:`settle`, or for the next call.
+        """
+        began, self._settling = time.perf_counter() - self._settling, 0.0
         coasts = self._predict(observation)
         sweep = Sweep()
         if coasts:
@@ -206,6 +209,12 @@ class FrontEnd:
         frame = self._frame(observation, matched, evidence, health, doubtful, began)
         self._jumped = False
         return frame
+
+    def settle(self) -> None:
+        """Do what could wait until the frame was on its way; it counts as time of the next one."""
+        began = time.perf_counter()
+        self.submaps.settle()
+        self._settling += time.perf_counter() - began
 
     # --- prior -----------------------------------------------------------------------------
 
@@ -266,7 +275,7 @@ class FrontEnd:
 
     def _judge(self, observation: Observation, matched: Matched, evidence: Evidence) -> Health:
         due = self._reflectors.due(observation, matched)
-        used = matched.keys[matched.status == Status.USED]
+        used = matched.keys[matched.status == USED]
         return self.health.judge(
             observation.stamp,
             evidence,
@@ -292,7 +301,7 @@ class FrontEnd:
     ) -> Frame:
         pose, cov = self.state.pose, self.state.pose_cov
         T_map_base, cov_map = self.in_map(pose, cov + self.late(observation.stamp_sigma))
-        used = matched.status == Status.USED
+        used = matched.status == USED
         return Frame(
             stamp=observation.stamp,
             observation=observation,

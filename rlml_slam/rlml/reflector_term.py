@@ -23,6 +23,9 @@ from rlml_slam.se2 import Array
 from rlml_slam.types import ANONYMOUS, Belief, Detections, Observation, Reflectors, Status
 
 NONE = np.zeros(0, dtype=np.int64)
+# as plain numbers: a member of an enumeration takes longer to be looked up than to be compared
+USED, GHOST = int(Status.USED), int(Status.GHOST)
+NEW, DOUBTFUL, AMBIGUOUS = int(Status.NEW), int(Status.DOUBTFUL), int(Status.AMBIGUOUS)
 
 
 class Matched:
@@ -31,7 +34,7 @@ class Matched:
     def __init__(self, k: int) -> None:
         self.index = np.full(k, -1, dtype=np.int64)
         self.keys = np.full(k, -1, dtype=np.int64)
-        self.status = np.full(k, Status.NEW, dtype=np.int64)
+        self.status = np.full(k, NEW, dtype=np.int64)
         self.distance2 = np.full(k, np.nan)
 
     @classmethod
@@ -42,7 +45,7 @@ class Matched:
     @property
     def num_used(self) -> int:
         """Detections that moved the estimate."""
-        return int((self.status == Status.USED).sum()) if len(self.status) else 0
+        return int((self.status == USED).sum()) if len(self.status) else 0
 
     @property
     def agrees(self) -> bool:
@@ -101,7 +104,7 @@ class ReflectorTerm:
         )
         taken = (result.match >= 0) & (result.match[:, None] == matched.index).any(axis=1)
         used = (result.match >= 0) & ~taken
-        matched.status[rows] = np.where(taken, Status.AMBIGUOUS, result.status)
+        matched.status[rows] = np.where(taken, AMBIGUOUS, result.status)
         if not used.any():
             return
         k, index = rows[used], result.match[used]
@@ -147,9 +150,9 @@ class ReflectorTerm:
         p, detections = self._p.reflector, observation.detections
         if self._p.node.mode != 'mapping':
             # a map that never changes has all reflectors that there are
-            matched.status[matched.status == Status.NEW] = Status.GHOST
+            matched.status[matched.status == NEW] = GHOST
         elif detections is not None and not doubtful:
-            fresh = (matched.status == Status.NEW) | (matched.status == Status.DOUBTFUL)
+            fresh = (matched.status == NEW) | (matched.status == DOUBTFUL)
             for k in np.flatnonzero(fresh):
                 matched.index[k] = self._state.add_landmark(
                     detections.points[k], detections.cov[k]
@@ -175,7 +178,7 @@ class ReflectorTerm:
         d, m = observation.detections, len(self.tracks)
         if d is None or observation.points is None or observation.origin is None:
             return np.zeros(m, dtype=np.bool_)
-        used = d.points[matched.status == Status.USED]
+        used = d.points[matched.status == USED]
         if len(used):
             self._reach = max(self._reach, float(np.hypot(used[:, 0], used[:, 1]).max()))
         due: NDArray[np.bool_] = self.tracks.confirmed(self._p.reflector.min_sightings)

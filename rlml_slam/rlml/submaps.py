@@ -24,6 +24,7 @@ class Submaps:
     def __init__(self, parameters: params.Submap) -> None:
         self._p = parameters
         self._maps: list[Submap] = []
+        self._open: list[tuple[Submap, Array, Array]] = []  # scans that are still to be carved
         self._last: Array | None = None
         self.bias = np.zeros((3, 3))
         self.bias[[0, 1, 2], [0, 1, 2]] = parameters.bias2
@@ -31,10 +32,15 @@ class Submaps:
     @property
     def target(self) -> Submap | None:
         """The submap that scans are matched against, None before the first scan."""
+        self.settle()
         return self._maps[0] if self._maps else None
 
     def insert(self, state: JointState, points: Array, origin: Array) -> bool:
-        """Insert end points and sensor origin (base frame) where the robot has moved enough."""
+        """Insert end points and sensor origin (base frame) where the robot has moved enough.
+
+        The grids change by the next :meth:`settle`, and before anyone looks at them.
+        """
+        self.settle()
         pose = state.pose
         if self._last is not None:
             step = se2.between(self._last, pose)
@@ -48,8 +54,15 @@ class Submaps:
         points = thinning.thin(points, self._p.resolution, self._p.max_points)
         for slot, submap in enumerate(self._maps):
             T = se2.between(state.anchor(slot), pose)
-            submap.insert(se2.transform(T, points), se2.transform(T, origin[None])[0])
+            placed = se2.transform(T, points), se2.transform(T, origin[None])[0]
+            self._open.append((submap, *placed))
         return True
+
+    def settle(self) -> None:
+        """Carve the scan that was inserted last: this takes longest, and no pose needs it."""
+        for submap, points, origin in self._open:
+            submap.insert(points, origin)
+        self._open.clear()
 
     def _turn_over(self, state: JointState) -> None:
         """Retire a full submap, begin the next one at half of it."""
@@ -64,4 +77,5 @@ class Submaps:
 
     def cells(self) -> int:
         """Allocated grid cells, for the memory report."""
+        self.settle()
         return int(np.sum([m.values.size for m in self._maps]))

@@ -462,3 +462,29 @@ def test_a_moving_robot_is_as_uncertain_as_its_stamps_are():
     gone = late * speed * np.array([np.cos(along), np.sin(along)])
     np.testing.assert_allclose(added[-1][:2, :2], np.outer(gone, gone), atol=0.1 * gone @ gone)
     np.testing.assert_allclose(unsure[-1].T_map_base, sure[-1].T_map_base, atol=1e-12)
+
+
+# --- what can wait -----------------------------------------------------------------------------
+
+
+def test_when_a_scan_is_carved_changes_no_bit():
+    one, other = FrontEnd(Parameters()), FrontEnd(Parameters())
+    for o in observations(ROOM, CURVE):
+        a, b = one.process(o), other.process(o)
+        other.settle()
+        assert a.T_local_base.tobytes() == b.T_local_base.tobytes()
+        assert a.cov_local.tobytes() == b.cov_local.tobytes()
+    assert one.submaps.target.values.tobytes() == other.submaps.target.values.tobytes()
+    assert one.submaps.target.insertions > 10
+
+
+def test_grids_are_left_alone_until_the_frame_is_out_and_seen_with_the_scan():
+    front_end = FrontEnd(Parameters())
+    seen = observations(ROOM, CURVE)
+    front_end.process(next(iter(seen)))
+    submap = front_end.submaps._maps[0]
+    assert submap.insertions == 0
+    front_end.settle()
+    assert submap.insertions == 1
+    front_end.settle()
+    assert submap.insertions == 1
