@@ -23,7 +23,7 @@ from rlml_slam.se2 import Array
 
 OPEN = 1e-2  # [1/m², 1/rad²] an edge knows its directions to 10 m and 10 rad at the worst
 HELD = 1.0  # [m] a closure holds its place to this in any direction, or may be of another one
-PYRAMIDS = 16  # search pyramids kept: each is several times as large as its submap
+PYRAMIDS = 6  # search pyramids kept, more than are searched at a time: each is twice its submap
 
 
 SECOND, OPEN_WAY = 'a second place fits as well', 'the scan leaves a direction open'

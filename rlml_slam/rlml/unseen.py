@@ -38,17 +38,19 @@ def expected(
 def _passed(place: Array, points: Array, origin: Array, reach: float) -> NDArray[np.bool_]:
     """Whether beams towards each place (m, 2), seen from the laser, end there or behind."""
     out = np.zeros(len(place), dtype=np.bool_)
+    x, y = points[:, 0] - origin[0], points[:, 1] - origin[1]
+    ends = np.empty(len(points))  # along the way to the place; Inf of beams that go elsewhere
     for k in range(len(place)):
         far = math.hypot(place[k, 0], place[k, 1])
         if not DEPTH < far < reach:
             continue
         ux, uy = place[k, 0] / far, place[k, 1] / far
-        shortest = math.inf
         for n in range(len(points)):
-            x, y = points[n, 0] - origin[0], points[n, 1] - origin[1]
-            along = ux * x + uy * y
-            if abs(ux * y - uy * x) < BEAM * along:
-                shortest = min(shortest, along)
+            along = ux * x[n] + uy * y[n]
+            ends[n] = along if abs(ux * y[n] - uy * x[n]) < BEAM * along else math.inf
+        shortest = math.inf
+        for end in ends:
+            shortest = min(shortest, end)
         out[k] = far - DEPTH < shortest < math.inf
     return out
 
