@@ -31,13 +31,15 @@ def integrate(
 ) -> Array:
     """Compose control intervals (eq. 5, 7-9); all arguments ``(n,)``.
 
-    Returns ``(5, 3)``: the relative pose in row 0 (theta not wrapped), its covariance in rows 1-3,
-    its derivative by a bias of the turn rate in row 4 (``gyro`` is 1 where w is from the IMU).
+    Returns ``(6, 3)``: the relative pose in row 0 (theta not wrapped), its covariance in rows 1-3,
+    its derivative by a bias of the turn rate in row 4 (``gyro`` is 1 where w is from the IMU), and
+    in row 5 that by the share by which the wheels turn too little, where w is from them.
     The sideways variance ``var_lat`` is that of a velocity across the heading, which the notes'
     (v, omega) cannot express and which keeps the covariance regular.
     """
     x = y = th = 0.0
     bx = by = bt = 0.0
+    sx = sy = st = 0.0
     P = np.zeros((3, 3))
     for k in range(len(v)):
         h = dt[k]
@@ -63,15 +65,20 @@ def integrate(
         bx += gx * bt - gyro[k] * wx
         by += gy * bt - gyro[k] * wy
         bt -= gyro[k] * h
+        more = (1.0 - gyro[k]) * w[k]
+        sx += gx * st + more * wx
+        sy += gy * st + more * wy
+        st += more * h
         x += d * c
         y += d * s
         th += w[k] * h
-    out = np.empty((5, 3))
+    out = np.empty((6, 3))
     out[0, 0], out[0, 1], out[0, 2] = x, y, th
     out[1, 0], out[1, 1], out[1, 2] = P[0, 0], P[0, 1], P[0, 2]
     out[2, 0], out[2, 1], out[2, 2] = P[0, 1], P[1, 1], P[1, 2]
     out[3, 0], out[3, 1], out[3, 2] = P[0, 2], P[1, 2], P[2, 2]
     out[4, 0], out[4, 1], out[4, 2] = bx, by, bt
+    out[5, 0], out[5, 1], out[5, 2] = sx, sy, st
     return out
 
 
@@ -81,17 +88,21 @@ def compose_motion(first: Motion, second: Motion) -> Motion:
         return second
     J_a, J_b = se2.compose_jacobians(first.delta, second.delta)
     cov = J_a @ first.cov @ J_a.T + J_b @ second.cov @ J_b.T
-    gain = J_a @ first.bias_gain + J_b @ second.bias_gain
+    bias_gain = J_a @ first.bias_gain + J_b @ second.bias_gain
+    turn_gain = J_a @ first.turn_gain + J_b @ second.turn_gain
     # what the two say of the bias, weighted; the weight of one that says nothing is zero
     weight = 1.0 / first.bias_var + 1.0 / second.bias_var
-    weighted = first.bias / first.bias_var + second.bias / second.bias_var
+    var = 1.0 / weight if weight > 0.0 else math.inf
+    w_a, w_b = (var / m.bias_var if weight > 0.0 else 0.0 for m in (first, second))
     return Motion(
         se2.compose(first.delta, second.delta),
         cov,
         first.known and second.known,
-        gain,
-        weighted / weight if weight > 0.0 else 0.0,
-        1.0 / weight if weight > 0.0 else math.inf,
+        bias_gain,
+        w_a * first.bias + w_b * second.bias,
+        var,
+        turn_gain,
+        w_a * first.bias_turn + w_b * second.bias_turn,
     )
 
 
@@ -125,8 +136,8 @@ def _drive(
     imu_stamps: Stamps,
     rates: Array,
     n: _Noise,
-) -> tuple[Array, bool, float, float]:
-    """Motion between two stamps: that of integrate(), known, bias and its variance.
+) -> tuple[Array, bool, float, float, float]:
+    """Motion between two stamps: that of integrate(), known, bias, its variance, bias_turn.
 
     ``v``, ``w`` (k,) are the velocities of the intervals that end at the odometry's ``stamps``,
     ``rates`` those measured by the IMU at its own. Between two stamps of either, the control is
@@ -147,7 +158,7 @@ def _drive(
     cuts[m] = end
     rows = np.empty((7, m))
     all_known = True
-    weight = weighted = 0.0
+    weight = weighted = turned = 0.0
     for k in range(m):
         dt = (cuts[k + 1] - cuts[k]) / SECOND
         middle = (cuts[k] + cuts[k + 1]) // 2
@@ -186,10 +197,11 @@ def _drive(
         if says_bias:
             weight += 1.0 / (bias_sigma**2 * scale)
             weighted += bias / (bias_sigma**2 * scale)
+            turned += gyro * rate / (bias_sigma**2 * scale)
     out = integrate(rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6])
     if weight > 0.0:
-        return out, all_known, weighted / weight, 1.0 / weight
-    return out, all_known, 0.0, np.inf
+        return out, all_known, weighted / weight, 1.0 / weight, turned / weight
+    return out, all_known, 0.0, np.inf, 0.0
 
 
 @part
@@ -303,7 +315,8 @@ class MotionBuffer:
         if has_gyro:
             cov[2, 2] = unmeasured.cov[2, 2]
         delta = se2.exp(np.array([v * coasted, 0.0, turn]))
-        rest = Motion(delta, cov, known=False, bias_gain=unmeasured.bias_gain)
+        turn_gain = np.zeros(3) if has_gyro else np.array([0.0, 0.0, turn])
+        rest = Motion(delta, cov, False, unmeasured.bias_gain, turn_gain=turn_gain)
         return compose_motion(covered, rest)
 
     def forget_after(self, stamp: int) -> None:
@@ -341,7 +354,7 @@ class MotionBuffer:
             return STILL
         odometry = _around(self._stamps, start, end)
         imu = _around(self._imu_stamps, start, end)
-        out, known, bias, variance = _drive(
+        out, known, bias, variance, turned = _drive(
             start, end,
             np.array(self._stamps[odometry], dtype=np.int64),
             np.array(self._v[odometry], dtype=np.float64),
@@ -351,7 +364,7 @@ class MotionBuffer:
             self._noise_values,
         )  # fmt: skip
         out[0, 2] = se2.wrapped(out[0, 2])
-        return Motion(out[0], out[1:4], known, out[4], bias, variance)
+        return Motion(out[0], out[1:4], known, out[4], bias, variance, out[5], turned)
 
 
 def warm_up() -> None:

@@ -178,6 +178,16 @@ class MotionNoise(Group):
     imu_d: float = param(0.003, "the IMU's turn rate noise floor", 'rad/s', 0.0, 10.0)
     imu_bias: float = param(0.02, "the IMU's bias at start, 1 sigma", 'rad/s', 0.0, 10.0)
     imu_bias_walk: float = param(2e-4, "random walk of the IMU's bias", 'rad/s/sqrt(s)', 0.0, 1.0)
+    wheels: tuple[float, ...] = param(
+        (0.03, 0.05),
+        'share by which odometry errs in speed and in turn for a long time, 1 sigma; 0: never',
+        '',
+        0.0,
+        1.0,
+    )
+    wheels_time: float = param(
+        600.0, 'time in which that is another one: load, floor, tyres', 's', 1.0, 1e6
+    )
     interval: float = param(0.1, 'control interval that a, b, c, d are given for', 's', 1e-3, 10.0)
     guess: float = param(
         0.2,
@@ -602,6 +612,9 @@ class Ekf(Group):
     line_origin: tuple[float, ...] = param(
         (0.0, 0.0), 'fixed point of the map; a line is its point nearest to this', 'm, m'
     )
+    smooth: bool = param(
+        True, 'replay: path and map are smoothed in the end, by what was measured later as well'
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

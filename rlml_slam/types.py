@@ -77,6 +77,11 @@ class Motion:
     cov is wide. Where the turn rate is the IMU's, ``bias_gain`` (3,) is d delta / d bias, delta
     being that of a bias of zero; ``bias`` [rad/s] is what IMU and wheels together say of it, with
     variance ``bias_var``, infinite without an IMU.
+
+    Wheels tell speed and turn but for a scale: the true ones are larger by a share of them, which
+    ``delta`` is without. Where the turn is the wheels', ``turn_gain`` (3,) is d delta / d share of
+    turn; where it is the IMU's, ``bias`` is that and ``bias_turn`` [rad/s] times that share. The
+    share of speed needs no gain: the way (x, y) is its own derivative.
     """
 
     delta: Array
@@ -85,6 +90,8 @@ class Motion:
     bias_gain: Array = field(default_factory=lambda: np.zeros(3))
     bias: float = 0.0
     bias_var: float = np.inf
+    turn_gain: Array = field(default_factory=lambda: np.zeros(3))
+    bias_turn: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -100,6 +100,34 @@ def test_bias_gain_is_the_derivative_by_the_gyros_bias():
     assert abs(gain[2]) > 0.1
 
 
+def test_turn_gain_is_the_derivative_by_what_the_wheels_turn_too_little():
+    rng = np.random.default_rng(4)
+    v, w, dt = rng.normal(0.5, 1.0, 7), rng.normal(0.0, 1.0, 7), rng.uniform(0.05, 0.3, 7)
+    gyro = np.array([1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0])
+    zero = np.zeros(7)
+
+    def moved(share):
+        wheels = 1.0 + (1.0 - gyro) * share[0]
+        return integrate(v, wheels * w, dt, zero, zero, zero, gyro)[0]
+
+    gain = central_differences(moved, np.zeros(1))[:, 0]
+    out = integrate(v, w, dt, zero, zero, zero, gyro)
+    np.testing.assert_allclose(out[5], gain, atol=1e-8)
+    assert np.abs(gain).min() > 0.01
+
+
+def test_way_is_its_own_derivative_by_the_share_of_speed():
+    rng = np.random.default_rng(5)
+    v, w, dt = rng.normal(0.5, 1.0, 7), rng.normal(0.0, 1.0, 7), rng.uniform(0.05, 0.3, 7)
+    zero = np.zeros(7)
+
+    def moved(share):
+        return integrate((1.0 + share[0]) * v, w, dt, zero, zero, zero, zero)[0]
+
+    gain = central_differences(moved, np.zeros(1))[:, 0]
+    np.testing.assert_allclose(gain, [*moved(np.zeros(1))[:2], 0.0], atol=1e-8)
+
+
 def test_covariance_is_that_of_sampled_noise():
     rng = np.random.default_rng(2)
     n, samples = 10, 4000
@@ -124,16 +152,17 @@ def test_composition_is_the_integration_in_parts():
     rows = np.vstack(
         [
             rng.normal(0.5, 1.0, 8), rng.normal(0.0, 2.0, 8), rng.uniform(0.01, 0.3, 8),
-            rng.uniform(0.0, 0.1, (3, 8)), np.ones((1, 8)),
+            rng.uniform(0.0, 0.1, (3, 8)), np.array([[1.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 0.0]]),
         ]
     )  # fmt: skip
     parts = [integrate(*np.ascontiguousarray(r)) for r in (rows, rows[:, :3], rows[:, 3:])]
-    both, a, b = (Motion(p[0], p[1:4], True, p[4]) for p in parts)
+    both, a, b = (Motion(p[0], p[1:4], True, p[4], turn_gain=p[5]) for p in parts)
     c = compose_motion(a, b)
     np.testing.assert_allclose(c.delta[:2], both.delta[:2], atol=1e-12)
     assert abs(se2.wrap(c.delta[2] - both.delta[2])) < 1e-12
     np.testing.assert_allclose(c.cov, both.cov, atol=1e-12)
     np.testing.assert_allclose(c.bias_gain, both.bias_gain, atol=1e-12)
+    np.testing.assert_allclose(c.turn_gain, both.turn_gain, atol=1e-12)
 
 
 def test_composition_weighs_what_its_parts_say_of_the_bias():
@@ -143,20 +172,24 @@ def test_composition_weighs_what_its_parts_say_of_the_bias():
     parts = compose_motion(buffer.motion(a, b), buffer.motion(b, c))
     assert parts.bias == pytest.approx(whole.bias, rel=1e-9)
     assert parts.bias_var == pytest.approx(whole.bias_var, rel=1e-9)
+    assert parts.bias_turn == pytest.approx(whole.bias_turn, rel=1e-9)
     silent = Motion(np.zeros(3), np.zeros((3, 3)))
     assert compose_motion(silent, silent).bias_var == math.inf
 
 
 def test_standing_still_is_the_identity_of_composition():
     m = Motion(
-        np.array([1.0, 0.2, 0.3]), np.diag([1.0, 2.0, 3.0]), True, np.arange(3.0), 0.01, 1e-4
-    )
+        np.array([1.0, 0.2, 0.3]), np.diag([1.0, 2.0, 3.0]), True, np.arange(3.0), 0.01, 1e-4,
+        np.array([0.1, -0.2, 0.3]), 0.4,
+    )  # fmt: skip
     for c in (compose_motion(STILL, m), compose_motion(m, STILL)):
         np.testing.assert_allclose(c.delta, m.delta)
         np.testing.assert_allclose(c.cov, m.cov)
         np.testing.assert_allclose(c.bias_gain, m.bias_gain)
         assert c.bias == pytest.approx(m.bias)
         assert c.bias_var == pytest.approx(m.bias_var)
+        np.testing.assert_allclose(c.turn_gain, m.turn_gain)
+        assert c.bias_turn == pytest.approx(m.bias_turn)
     unknown = Motion(np.zeros(3), np.eye(3), known=False)
     assert not compose_motion(m, unknown).known
     assert not compose_motion(unknown, m).known
@@ -251,8 +284,10 @@ def test_turn_rate_is_the_imus_where_there_is_one():
     sigma = NOISE.imu_c * 0.7 + NOISE.imu_d
     assert m.cov[2, 2] == pytest.approx(sigma**2 * NOISE.interval * 1.0, rel=1e-6)
     assert m.bias_gain[2] == pytest.approx(-1.0)
+    np.testing.assert_array_equal(m.turn_gain, 0.0)
     # what wheels and IMU differ by is the bias, as well as both tell
     assert m.bias == pytest.approx(0.2, rel=1e-6)
+    assert m.bias_turn == pytest.approx(0.7, rel=1e-6)
     wheels = NOISE.c * 0.5 + NOISE.d
     assert m.bias_var == pytest.approx((sigma**2 + wheels**2) * NOISE.interval, rel=1e-6)
 
@@ -268,6 +303,7 @@ def test_standing_wheels_show_the_bias_and_the_robot_does_not_turn():
     np.testing.assert_array_equal(m.delta, 0.0)
     np.testing.assert_array_equal(m.bias_gain, 0.0)
     assert m.bias == pytest.approx(0.03)
+    assert m.bias_turn == 0.0
     assert m.bias_var < 1e-4
 
 
@@ -278,6 +314,7 @@ def test_gap_of_the_imu_is_bridged_by_the_wheels():
     m = buffer.motion(T0 + 2 * SECOND, T0 + 3 * SECOND)
     assert m.delta[2] == pytest.approx(0.5)
     assert m.bias_gain[2] == 0.0
+    assert m.turn_gain[2] == pytest.approx(0.5)
 
 
 # --- gaps, jumps, ends -------------------------------------------------------------------------

@@ -22,11 +22,13 @@ from rlml_slam import se2
 from rlml_slam.ekf.association import compatible_ids
 from rlml_slam.ekf.candidates import Candidates
 from rlml_slam.ekf.extraction import Measured
-from rlml_slam.ekf.filter import Filter
+from rlml_slam.ekf.filter import BIAS, ROBOT, Filter
 from rlml_slam.ekf.likelihood import SAME_PLACE, log_density
 from rlml_slam.ekf.matching import Matcher
 from rlml_slam.ekf.models import POINT
+from rlml_slam.ekf.smoother import Sight, Step
 from rlml_slam.matching.hypotheses import GATE, OUTLIER, TOGETHER, UNKNOWN
+from rlml_slam.motion import STILL
 from rlml_slam.params import EkfParameters
 from rlml_slam.rlml.tracks import Tracks
 from rlml_slam.se2 import Array
@@ -45,6 +47,7 @@ class Path:
     stamp: int
     pose: Array
     before: Path | None
+    step: Step | None = None
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,8 @@ class Branch:
         self.apart: frozenset[tuple[int, int]] = frozenset()
         self.weight = 0.0
         self.path: Path | None = None
+        self.renamed: dict[int, int] = {}
+        self._step = Step(STILL, 0.0, 1.0)
         self.looked = Looked.nothing()
         self._region: Array | None = None
         self._radius = self._reach = 0.0
@@ -102,6 +107,7 @@ class Branch:
         out.filter = _copy(self.filter)
         out.candidates = _copy(self.candidates)
         out.tracks = _copy(self.tracks)
+        out.renamed = self.renamed.copy()
         return out
 
     def use_map(self, reflectors: Reflectors) -> None:
@@ -124,11 +130,39 @@ class Branch:
             t.ids.copy(), t.sightings.copy(), t.diameters.copy(),
         )  # fmt: skip
 
-    def predict(self, motion: Motion, walk: float) -> None:
-        """Step 1: odometry."""
+    def predict(self, motion: Motion, walk: float, kept: float) -> None:
+        """Step 1: odometry; ``walk`` and ``kept`` as :meth:`Filter.predict` takes them."""
         self.looked = Looked.nothing()
-        self.filter.predict(motion, walk)
-        self.candidates.move(motion.delta + motion.bias_gain * self.filter.x[3], motion.cov)
+        f = self.filter
+        delta, gains = f.corrected(motion)
+        lasting = gains @ f.P[BIAS:ROBOT, BIAS:ROBOT] @ gains.T
+        f.predict(motion, walk, kept)
+        self.candidates.move(delta, motion.cov + lasting)
+        self._step = Step(motion, walk, kept)
+
+    def log(self, stamp: int, steps: bool) -> None:
+        """Remember the pose, and ``steps``, what it comes from."""
+        step = self._step if steps else None
+        self.path = Path(stamp, self.filter.pose, self.path, step)
+
+    def steps(self) -> list[Step]:
+        """What the path comes from, the first one first, with the keys that landmarks have now."""
+        out, node = [], self.path
+        while node is not None and node.step is not None:
+            now = (dataclasses.replace(s, key=self._key_now(s.key)) for s in node.step.sights)
+            out.append(dataclasses.replace(node.step, sights=tuple(now)))
+            node = node.before
+        out.reverse()
+        return out
+
+    def _key_now(self, key: int) -> int:
+        while key in self.renamed:
+            key = self.renamed[key]
+        return key
+
+    def _log_sight(self, key: int, z: Array, R: Array) -> None:
+        sights = (*self._step.sights, Sight(key, z, R))
+        self._step = dataclasses.replace(self._step, sights=sights)
 
     def look(self, look: Look) -> list[Branch]:
         """Steps 2 and 3: update with what is known, count what is new; the branches after it."""
@@ -187,6 +221,7 @@ class Branch:
             if seen.detections.ids[i] == ANONYMOUS:
                 R = R / max(look.worth, SAME_PLACE)
         self.filter.update(slot, seen.z[i], R)
+        self._log_sight(int(self.tracks.keys[number]), seen.z[i], R)
         self.tracks.see(np.array([number]), look.stamp, seen.detections.ids[[i]])
 
     def _evidence(self, seen: Measured, slots: NDArray[np.int64]) -> float:
@@ -238,6 +273,7 @@ class Branch:
         self.tracks.append(look.stamp, int(d.ids[i]), float(d.diameters[i]))
         self.tracks.keys[-1], self.tracks.sightings[-1] = look.key_of(i), n
         self._note(i, look.key_of(i))
+        self._log_sight(look.key_of(i), look.seen.z[i], look.seen.R[i])
         return out
 
     def _note(self, i: int, key: int) -> None:
@@ -303,6 +339,7 @@ class Branch:
         t.sightings[a] += t.sightings[b]
         t.last_seen[a] = max(t.last_seen[a], t.last_seen[b])
         t.keep(np.arange(len(t)) != b)
+        self.renamed[gone] = known
         renamed = (sorted(known if k == gone else k for k in pair) for pair in self.apart)
         self.apart = frozenset((i, j) for i, j in renamed)
 

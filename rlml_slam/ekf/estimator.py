@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.ekf.branch import Branch, Look, Looked, Path
+from rlml_slam.ekf.branch import Branch, Look, Looked
 from rlml_slam.ekf.extraction import Measured, measure
 from rlml_slam.ekf.filter import Filter
 from rlml_slam.ekf.likelihood import ALIKE
 from rlml_slam.ekf.matching import Matcher
 from rlml_slam.ekf.models import POINT, line_model
+from rlml_slam.ekf.smoother import Smoothed, Start, smooth
 from rlml_slam.maps.occupancy import OccupancyGrid, render
 from rlml_slam.params import EkfParameters
 from rlml_slam.rlml.confirmation import START_SIGMA, Confirmation
@@ -42,8 +43,10 @@ MAP_TRAVEL, MAP_TURN = 0.3, 0.25  # [m], [rad] between two scans that are drawn 
 class Estimator:
     """Filters and results; ``process`` is the system. One branch as long as all can be told."""
 
-    def __init__(self, params: EkfParameters) -> None:
+    def __init__(self, params: EkfParameters, keep_steps: bool = False) -> None:
+        """``keep_steps``: what the path comes from is kept, to be smoothed in the end."""
         self._p = params
+        self._keeps_steps = keep_steps
         e = params.ekf
         self.model = line_model(np.array(e.line_origin)) if e.extractor == 'lines' else POINT
         self._matcher = Matcher(params)
@@ -53,7 +56,9 @@ class Estimator:
         """Forget everything and start at a pose (3,) of the map with covariance (3, 3)."""
         # a line is no point that turns with the rest
         invariant = self._p.ekf.error == 'invariant' and self.model is POINT
-        filter_ = Filter(pose, cov, self._p.motion.imu_bias, self.model, invariant)
+        m = self._p.motion
+        filter_ = Filter(pose, cov, m.imu_bias, self.model, invariant, m.wheels)
+        self._start = Start(filter_.x.copy(), filter_.P.copy())
         self.branches = [Branch(self._p, self._matcher, filter_)]
         self.health = HealthMonitor(self._p.health)
         self.confirmation = Confirmation(self._p)
@@ -63,7 +68,7 @@ class Estimator:
         self._since = np.zeros(2)  # way and turn since something was last seen
         self._next_key = 0
         self._last_used = 0
-        self._drawn: list[tuple[Array, Array, Array]] = []
+        self._drawn: list[tuple[int, Array, Array, Array]] = []
 
     @property
     def filter(self) -> Filter:
@@ -79,6 +84,7 @@ class Estimator:
             self.reset(self.filter.pose, np.diag(START_SIGMA**2))
         self.confirmation.begin()
         self._mapping = False
+        self._keeps_steps = False  # the map is not of this drive
         for branch in self.branches:
             branch.use_map(reflectors)
 
@@ -90,7 +96,7 @@ class Estimator:
         if seen is not None:
             self._look(seen, observation.stamp)
         for branch in self.branches:
-            branch.path = Path(observation.stamp, branch.filter.pose, branch.path)
+            branch.log(observation.stamp, self._keeps_steps)
         self._draw(observation)
         return self._frame(observation, seen, self.branches[0].looked, began)
 
@@ -102,8 +108,9 @@ class Estimator:
         if self._last_stamp is not None:
             dt = (observation.stamp - self._last_stamp) * 1e-9
         self._last_stamp = observation.stamp
+        m = self._p.motion
         for branch in self.branches:
-            branch.predict(motion, self._p.motion.imu_bias_walk**2 * dt)
+            branch.predict(motion, m.imu_bias_walk**2 * dt, math.exp(-dt / m.wheels_time))
         self._since += [np.hypot(motion.delta[0], motion.delta[1]), abs(motion.delta[2])]
 
     def _look(self, seen: Measured, stamp: int) -> None:
@@ -133,11 +140,11 @@ class Estimator:
             return
         pose = self.filter.pose
         if self._drawn:
-            last = self._drawn[-1][0]
+            last = self._drawn[-1][1]
             moved = np.hypot(*(pose[:2] - last[:2])) >= MAP_TRAVEL
             if not moved and abs(np.sin(0.5 * (pose[2] - last[2]))) < np.sin(0.5 * MAP_TURN):
                 return
-        self._drawn.append((pose, observation.points, observation.origin))
+        self._drawn.append((observation.stamp, pose, observation.points, observation.origin))
 
     def _frame(
         self,
@@ -191,6 +198,13 @@ class Estimator:
             np.array([p.pose for p in path]).reshape(-1, 3),
         )
 
+    def smoothed(self) -> Smoothed | None:
+        """The likeliest branch's path by all measurements, None where its steps were not kept."""
+        steps = self.branches[0].steps()
+        if not steps:
+            return None
+        return smooth(self._start, steps, self.model, self.trajectory()[1])
+
     def reflectors(self) -> Reflectors:
         """All landmarks of the state, in the map frame."""
         return self.branches[0].reflectors()
@@ -208,12 +222,16 @@ class Estimator:
             out += w * (b.filter.pose_cov + np.outer(d, d))
         return out
 
-    def occupancy_grid(self) -> OccupancyGrid | None:
-        """The kept scans at the poses of their time, None without any."""
-        kept = [d for d in self._drawn if len(d[1])]
+    def occupancy_grid(
+        self, path: tuple[NDArray[np.int64], Array] | None = None
+    ) -> OccupancyGrid | None:
+        """The kept scans at the poses of their time, or of a ``path``; None without any."""
+        kept = [d for d in self._drawn if len(d[2])]
         if not kept:
             return None
-        poses, points, origins = zip(*kept, strict=True)
+        stamps, poses, points, origins = zip(*kept, strict=True)
+        if path is not None:
+            poses = tuple(path[1][np.searchsorted(path[0], stamps)])
         resolution = self._p.back_end.resolution
         return render(np.array(poses), list(points), list(origins), resolution)
 

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The filter: predict, update, augment, over the landmarks near the robot; the others later.
 
-State (x, y, theta, b, x_1, y_1, ...): the note's, with the bias b of the gyro, which stays where
-it is without an IMU. Only the robot and the landmarks of a local region are worked on. What an
-update means for the landmarks beyond it is collected in three small matrices and applied when the
-region changes (compressed filter: Guivant, Nebot 2001), which gives the same state exactly.
+State (x, y, theta, b, s, t, x_1, y_1, ...): the note's, with the bias b of the gyro, which stays
+where it is without an IMU, and the shares s and t by which the robot is faster and turns more than
+its wheels tell: radius and track of wheels, and what they slip on a floor, err for long. Only the
+robot and the landmarks of a local region are worked on. What an update means for the landmarks
+beyond it is collected in three small matrices and applied when the region changes (compressed
+filter: Guivant, Nebot 2001), which gives the same state exactly.
 
 The note's filter believes that it knows its heading in the map from landmarks alone, which it
 cannot: turning everything about the origin changes no measurement, but once the estimate has moved
@@ -15,6 +17,8 @@ along with the heading by which the error is turned, and is consistent there.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,21 +27,29 @@ from rlml_slam.ekf.models import Model
 from rlml_slam.se2 import Array
 from rlml_slam.types import Motion
 
-BIAS, ROBOT = 3, 4
+BIAS, SPEED, TURN, ROBOT = 3, 4, 5, 6
+WHEELS = slice(SPEED, TURN + 1)
 JOINED = 1e-3  # [m] what the places of one landmark may differ by
 PENDING = 128  # updates whose share in Psi is summed up at once
 
 
 class Filter:
-    """Mean ``x`` (4 + 2a,) and covariance ``P`` of robot and local landmarks ``local`` (a,).
+    """Mean ``x`` (6 + 2a,) and covariance ``P`` of robot and local landmarks ``local`` (a,).
 
     Landmarks are numbered 0, 1, ... in the order they were added; those not in ``local`` are as
     of the last :meth:`settle`. In a filter whose region is never chosen all landmarks are local.
     """
 
     def __init__(
-        self, pose: Array, cov: Array, bias_sigma: float, model: Model, invariant: bool = False
+        self,
+        pose: Array,
+        cov: Array,
+        bias_sigma: float,
+        model: Model,
+        invariant: bool = False,
+        wheels: Sequence[float] = (0.0, 0.0),
     ) -> None:
+        """``wheels`` (2,): 1 sigma of the shares; with zeros, the filter without them."""
         self.model = model
         self.invariant = invariant
         self.x = np.zeros(ROBOT)
@@ -45,6 +57,8 @@ class Filter:
         self.P = np.zeros((ROBOT, ROBOT))
         self.P[:3, :3] = cov
         self.P[BIAS, BIAS] = bias_sigma**2
+        self._wheels2 = np.diag(np.square(wheels))
+        self.P[WHEELS, WHEELS] = self._wheels2
         self.local = np.zeros(0, dtype=np.int64)
         self.num_landmarks = 0
         self._others = np.zeros(0, dtype=np.int64)
@@ -57,37 +71,49 @@ class Filter:
 
     # --- step 1 ----------------------------------------------------------------------------
 
-    def predict(self, motion: Motion, walk: float = 0.0) -> None:
+    def predict(self, motion: Motion, walk: float = 0.0, kept: float = 1.0) -> None:
         """Move the robot: P_rr <- A P_rr A^T + Q, P_ri <- A P_ri (eq. 7, 8), in O(n).
 
-        Q = W C W^T is the motion's covariance turned into the map. ``walk``: variance that the
-        gyro's bias gained meanwhile.
+        Q = W C W^T is the motion's covariance turned into the map. Meanwhile the gyro's bias
+        gained the variance ``walk``, and of what the wheels err by a share of ``kept`` is left,
+        the rest is new (Gauss-Markov process).
         """
         if np.isfinite(motion.bias_var):
-            self._measure_bias(motion.bias, motion.bias_var)
-        gain = motion.bias_gain
-        delta = motion.delta + gain * self.x[BIAS]
+            self._measure_bias(motion)
+        delta, gains = self.corrected(motion)
         J_a, J_b = se2.compose_jacobians(self.x[:3], delta)
         self.x[:3] = se2.compose(self.x[:3], delta)
+        self.x[WHEELS] *= kept
         A = np.eye(ROBOT)
         A[:3, :3] = J_a
-        A[:3, BIAS] = J_b @ gain
+        A[:3, BIAS:ROBOT] = J_b @ gains
+        A[WHEELS, WHEELS] *= kept
         P = self.P
         P[:ROBOT, ROBOT:] = A @ P[:ROBOT, ROBOT:]
         P[ROBOT:, :ROBOT] = P[:ROBOT, ROBOT:].T
         rr = A @ P[:ROBOT, :ROBOT] @ A.T
         rr[:3, :3] += J_b @ motion.cov @ J_b.T
         rr[BIAS, BIAS] += walk
+        rr[WHEELS, WHEELS] += (1.0 - kept**2) * self._wheels2
         P[:ROBOT, :ROBOT] = 0.5 * (rr + rr.T)
         if self._phi is not None:
             self._phi[:ROBOT] = A @ self._phi[:ROBOT]
 
-    def _measure_bias(self, bias: float, variance: float) -> None:
+    def corrected(self, motion: Motion) -> tuple[Array, Array]:
+        """The motion (3,) by what is known of gyro and wheels; d motion / d (b, s, t) (3, 3)."""
+        delta = motion.delta + motion.bias_gain * self.x[BIAS] + motion.turn_gain * self.x[TURN]
+        way, faster = np.array([delta[0], delta[1], 0.0]), 1.0 + self.x[SPEED]
+        scale = np.array([faster, faster, 1.0])
+        gains = np.stack([scale * motion.bias_gain, way, scale * motion.turn_gain], axis=1)
+        return scale * delta, gains
+
+    def _measure_bias(self, motion: Motion) -> None:
         """What IMU and wheels together say of the bias, gated against slip."""
-        error = bias - float(self.x[BIAS])
-        if error * error < 16.0 * (float(self.P[BIAS, BIAS]) + variance):
-            column = np.array([BIAS])
-            self.apply(column, np.ones((1, 1)), np.array([[variance]]), np.array([error]))
+        columns, H = np.array([BIAS, TURN]), np.array([[1.0, motion.bias_turn]])
+        error = motion.bias - float(H[0] @ self.x[columns])
+        variance = float(H[0] @ self.P[np.ix_(columns, columns)] @ H[0]) + motion.bias_var
+        if error * error < 16.0 * variance:
+            self.apply(columns, H, np.array([[motion.bias_var]]), np.array([error]))
 
     # --- step 2 ----------------------------------------------------------------------------
 

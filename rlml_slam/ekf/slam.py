@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.ekf.estimator import Estimator
+from rlml_slam.ekf.smoother import Smoothed
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import EkfParameters
 from rlml_slam.se2 import Array
@@ -17,16 +19,18 @@ from rlml_slam.types import Frame, Observation, Reflectors
 
 
 class EkfSlam(Driven):
-    """Sequencer and filter."""
+    """Sequencer and filter; what is told in the end is smoothed, frames are as they were live."""
 
     def __init__(self, params: EkfParameters) -> None:
         super().__init__(params)
-        self.estimator = Estimator(params)
+        self.estimator = Estimator(params, params.ekf.smooth)
+        self._smoothed: Smoothed | None = None
 
     def finish(self) -> list[Frame]:
-        """Everything that still waits."""
+        """Everything that still waits; then the path is smoothed."""
         frames = self.process(self.sequencer.flush())
         self.estimator.filter.settle()
+        self._smoothed = self.estimator.smoothed()
         return frames
 
     def process(self, observations: Iterable[Observation]) -> list[Frame]:
@@ -34,13 +38,21 @@ class EkfSlam(Driven):
         return [self.estimator.process(o) for o in observations]
 
     def trajectory(self) -> tuple[NDArray[np.int64], Array]:
-        """Stamps (n,) and poses (n, 3) of the likeliest branch, as they were estimated live."""
-        return self.estimator.trajectory()
+        """Stamps (n,) and poses (n, 3) of the likeliest branch, by all that was measured.
+
+        As they were estimated live before the end, and where ``ekf.smooth`` is false.
+        """
+        stamps, poses = self.estimator.trajectory()
+        return stamps, poses if self._smoothed is None else self._smoothed.states[:, :3].copy()
 
     def reflectors(self) -> Reflectors:
-        """The landmarks of the state."""
-        return self.estimator.reflectors()
+        """The landmarks of the state, where the smoothed path has them."""
+        found = self.estimator.reflectors()
+        if self._smoothed is None:
+            return found
+        at = np.searchsorted(self._smoothed.keys, found.keys)
+        return dataclasses.replace(found, points=self._smoothed.points[at])
 
     def occupancy_grid(self) -> OccupancyGrid | None:
-        """The scans drawn at the poses of their time, None without any."""
-        return self.estimator.occupancy_grid()
+        """The scans drawn along the trajectory, None without any."""
+        return self.estimator.occupancy_grid(self.trajectory())

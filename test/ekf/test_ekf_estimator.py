@@ -53,15 +53,20 @@ def detections(stamp, pose, ids, rng=None):
     )
 
 
-def drive(p, rng=None, ids=False, steps=STEPS, q=Q):
-    """Frames and true poses of a drive; the wheels' and the sensor's noise only with ``rng``."""
+def drive(p, rng=None, ids=False, steps=STEPS, q=Q, wheels=(0.0, 0.0)):
+    """Frames and true poses of a drive; the wheels' and the sensor's noise only with ``rng``.
+
+    ``wheels``: by what share the robot is faster, and turns more, than they tell.
+    """
     estimator, pose, frames, truth = Estimator(p), np.zeros(3), [], []
     for k in range(steps):
         moved = STEP if k else np.zeros(3)
         if rng is not None and k:
+            moved = moved * [1.0 + wheels[0], 1.0, 1.0 + wheels[1]]
             moved = moved + np.sqrt(np.diag(q)) * rng.standard_normal(3)
         pose = se2.compose(pose, moved)
-        motion = Motion(STEP if k else np.zeros(3), q if k else np.zeros((3, 3)))
+        turn = STEP * [0.0, 0.0, 1.0]
+        motion = Motion(STEP, q, turn_gain=turn) if k else Motion(np.zeros(3), np.zeros((3, 3)))
         stamp = (k + 1) * 100_000_000
         seen = detections(stamp, pose, ids, rng)
         frames.append(estimator.process(Observation(stamp, motion, detections=seen)))
@@ -88,7 +93,8 @@ def test_pose_is_consistent_around_the_first_loop_with_known_associations():
     runs = 8
     nees = []
     for seed in range(runs):
-        _, frames, truth = drive(params(), np.random.default_rng(seed), ids=True)
+        p = from_mapping({'motion.wheels': (0.0, 0.0)}, EkfParameters)
+        _, frames, truth = drive(p, np.random.default_rng(seed), ids=True)
         e = np.array([f.T_map_base for f in frames]) - truth
         e[:, 2] = se2.wrap(e[:, 2])
         # the first pose is the map's: it has neither error nor covariance
@@ -102,6 +108,27 @@ def test_pose_is_consistent_around_the_first_loop_with_known_associations():
     dof = 3 * runs * 4
     low, high = chi2.ppf([0.025, 0.975], dof) / (runs * 4)
     assert low < np.mean(nees) < high
+
+
+def test_pose_is_consistent_where_wheels_err_for_long():
+    """As for wheels that do not; a filter that does not know of it believes far too much."""
+    runs, sigma, nees = 12, (0.1, 0.2), {}
+    for known in (True, False):
+        p = from_mapping({'motion.wheels': sigma if known else (0.0, 0.0)}, EkfParameters)
+        out = []
+        for seed in range(runs):
+            rng = np.random.default_rng(seed)
+            wheels = sigma * rng.standard_normal(2)
+            _, frames, truth = drive(p, rng, ids=True, wheels=wheels)
+            e = np.array([f.T_map_base for f in frames]) - truth
+            e[:, 2] = se2.wrap(e[:, 2])
+            P = np.array([f.cov_map for f in frames])
+            out.append((e[1:] * np.linalg.solve(P[1:], e[1:, :, None])[..., 0]).sum(axis=1))
+        nees[known] = np.mean(out)
+    dof = 3 * runs * 4
+    low, high = chi2.ppf([0.025, 0.975], dof) / (runs * 4)
+    assert low < nees[True] < high
+    assert nees[False] > 2.0 * high
 
 
 def test_anonymous_detections_find_every_landmark_and_no_other():

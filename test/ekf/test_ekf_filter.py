@@ -6,7 +6,7 @@ import pytest
 from differences import central_differences
 
 from rlml_slam import se2
-from rlml_slam.ekf.filter import JOINED, ROBOT, Filter
+from rlml_slam.ekf.filter import BIAS, JOINED, ROBOT, SPEED, TURN, WHEELS, Filter
 from rlml_slam.ekf.models import POINT, line_model
 from rlml_slam.types import Motion
 
@@ -41,6 +41,51 @@ def test_predict_is_the_full_matrix_equation_with_numeric_jacobians():
     assert np.allclose(f.x[:3], move(x, motion.delta), atol=1e-14)
     assert np.abs(f.P - (A @ P @ A.T + B @ Q @ B.T)).max() < 1e-9
     assert is_covariance(f.P)
+
+
+def test_wheels_that_err_are_moved_by_with_numeric_jacobians():
+    rng = np.random.default_rng(3)
+    f = Filter(POSE, COV, 0.02, POINT, wheels=(0.1, 0.2))
+    for _ in range(4):
+        f.augment(np.array([rng.uniform(1.0, 6.0), rng.uniform(-3.0, 3.0)]), R)
+    motion = Motion(
+        np.array([0.5, -0.03, 0.2]), Q, bias_gain=np.array([0.01, 0.02, -0.1]),
+        turn_gain=np.array([0.02, 0.2, 0.1]),
+    )  # fmt: skip
+    f.predict(motion, 0.0, 0.9)
+    f.x[BIAS:ROBOT] = 0.01, 0.08, -0.15
+    x, P = f.x.copy(), f.P.copy()
+
+    def move(s, u):
+        delta = u + motion.bias_gain * s[BIAS] + motion.turn_gain * s[TURN]
+        delta[:2] *= 1.0 + s[SPEED]
+        return se2.compose(s[:3], delta)
+
+    n, kept = len(x), 0.7
+    A, Qs = np.eye(n), np.zeros((n, n))
+    A[:3] = central_differences(lambda s: move(s, motion.delta), x, angles=(2,))
+    A[WHEELS, WHEELS] *= kept
+    turned = se2.compose_jacobians(x[:3], motion.delta)[1]
+    Qs[:3, :3] = turned @ Q @ turned.T
+    Qs[WHEELS, WHEELS] = (1.0 - kept**2) * np.diag([0.1, 0.2]) ** 2
+    f.predict(motion, 0.0, kept)
+    assert np.allclose(f.x[:3], move(x, motion.delta), atol=1e-14)
+    assert np.allclose(f.x[WHEELS], kept * x[WHEELS], atol=1e-15)
+    assert np.abs(f.P - (A @ P @ A.T + Qs)).max() < 1e-9
+    assert is_covariance(f.P)
+
+
+def test_wheels_that_do_not_err_are_the_filter_without_them():
+    plain, _ = small()
+    gain = np.array([0.02, 0.2, 0.1])
+    plain.predict(Motion(np.array([0.5, -0.03, 0.2]), Q, turn_gain=gain), 0.0, 0.5)
+    other, _ = small()
+    other.predict(Motion(np.array([0.5, -0.03, 0.2]), Q))
+    for f in (plain, other):
+        f.update(1, f.model.observe(f.x[:3], f.points)[0][1] + 0.01, R)
+    assert np.array_equal(plain.x, other.x)
+    assert np.array_equal(plain.P, other.P)
+    assert not plain.P[WHEELS].any()
 
 
 def test_update_is_the_joseph_form_with_numeric_jacobians():
@@ -80,20 +125,23 @@ def near_now(f, radius):
     return f.local[np.hypot(*(f.points - f.x[:2]).T) < radius]
 
 
+@pytest.mark.parametrize(('wheels', 'steps'), [((0.0, 0.0), 200), ((0.03, 0.05), 100)])
 @pytest.mark.parametrize('invariant', [False, True])
-def test_postponed_update_equals_the_plain_filter(invariant):
-    plain = Filter(POSE, COV, 0.02, POINT, invariant)
+def test_postponed_update_equals_the_plain_filter(invariant, wheels, steps):
+    plain = Filter(POSE, COV, 0.02, POINT, invariant, wheels)
     rng = np.random.default_rng(5)
+    told = np.array([0.3, 0.0, 0.05])
     motions = [
-        Motion(np.array([0.3, 0.0, 0.05]) + 0.01 * rng.standard_normal(3), Q) for _ in range(200)
+        Motion(told + 0.01 * rng.standard_normal(3), Q, turn_gain=told * [0.0, 0.0, 1.0])
+        for _ in range(200)
     ]
     noise = 0.01 * rng.standard_normal((200, 50, 2))
     new = np.stack([rng.uniform(0.5, 2.5, 200), rng.uniform(-3.0, 3.0, 200)], -1)
-    postponed = Filter(POSE, COV, 0.02, POINT, invariant)
+    postponed = Filter(POSE, COV, 0.02, POINT, invariant, wheels)
     shares = []
-    for k, motion in enumerate(motions):
+    for k, motion in enumerate(motions[:steps]):
         for f in (plain, postponed):
-            f.predict(motion)
+            f.predict(motion, 0.0, 0.99)
         if k % 10 == 0:
             postponed.choose(near(postponed, 7.0))
         if k % 4 == 0:
@@ -151,7 +199,9 @@ def test_an_invariant_filter_learns_no_heading_from_landmarks_it_does_not_know()
         turn[2] = 1.0
         for k in (0, *range(ROBOT, len(f.x), 2)):
             turn[k], turn[k + 1] = -f.x[k + 1], f.x[k]
-        gained[invariant] = 1.0 / (turn @ np.linalg.solve(f.P, turn)) / before
+        varies = np.delete(np.arange(len(f.x)), [SPEED, TURN])  # these wheels do not err
+        P, turn = f.P[np.ix_(varies, varies)], turn[varies]
+        gained[invariant] = 1.0 / (turn @ np.linalg.solve(P, turn)) / before
     # what the robot forgets on its way is less than a hundredth of it
     assert gained[True] == pytest.approx(1.0, abs=1e-2)
     assert gained[False] < 0.7
