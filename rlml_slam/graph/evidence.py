@@ -13,11 +13,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from rlml_slam.se2 import Array
 
 # degrees of freedom: between the 3 to 10 that Lange, Little & Taylor 1989 find in practice
 NU = 5.0
+USUAL = 0.9  # share of the closures that are no longer than the usual reach
 SCALES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)  # where the search for the scale begins
 _PEAK = math.lgamma((NU + 3.0) / 2.0) - math.lgamma(NU / 2.0) - 1.5 * math.log(NU * math.pi)
 
@@ -30,6 +32,31 @@ def mahalanobis2(e: Array, S: Array) -> Array:
 def uniform(area: Array | float) -> Array:
     """Log density of wrong errors within an area [m²], any heading."""
     return np.asarray(-np.log(2.0 * np.pi * np.asarray(area, dtype=np.float64)))
+
+
+def extent2(poses: Array) -> float:
+    """Square of the larger extent of the poses (n, 3) [m²], at least 1."""
+    return max(float(np.ptp(poses[:, :2], axis=0).max()) ** 2, 1.0)
+
+
+def near_by(poses: Array, z: Array, cov: Array) -> float:
+    """Log density of the errors of wrong closures that look like closures z (k, 3) do at all.
+
+    Those join two poses as near to each other as closures are long and, with covariance ``cov`` of
+    that, uncertain. Chance does so as often as two poses are, whose errors then lie within that
+    reach at any heading. Robots keep to their ways: that is more often than if the poses (n, 3)
+    were spread evenly over the map, which is the least.
+    """
+    anywhere, n = float(uniform(extent2(poses))), len(poses)
+    if not len(z):
+        return anywhere
+    length2 = (z[:, :2] ** 2).sum(1) + np.trace(cov[:, :2, :2], axis1=1, axis2=2)
+    reach = math.sqrt(float(np.quantile(length2, USUAL)))
+    tree = cKDTree(poses[:, :2])
+    pairs = float(tree.count_neighbors(tree, reach)) - n
+    if pairs <= 0.0:
+        return anywhere
+    return max(math.log(pairs / (n * (n - 1.0))) + float(uniform(math.pi * reach**2)), anywhere)
 
 
 def evidence(e: Array, S: Array, scale: float, wrong: Array) -> Array:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from rlml_slam.graph.factors import chi2, relative_pose
 from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.marginals import Marginals
+from rlml_slam.graph.prediction import residual_covs
 from rlml_slam.graph.robust import loss
 from rlml_slam.se2 import Array
 
@@ -49,15 +50,10 @@ def leverages(graph: Graph) -> Array:
     use = np.flatnonzero(e.enabled)
     i, j = e.nodes[use].T
     information = e.information[use]
-    residual, A, B = relative_pose(graph.poses[i], graph.poses[j], e.measured[use])
-    marginals = Marginals(graph)
-    poses = marginals.poses(np.arange(len(graph.poses)))
-    A_t, B_t = np.swapaxes(A, 1, 2), np.swapaxes(B, 1, 2)
-    mixed = A @ marginals.edges() @ B_t
-    Q = A @ poses[i] @ A_t + B @ poses[j] @ B_t + mixed + np.swapaxes(mixed, 1, 2)
+    residual = relative_pose(graph.poses[i], graph.poses[j], e.measured[use])[0]
     losses = graph.losses.in_order()
     of = [losses[code] for code in e.kinds[use].tolist()]
     s = chi2(residual, information).tolist()
     w = np.array([loss(int(one.kind), one.scale, v)[1] for one, v in zip(of, s, strict=True)])
-    out: Array = Q @ information * w[:, None, None]
+    out: Array = residual_covs(graph, Marginals(graph)) @ information * w[:, None, None]
     return out

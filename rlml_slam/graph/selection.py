@@ -6,6 +6,7 @@ start with all closures in the graph settle in whatever they are bent into. So t
 with odometry alone. A closure, or a group that agrees (agreement.py), enters when the evidence
 (evidence.py) of the graph so far is far above chance; each that enters sharpens the prediction for
 the others. The demands sink only when nothing meets them, down to a 5 % chance of being wrong.
+In the end each that is inside is judged once more, by all the others (``_review``).
 """
 
 from __future__ import annotations
@@ -21,9 +22,11 @@ from rlml_slam import params, se2
 from rlml_slam.graph import factors
 from rlml_slam.graph.agreement import Groups, group
 from rlml_slam.graph.backbone import Backbone, Ints
-from rlml_slam.graph.evidence import evidence, uniform
+from rlml_slam.graph.calibration import calibrate
+from rlml_slam.graph.evidence import evidence, extent2, near_by, uniform
 from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.marginals import Marginals
+from rlml_slam.graph.prediction import difference_covs, left_out, most_difference_covs
 from rlml_slam.graph.robust import Loss
 from rlml_slam.graph.solver import optimize
 from rlml_slam.graph.table import FactorKind
@@ -75,17 +78,18 @@ class _Selector:
         is_closure = e.kinds == FactorKind.CLOSURE
         self._edges = np.flatnonzero(is_closure)
         may = np.isin(self._edges, [] if barred is None else barred, invert=True)
+        self._may = may
         self._nodes, self._z = e.nodes[self._edges], e.measured[self._edges]
         self._cov = np.asarray(np.linalg.inv(e.information[self._edges]), dtype=np.float64)
         trusted = np.flatnonzero(e.enabled & ~is_closure)
         backbone = Backbone(graph, trusted)
-        area = _extent2(backbone.poses)
+        area = extent2(backbone.poses)
         self._groups = group(backbone, self._nodes, self._z, self._cov, area)
         self._held = _bridges(backbone, self._nodes, self._groups, may)
         if self._held.any():
             held = self._edges[self._held]
             backbone = Backbone(graph, np.concatenate([trusted, held]))
-            area = _extent2(backbone.poses)
+            area = extent2(backbone.poses)
         self._wrong = uniform(area)
         free = ~graph.fixed_poses
         graph.poses[free] = backbone.poses[free]
@@ -96,6 +100,14 @@ class _Selector:
         self._solves = 0
 
     def run(self) -> Selection:
+        """Let closures in, then judge all of them again."""
+        self._grow()
+        self._review()
+        return Selection(
+            self._edges, self._accepted, self._evidence, self._groups.scale, self._solves
+        )
+
+    def _grow(self) -> None:
         """Let closures in until none of those outside is likelier right than wrong."""
         self._solve()
         self._judge_first()
@@ -110,9 +122,6 @@ class _Selector:
                 break
             else:
                 sunk += STEP
-        return Selection(
-            self._edges, self._accepted, self._evidence, self._groups.scale, self._solves
-        )
 
     def _lowest(self) -> float:
         """How far the demands may sink: to where one that enters is wrong with the chance DOUBT.
@@ -122,6 +131,15 @@ class _Selector:
         inside = int(self._accepted.sum())
         odds = (len(self._edges) - inside + 1.0) / (inside + 1.0)
         return self._strict() - math.log(odds / DOUBT)
+
+    def _of_groups(self, several: Flags, sunk: float) -> float:
+        """Demand of the groups: as of single ones, by the odds of groups, and never below 0."""
+        label, size, _ = self._groups
+        num = int(several.sum())
+        strict = math.log(max(num, 1) / GROUPS)
+        inside = int((several & (np.bincount(label, self._accepted, len(size)) > 0.0)).sum())
+        last = math.log((num - inside + 1.0) / (inside + 1.0) / DOUBT)
+        return max(min(strict, max(strict - sunk, last)), 0.0)
 
     def _strict(self) -> float:
         return math.log(max(len(self._edges), 1) / SURE)
@@ -135,18 +153,14 @@ class _Selector:
         best = np.full(len(size), -np.inf)
         np.maximum.at(best, label, value)
         several = size > 1
-        demand = max(math.log(max(int(several.sum()), 1) / GROUPS) - sunk, 0.0)
-        grouped: Flags = (several & (best > demand))[label]
+        grouped: Flags = (several & (best > self._of_groups(several, sunk)))[label]
         return outside & ((value > self._strict() - sunk) | grouped)
 
     def _take(self, new: Flags) -> None:
         """Let closures in, and throw out what the graph cannot agree with."""
         self._accepted |= new
         self._solve()
-        poses = self._graph.poses
-        i, j = self._nodes.T
-        e = factors.relative_pose(poses[i], poses[j], self._z)[0]
-        now = self._weigh(e, self._cov)
+        now = self._weigh(self._errors(np.arange(len(self._edges))), self._cov)
         bad = self._accepted & ~self._held & (now < 0.0)
         if bad.any():
             self._evidence[bad] = now[bad]
@@ -178,41 +192,75 @@ class _Selector:
             return
         poses = self._graph.poses
         i, j = self._nodes[outside].T
-        e = factors.relative_pose(poses[i], poses[j], self._z[outside])[0]
-        _, J_i, J_j = factors.relative_pose(poses[i], poses[j], se2.between(poses[i], poses[j]))
+        e = self._errors(outside)
         marginals = Marginals(self._graph)
-        S: Array = 2.0 * (_carried(J_i, marginals.poses(i)) + _carried(J_j, marginals.poses(j)))
-        rough = self._weigh(e, S + self._cov[outside])
+        rough = self._roughly(marginals, outside)
         # the true covariance is smaller: its density is lower at a large error, higher at none
         open_ = np.flatnonzero((rough > -STEP) & (rough < self._strict() + STEP))
         if len(open_):
-            S = _difference_covs(marginals, i[open_], j[open_], J_i[open_], J_j[open_])
+            S = difference_covs(marginals, poses, i[open_], j[open_])
             rough[open_] = self._weigh(e[open_], S + self._cov[outside[open_]])
         self._evidence[outside] = rough
 
+    def _errors(self, of: Ints) -> Array:
+        """Residuals (k, 3) of the closures ``of`` (k,) by the graph as it is."""
+        poses = self._graph.poses
+        i, j = self._nodes[of].T
+        return factors.relative_pose(poses[i], poses[j], self._z[of])[0]
+
+    def _roughly(self, marginals: Marginals, outside: Ints) -> Array:
+        i, j = self._nodes[outside].T
+        S = most_difference_covs(marginals, self._graph.poses, i, j)
+        return self._weigh(self._errors(outside), S + self._cov[outside])
+
+    def _review(self) -> None:
+        """Judge those inside by the others, and those outside again, until nothing changes.
+
+        What entered early was judged by a graph that knew little. Now all can be judged by what
+        all the others say, and by errors as they have turned out to be (calibration.py). Of those
+        that fail, the ones likelier wrong than right go at once; otherwise the worst goes alone,
+        as two that contradict each other need not both be wrong.
+        """
+        self._left = np.where(self._may & ~self._held, TRIES, 0)
+        while True:
+            judged, evidence = self._judge_again()
+            demand = self._strict() - self._lowest()
+            doubt = judged & self._accepted & (evidence < demand)
+            back = judged & ~self._accepted & (evidence > demand)
+            self._evidence[judged] = evidence[judged]
+            if doubt.any():
+                worst = evidence[doubt].min()
+                out = doubt & (evidence <= max(worst, 0.0))
+                self._left[out] -= 1
+                self._accepted &= ~out
+            elif back.any():
+                self._accepted |= back
+            else:
+                return
+            self._solve()
+
+    def _judge_again(self) -> tuple[Flags, Array]:
+        """(Which closures are judged, evidence of those), each by all others that are inside."""
+        outside = np.flatnonzero(~self._accepted & (self._left > 0))
+        inside = np.flatnonzero(self._accepted & ~self._held)
+        marginals = Marginals(self._graph)
+        outside = outside[self._roughly(marginals, outside) > -STEP]
+        i, j = self._nodes[outside].T
+        e_out = self._errors(outside)
+        S_out = difference_covs(marginals, self._graph.poses, i, j) + self._cov[outside]
+        e_in, S_in = left_out(self._graph, marginals, self._edges[inside])
+        both = np.concatenate([inside, outside])
+        e, S = np.concatenate([e_in, e_out]), np.concatenate([S_in, S_out])
+        scale = self._groups.scale
+        wrong = near_by(self._graph.poses, self._z[inside], scale * S_in)
+        judged, values = np.zeros(len(self._edges), np.bool_), np.zeros(len(self._edges))
+        if len(both):
+            calibration = calibrate(e, S, scale, wrong)
+            judged[both], values[both] = True, calibration.evidence(e, S, wrong)
+        return judged, values
+
     def _weigh(self, e: Array, S: Array) -> Array:
         return evidence(e, S, self._groups.scale, self._wrong)
-
-
-def _extent2(poses: Array) -> float:
-    """Square of the larger extent of the poses [m²], at least 1."""
-    return max(float(np.ptp(poses[:, :2], axis=0).max()) ** 2, 1.0)
-
-
-def _carried(J: Array, cov: Array) -> Array:
-    out: Array = J @ cov @ np.swapaxes(J, 1, 2)
-    return out
-
-
-def _difference_covs(marginals: Marginals, i: Ints, j: Ints, J_i: Array, J_j: Array) -> Array:
-    """Covariances (k, 3, 3) of the relative poses of i (k,) and j (k,)."""
-    out = np.empty((len(i), 3, 3))
-    for first in np.unique(i):
-        at = np.flatnonzero(i == first)
-        cross = marginals.pose_columns(int(first), j[at])
-        mixed = J_i[at] @ cross @ np.swapaxes(J_j[at], 1, 2)
-        out[at] = mixed + np.swapaxes(mixed, 1, 2)
-    return out + _carried(J_i, marginals.poses(i)) + _carried(J_j, marginals.poses(j))
 
 
 def _bridges(backbone: Backbone, nodes: Ints, groups: Groups, may: Flags) -> Flags:

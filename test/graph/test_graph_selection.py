@@ -54,6 +54,16 @@ def spoil(graph, pairs):
     ]
 
 
+def restated(source, factors):
+    """The same graph, with sigmas stated 1 / factors (3,) times as large."""
+    graph, e = Graph(), source.edges
+    graph.add_poses(source.poses)
+    graph.fixed_poses[0] = True
+    kinds = [EdgeKind.CLOSURE if k == FactorKind.CLOSURE else EdgeKind.ODOMETRY for k in e.kinds]
+    graph.add_edges(kinds, e.nodes, e.measured, e.information * np.outer(factors, factors))
+    return graph
+
+
 WRONG = [(3, 33), (10, 95), (44, 140), (70, 100), (20, 170), (21, 52), (90, 175), (5, 130)]
 
 
@@ -146,12 +156,7 @@ def test_wrong_closures_are_refused_however_wrong_the_covariances_are(factor):
     best = optimum(laps())
     source = laps()
     spoil(source, WRONG)
-    graph = Graph()
-    graph.add_poses(source.poses)
-    graph.fixed_poses[0] = True
-    e = source.edges
-    kinds = [EdgeKind.CLOSURE if k == FactorKind.CLOSURE else EdgeKind.ODOMETRY for k in e.kinds]
-    graph.add_edges(kinds, e.nodes, e.measured, factor * e.information)
+    graph = restated(source, np.full(3, np.sqrt(factor)))
     chosen = select_closures(graph, EXACT)
     assert_array_equal(chosen.accepted, np.arange(len(chosen.edges)) < len(chosen.edges) - 8)
     assert_array_equal(graph.edges.enabled[chosen.edges], chosen.accepted)
@@ -177,6 +182,36 @@ def test_selection_does_not_depend_on_where_the_map_lies_nor_on_the_start():
     assert_array_equal(chosen.accepted, same.accepted)
     # expectation maximisation stops at a gain of 1e-6 per closure
     assert chosen.scale == pytest.approx(same.scale, rel=1e-2)
+
+
+def test_a_wrong_closure_within_what_is_stated_is_refused_where_the_others_hold_better():
+    # translation is stated ten times too uncertain, heading rightly: the wrong closure is off by
+    # two sigmas of what is stated, and nothing but how well the others agree speaks against it
+    source, rough = laps(), np.array([0.1, 0.1, 1.0])
+    best = optimum(restated(source, rough))
+    delta = se2.between(source.poses[71], source.poses[74]) + np.array([0.0, 1.0, 0.0])
+    source.add_edge(EdgeKind.CLOSURE, 71, 74, delta, np.diag(SIGMA**-2))
+    graph = restated(source, rough)
+    chosen = select_closures(graph, EXACT)
+    assert_array_equal(chosen.accepted, np.arange(len(chosen.edges)) < len(chosen.edges) - 1)
+    assert_allclose(graph.poses, best, atol=1e-6)
+
+
+@pytest.mark.parametrize('every', [10, 20])
+def test_few_right_closures_stay_in(every):
+    # 4 and 2 of them: too few to say how large errors are
+    for seed in range(5):
+        source = laps(seed)
+        graph, e = Graph(), source.edges
+        graph.add_poses(source.poses)
+        graph.fixed_poses[0] = True
+        closures = np.flatnonzero(e.kinds == FactorKind.CLOSURE)
+        for k in [*np.flatnonzero(e.kinds == FactorKind.ODOMETRY), *closures[::every]]:
+            kind = EdgeKind.CLOSURE if k in closures else EdgeKind.ODOMETRY
+            graph.add_edge(kind, *e.nodes[k], e.measured[k], e.information[k])
+        wrong = spoil(graph, WRONG[:4])
+        chosen = select_closures(graph, EXACT)
+        assert_array_equal(chosen.edges[~chosen.accepted], wrong)
 
 
 def test_landmarks_are_trusted_and_losses_kept():
