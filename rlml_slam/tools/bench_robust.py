@@ -68,7 +68,8 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     parser.add_argument(
         '--keep', type=Path, metavar='DIR',
-        help='write every result there at once; what is there is not measured again',
+        help='write every result there at once; what is there is not measured again, unless '
+        'it is of this solver and its sources have changed',
     )  # fmt: skip
     parser.add_argument('--without', action='append', default=[], help='leave out a solver')
     parser.add_argument('--json', action='store_true', help='one JSON object on stdout')
@@ -85,6 +86,7 @@ def run(args: argparse.Namespace) -> int:
         raise RlmlError(f'--limit {args.limit:g} is not more than 0')
     counts = [parse_wrong(word) for word in args.wrong]
     methods = _methods()
+    own = list(methods)
     for method in methods.values():  # compiles what it needs
         method(city(60))
     rivals, close = _rivals(args.limit)
@@ -94,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
         for name, graph in read_graphs(args.graphs):
             if len(graph.landmarks) or not (graph.edges.kinds == FactorKind.CLOSURE).any():
                 continue
-            cases = Cases(name, graph, args.keep)
+            cases = Cases(name, graph, args.keep, own)
             results.append({'graph': name, 'poses': len(graph.poses), 'closures': cases.right})
             if not args.json:
                 _print_head(results[-1])

@@ -3,19 +3,21 @@
 
 A case is one draw of wrong closures with the results of all solvers on it. It is written to the
 disk whenever one of them is done, and taken from there where it was measured before on the same
-graph.
+graph: those of this package with the same sources of the solver.
 """
 
 from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+import rlml_slam.graph
 from rlml_slam import params, se2
 from rlml_slam.errors import RlmlError
 from rlml_slam.graph.graph import Graph
@@ -68,8 +70,11 @@ def parse_wrong(word: str) -> Wrong:
 class Cases:
     """A graph with its optimum ``best``, and its cases, kept in ``folder`` if there is one."""
 
-    def __init__(self, name: str, graph: Graph, folder: Path | None) -> None:
-        self._name, self._graph, self._folder = name, graph, folder
+    def __init__(
+        self, name: str, graph: Graph, folder: Path | None, own: Collection[str] = ()
+    ) -> None:
+        """``own`` are the methods of this package."""
+        self._name, self._graph, self._folder, self._own = name, graph, folder, own
         self.right = int(np.sum(graph.edges.kinds == FactorKind.CLOSURE))
         self.best = copied(graph)
         initialize(self.best, 'chordal')
@@ -101,7 +106,7 @@ class Cases:
             assert spoilt is not None
             known[name] = self._judge(spoilt, methods[name])
             if path is not None:
-                kept = {'graph': self._digest, 'results': known}
+                kept = {'graph': self._digest, 'solver': _solver_digest(), 'results': known}
                 write_atomically(path, (json.dumps(kept, indent=1) + '\n').encode())
         return {name: known[name] for name in methods}
 
@@ -115,9 +120,10 @@ class Cases:
         try:
             kept = json.loads(path.read_text(encoding='utf-8'))
             results: dict[str, Judged] = kept['results'] if kept['graph'] == self._digest else {}
+            same = kept.get('solver') == _solver_digest()
         except (OSError, ValueError, KeyError, TypeError) as e:
             raise RlmlError(f'{path}: not a case of this benchmark: {e}') from e
-        return results
+        return {name: one for name, one in results.items() if same or name not in self._own}
 
     def _judge(self, spoilt: Graph, method: Method) -> Judged:
         """One solver on a copy of a graph."""
@@ -130,6 +136,13 @@ class Cases:
             out['missed'] = float(np.sum(~outcome.accepted[: self.right]))
             out['accepted_wrong'] = float(np.sum(outcome.accepted[self.right :]))
         return out
+
+
+@cache
+def _solver_digest() -> int:
+    """Of the sources of the solver: what they gave before they were changed is no result."""
+    sources = sorted(Path(rlml_slam.graph.__file__).parent.glob('*.py'))
+    return zlib.crc32(b''.join(source.read_bytes() for source in sources))
 
 
 def ate(poses: Array, best: Array) -> float:

@@ -99,7 +99,11 @@ def test_a_run_that_was_broken_off_goes_on(graph_file, tmp_path, capsys):
     assert more['select']['ate_max_m'] == 7.0
     assert (more['select']['runs'], more['dcs']['runs']) == (2, 1)
     assert more['select']['worse_than'] == {'dcs': 1}
-    # that of another graph under the same name is none
+    # that of a solver whose sources were others is none
+    path.write_text(json.dumps(kept | {'solver': kept['solver'] + 1}))
+    assert rows('--seeds', '1')['select']['ate_max_m'] < 1e-4
+    path.write_text(json.dumps(kept))
+    # nor that of another graph under the same name
     write_graph(graph_file, city(150, seed=4))
     assert rows('--seeds', '1')['select']['ate_max_m'] < 1e-4
 
