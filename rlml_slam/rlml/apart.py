@@ -10,11 +10,14 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+import pickle
 import signal
+import threading
 import warnings
 from collections import deque
 from collections.abc import Callable
 from multiprocessing.connection import Connection
+from queue import SimpleQueue
 from typing import Any, TypeAlias
 
 from rlml_slam.maps.saved import SavedMap
@@ -86,7 +89,7 @@ class Apart:
         _serve(back_end, add, frames, updates)
 
     def _send(self) -> None:
-        while self._owed and self._updates.poll():  # neither side may wait for the other to read
+        while self._owed and self._updates.poll():
             self._came += self._receive()
         self._owed += 1
         self._frames.send(packed(self._waiting))
@@ -132,12 +135,11 @@ def _serve(
 ) -> None:
     """The process: one answer for everything that comes; an error is the last answer."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the other process, and so this one
-    inbox: deque[Any] = deque()
-    with contextlib.suppress(EOFError, BrokenPipeError):
-        while True:
-            while not inbox or frames.poll():  # read ahead: the sender must not wait
-                inbox.append(frames.recv())
-            asked = inbox.popleft()
+    inbox: SimpleQueue[bytes] = SimpleQueue()
+    threading.Thread(target=_read_ahead, args=(frames, inbox), daemon=True).start()
+    with contextlib.suppress(BrokenPipeError):
+        while data := inbox.get():
+            asked = pickle.loads(data)
             answer: Answer | Exception
             try:
                 answer = _answer(back_end, add, asked)
@@ -146,6 +148,17 @@ def _serve(
             updates.send(answer)
             if asked == HOME or isinstance(answer, Exception):
                 return
+
+
+def _read_ahead(frames: Connection, inbox: SimpleQueue[bytes]) -> None:
+    """Take what comes at once, until the end, which is nothing.
+
+    Were the sender to wait, while this process waits for it to take an answer, both would forever.
+    """
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            inbox.put(frames.recv_bytes())
+    inbox.put(b'')
 
 
 def _answer(
