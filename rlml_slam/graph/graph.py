@@ -47,6 +47,8 @@ class Renumbering:
     landmarks: NDArray[np.int64]
     edges: NDArray[np.int64]
     sightings: NDArray[np.int64]
+    pose_priors: NDArray[np.int64]
+    landmark_priors: NDArray[np.int64]
 
 
 class Graph:
@@ -170,8 +172,8 @@ class Graph:
         """Let go of all other poses and landmarks with their factors, and of disabled factors.
 
         Of the disabled edges those of ``disabled`` (e,) stay, for they may be enabled again, all
-        of them by default. What was made of the graph, such as an Incremental, has to be made
-        anew.
+        of them by default. What was made of the graph has to be made anew, or to be told, as an
+        Incremental is by its ``renumber``.
         """
         new_poses, new_landmarks = renumbered(poses), renumbered(landmarks)
         e, s = self.edges.nodes, self.sightings.nodes
@@ -179,14 +181,14 @@ class Graph:
         known = np.all(poses[e], axis=-1)
         if disabled is not None:
             known &= self.edges.enabled | disabled
+        p, q = self.pose_priors, self.landmark_priors
         out = Renumbering(
             new_poses, new_landmarks,
             self.edges.keep(known, (new_poses, new_poses)),
             self.sightings.keep(seen, (new_poses, new_landmarks)),
+            p.keep(poses[p.nodes[:, 0]], (new_poses,)),
+            q.keep(landmarks[q.nodes[:, 0]], (new_landmarks,)),
         )  # fmt: skip
-        self.pose_priors.keep(poses[self.pose_priors.nodes[:, 0]], (new_poses,))
-        prior = self.landmark_priors.nodes[:, 0]
-        self.landmark_priors.keep(landmarks[prior], (new_landmarks,))
         for column, kept in (
             (self._poses, poses), (self._fixed_poses, poses),
             (self._landmarks, landmarks), (self._fixed_landmarks, landmarks),

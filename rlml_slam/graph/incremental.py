@@ -13,15 +13,19 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rlml_slam.compiled import kernel, part
 from rlml_slam.errors import SolverError
-from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.graph import Graph, Renumbering
 from rlml_slam.graph.increments import (
     CLIQUES,
     FACTORS,
     FREE_CLIQUE,
+    IN_USE,
+    LANDMARKS,
     LISTED,
+    POSES,
     SEEDS,
     STEP,
     TOP,
@@ -35,18 +39,25 @@ from rlml_slam.graph.partial import take_out
 from rlml_slam.graph.propagate import propagate
 from rlml_slam.graph.refactor import make_cliques, refactor, reserve
 from rlml_slam.graph.relinearize import judge, refer_all, take
+from rlml_slam.graph.renumber import renumber
 from rlml_slam.graph.system import Tables
+from rlml_slam.graph.tree_joint import tree_joint
 from rlml_slam.se2 import Array
 from rlml_slam.types import EdgeKind
+
+# The blocks of a tree whose parts come and go lie ever farther apart: beyond this many times the
+# room of those in use, it is made anew. As much has been factored by then as that costs.
+SCATTERED = 2.0
 
 
 @dataclass(frozen=True)
 class Thresholds:
     """How far off things may be before something is done about it.
 
-    A factor is relinearised when its linear model is off by ``due`` standard deviations or its
-    pose has turned by ``turn`` [rad], else only where it has to be assembled anyway. A move of a
-    variable by less than ``still`` standard deviations is not passed on.
+    A factor is relinearised when its linear model is off by ``due`` standard deviations, its pose
+    has turned by ``turn`` [rad] or its robust weight changed by that share, else only where it has
+    to be assembled anyway. A move of a variable by less than ``still`` standard deviations is not
+    passed on.
     """
 
     due: float = 0.05
@@ -111,7 +122,7 @@ def _start_over(state: State, poses: Array, landmarks: Array) -> int:
     """Forget the tree and relinearise everything; how many factors."""
     count = state.counts
     refer_all(state, poses, landmarks)
-    count[CLIQUES] = count[TOP] = count[LISTED] = 0
+    count[CLIQUES] = count[TOP] = count[LISTED] = count[IN_USE] = 0
     count[FREE_CLIQUE] = -1
     for k in range(len(state.free)):
         state.free[k] = -1
@@ -137,6 +148,16 @@ class Incremental:
         self._state = new_state(64, 64, 64, 256)
         self._pool = np.empty(1 << 14)
         self._whole = False
+        self._fixed = graph.fixed_poses.copy(), graph.fixed_landmarks.copy()
+
+    @property
+    def settled(self) -> bool:
+        """Whether no factor waits to be relinearised: another update would change nothing."""
+        return not self._whole and not self._state.counts[LISTED]
+
+    def start_over(self) -> None:
+        """The estimate in the graph was changed: the next update takes it as it is."""
+        self._whole = True
 
     def update(self, whole: bool = False) -> Step:
         """One step; with ``whole`` everything is relinearised, ordered and factored anew.
@@ -147,10 +168,14 @@ class Incremental:
         graph, limits = self.graph, self.thresholds
         if graph.losses is not self._losses:
             self._losses, self._whole = graph.losses, True
+        self._mind_fixed()
         self._reserve()
+        count = self._state.counts
+        scattered = count[TOP] > SCATTERED * count[IN_USE] + (1 << 14)
+        whole = whole or self._whole or bool(scattered)
         self._pool, failed, step = advance(
             self._state, self._pool, graph.tables(), graph.poses, graph.landmarks,
-            whole or self._whole, limits.due, limits.turn, limits.still,
+            whole, limits.due, limits.turn, limits.still,
         )  # fmt: skip
         self._whole = failed >= 0
         if self._whole:
@@ -161,6 +186,56 @@ class Incremental:
                 'to is not tied to the map, or has too few measurements'
             )
         return step
+
+    def joint(self, poses: ArrayLike, landmarks: ArrayLike = ()) -> Array:
+        """Joint covariance (3k + 2l, 3k + 2l) of the poses (k,), then the landmarks (l,).
+
+        As that of Marginals, at the linear models of the last update; what is new since then has
+        no covariance.
+        """
+        state, at = self._state, []
+        for of, known, nodes in (
+            (state.of_pose, state.counts[POSES], poses),
+            (state.of_landmark, state.counts[LANDMARKS], landmarks),
+        ):
+            k = np.asarray(nodes, dtype=np.int64).reshape(-1)
+            at.append(np.where(k < known, of[np.minimum(k, len(of) - 1)], -1))
+        sizes = np.repeat([3, 2], [len(at[0]), len(at[1])])
+        unknowns = np.concatenate(at)
+        free = (unknowns >= 0) & (state.unknowns['clique'][unknowns] >= 0)
+        rows = np.flatnonzero(np.repeat(free, sizes))
+        out = np.zeros((sizes.sum(), sizes.sum()))
+        if len(rows):
+            out[np.ix_(rows, rows)] = tree_joint(state, self._pool, unknowns[free])
+        return out
+
+    def renumber(self, new: Renumbering) -> None:
+        """The graph has let go of nodes and factors (Graph.keep).
+
+        It is cheap where an update came between the last change and that, in which nothing that
+        goes had an enabled factor any more. Else the next update starts over.
+        """
+        known = not self._whole and renumber(
+            self._state, new.poses, new.landmarks, new.edges, new.sightings, new.pose_priors,
+            new.landmark_priors,
+        )  # fmt: skip
+        if known:
+            self._fixed = self.graph.fixed_poses.copy(), self.graph.fixed_landmarks.copy()
+        else:
+            self._forget()
+
+    def _forget(self) -> None:
+        """Nothing is known of the graph."""
+        self._state, self._whole = new_state(64, 64, 64, 256), True
+        self._fixed = self.graph.fixed_poses.copy(), self.graph.fixed_landmarks.copy()
+
+    def _mind_fixed(self) -> None:
+        """A node that is fixed or let go changes what is unknown."""
+        now = self.graph.fixed_poses, self.graph.fixed_landmarks
+        if any(not np.array_equal(a, b[: len(a)]) for a, b in zip(self._fixed, now, strict=True)):
+            self._forget()
+        elif any(len(a) < len(b) for a, b in zip(self._fixed, now, strict=True)):
+            self._fixed = now[0].copy(), now[1].copy()
 
     def _reserve(self) -> None:
         """Make room for all that is in the graph."""
@@ -183,4 +258,7 @@ def compile_kernels() -> None:
     graph.add_pose([0.0, 0.0, 0.0], fixed=True)
     graph.add_pose([1.0, 0.0, 0.0])
     graph.add_edge(EdgeKind.ODOMETRY, 0, 1, [1.0, 0.0, 0.0], np.eye(3))
-    Incremental(graph).update()
+    solver = Incremental(graph)
+    solver.update()
+    solver.joint([1])
+    solver.renumber(graph.keep(np.ones(2, np.bool_), np.ones(0, np.bool_)))

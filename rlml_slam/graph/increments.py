@@ -63,9 +63,10 @@ CLIQUE = np.dtype(
 )  # fmt: skip
 
 # places in State.counts: what is known of the graph's tables (poses, landmarks, rows of the four
-# tables), what is in use here, and the number of the step
+# tables), what is in use here, the number of the step, where the lists of free records start, and
+# the elements of the blocks in use
 POSES, LANDMARKS, ROWS, UNKNOWNS, FACTORS, CLIQUES = 0, 1, 2, 6, 7, 8
-FREE_CLIQUE, TOP, STEP, SEEDS, LISTED, COUNTS = 9, 10, 11, 12, 13, 14
+FREE_CLIQUE, TOP, STEP, SEEDS, LISTED, FREE_UNKNOWN, FREE_FACTOR, IN_USE, COUNTS = range(9, 18)
 
 CLASSES = 256  # size classes of blocks: four to an octave
 
@@ -96,7 +97,7 @@ def new_state(poses: int, landmarks: int, rows: int, factors: int) -> State:
     """An empty state with room for so many nodes, rows in a table and factors in all."""
     nodes = poses + landmarks
     count = np.zeros(COUNTS, np.int64)
-    count[FREE_CLIQUE] = -1
+    count[FREE_CLIQUE] = count[FREE_UNKNOWN] = count[FREE_FACTOR] = -1
     return State(
         np.zeros(nodes, UNKNOWN), np.zeros(factors, FACTOR), np.zeros(nodes + 1, CLIQUE),
         np.full(poses, -1), np.full(landmarks, -1), np.full((4, rows), -1),
@@ -142,7 +143,7 @@ def with_room(pool: Array, top: int, need: int) -> Array:
     """The pool, or a copy of it that holds ``need`` more elements above ``top``."""
     if top + need <= len(pool):
         return pool
-    more = np.empty(2 * (top + need))
+    more = np.empty((top + need) * 5 // 4)
     for k in range(top):
         more[k] = pool[k]
     return more
@@ -161,9 +162,35 @@ def take_clique(cliques: Records, count: Ints) -> int:
 
 
 @part
+def take_unknown(unknowns: Records, count: Ints) -> int:
+    """A record for an unknown; the free ones are linked by ``head``."""
+    v: int = count[FREE_UNKNOWN]
+    if v >= 0:
+        count[FREE_UNKNOWN] = unknowns[v]['head']
+    else:
+        v = count[UNKNOWNS]
+        count[UNKNOWNS] += 1
+    return v
+
+
+@part
+def take_factor(factors: Records, count: Ints) -> int:
+    """A record for a factor; the free ones are linked by ``after``."""
+    f: int = count[FREE_FACTOR]
+    if f >= 0:
+        count[FREE_FACTOR] = factors[f]['after']
+    else:
+        f = count[FACTORS]
+        count[FACTORS] += 1
+    return f
+
+
+@part
 def drop_clique(state: State, numbers: Ints, c: int) -> None:
     """Give back a clique and its block."""
     clique = state.cliques[c]
+    least = 16 << (clique['room'] // 4)
+    state.counts[IN_USE] -= least + clique['room'] % 4 * (least // 4)
     numbers[clique['block']] = state.free[clique['room']]
     state.free[clique['room']] = clique['block']
     clique['next'] = state.counts[FREE_CLIQUE]

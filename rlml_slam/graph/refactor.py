@@ -12,6 +12,7 @@ from rlml_slam.compiled import fetch, part
 from rlml_slam.graph.dense import partial_cholesky, rank_update
 from rlml_slam.graph.fronts import SINGULAR, highest
 from rlml_slam.graph.increments import (
+    IN_USE,
     STEP,
     TOP,
     State,
@@ -62,6 +63,7 @@ def make_cliques(state: State, numbers: Ints, anew: Part) -> Ints:
         room, elements = room_of(_size(width, height, end - start))
         clique['room'], clique['width'], clique['height'] = room, width, height
         clique['block'] = take_block(state.free, state.counts, numbers, room, elements)
+        state.counts[IN_USE] += elements
         clique['child'], clique['mark'] = -1, state.counts[STEP]
         parent = fronts[s]['parent'] if height > width else -1
         hang(state.cliques, c, of_front[parent] if parent >= 0 else -1)

@@ -10,7 +10,7 @@ differs from its linear model by
 
 of second order and nothing where only positions moved; and its Jacobian has turned by phi. A
 factor is relinearised when r, or what the change of its robust weight amounts to, is a
-considerable share of its standard deviation, or when phi is.
+considerable share of its standard deviation, or when phi or that change as a share of it is.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ import numpy as np
 from rlml_slam.compiled import fetch, part
 from rlml_slam.graph.increments import (
     EDGES,
-    FACTORS,
     LANDMARK_PRIORS,
     LANDMARKS,
     LISTED,
@@ -34,6 +33,8 @@ from rlml_slam.graph.increments import (
     UNKNOWNS,
     State,
     ask,
+    take_factor,
+    take_unknown,
 )
 from rlml_slam.graph.linearize import wrapped
 from rlml_slam.graph.robust import loss
@@ -71,8 +72,7 @@ def take(state: State, tables: Tables, poses: Array, landmarks: Array) -> None:
 
 @part
 def _new_unknown(state: State, size: int, index: int) -> int:
-    v: int = state.counts[UNKNOWNS]
-    state.counts[UNKNOWNS] += 1
+    v = take_unknown(state.unknowns, state.counts)
     u = state.unknowns[v]
     u['size'], u['index'] = size, index
     u['clique'] = u['head'] = u['local'] = -1
@@ -116,8 +116,7 @@ def _take_factors(state: State, table: int, factors: Factors) -> None:
                     on[r] = not on[r]
                     _switch(state, state.of_row[table, r], on[r])
     for r in range(known, rows):
-        f: int = state.counts[FACTORS]
-        state.counts[FACTORS] += 1
+        f = take_factor(state.factors, state.counts)
         state.of_row[table, r] = f
         _copy(state, f, table, factors, r)
         on[r] = factors.enabled[r]
@@ -372,5 +371,8 @@ def _error(
         squared = _squared(z, e0 - z['x'], e1 - z['y'], e2)
         new = loss(losses[kind, 0], losses[kind, 1], squared)[1]
         # a weight that changes by dw pulls like a residual that changes by dw / w
-        error += (new - w) * (new - w) * squared / max(w, new, 1e-6)
+        change = (new - w) / max(w, new, 1e-6)
+        error += change * change * squared * max(w, new, 1e-6)
+        # it also is information, which is off by as much where nothing pulls
+        phi = max(abs(phi), abs(change))
     return error / (due * due) + phi * phi / (turn * turn)

@@ -16,9 +16,9 @@ from rlml_slam import se2
 from rlml_slam.errors import MapError
 from rlml_slam.graph.factors import relative_information
 from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.live import Live
 from rlml_slam.graph.marginals import Marginals
 from rlml_slam.graph.robust import Loss, Losses, LossKind
-from rlml_slam.graph.solver import optimize
 from rlml_slam.maps.occupancy import OccupancyGrid, render
 from rlml_slam.maps.survey import Survey, same
 from rlml_slam.params import Parameters
@@ -82,16 +82,17 @@ class BackEnd:
                 reflector=Loss(LossKind.CAUCHY, p.reflector.robust_scale),
             )
         )
+        self.live = Live(self.graph, p.solver)
         self.keyframes: list[Keyframe] = []
-        self.scans = ScanGraph(p, self.graph)
-        self.reflector_graph = ReflectorGraph(p.reflector, self.graph)
+        self.scans = ScanGraph(p, self.live)
+        self.reflector_graph = ReflectorGraph(p.reflector, self.live)
         self.constellations = Constellations(p, self.graph, self.reflector_graph)
         self.deferred = DeferredMatches(p.reflector, self.reflector_graph)
-        self.sparsifier = Sparsifier(p, self.graph, self.scans, self.reflector_graph)
+        self.sparsifier = Sparsifier(p, self.live, self.scans, self.reflector_graph)
         self.path = Path(p.back_end.path_frames)
         self.presence = Presence(p, self.graph, self.reflector_graph)
         self._gone: tuple[int, ...] = ()  # since the newest keyframe began
-        self.closure_watch = ClosureWatch(p, self.graph)
+        self.closure_watch = ClosureWatch(p, self.live)
         self.plant = self._plant_frame(self._survey)
         self._changed: tuple[Closure, ...] = ()  # since the newest keyframe began
         self.T_map_local = np.zeros(3)
@@ -103,7 +104,7 @@ class BackEnd:
     def _plant_frame(self, survey: Survey | None) -> PlantFrame | None:
         if survey is None:
             return None
-        return PlantFrame(self._p, self.graph, self.reflector_graph, survey)
+        return PlantFrame(self._p, self.live, self.reflector_graph, survey)
 
     def add(self, frame: Frame) -> Update | None:
         """Take one frame of the front end; an Update where it became a keyframe."""
@@ -176,8 +177,7 @@ class BackEnd:
             motion = se2.between(last.T_local, frame.T_local_base)
             delta = motion if ours else since.delta
             self.path.begin_keyframe(motion)
-            pose = se2.compose(self.T_map_local, frame.T_local_base)
-            index = self.graph.add_pose(pose)
+            index = self.graph.add_pose(se2.compose(self.graph.poses[last.index], motion))
             cov = since.cov + np.diag(np.array(self._p.back_end.edge_floor2))
             if self._p.back_end.edge_covariance == 'sum':
                 # eq. 14 to the letter, in the axes of the frame it is used in
@@ -244,7 +244,7 @@ class BackEnd:
         """
         robust = self.graph.losses
         self.graph.losses = replace(robust, odometry=Loss(), reflector=Loss())
-        optimize(self.graph, self._p.solver)
+        self.live.solve_all()
         self.graph.losses = robust
         self.optimize()
 
@@ -255,13 +255,15 @@ class BackEnd:
         """
         if len(self.keyframes) < 2:
             return
-        optimize(self.graph, self._p.solver)
+        solve = self.live.solve_all if final else self.live.solve
+        solve()
         if self.reflector_graph.merge(self.deferred.pending):
-            optimize(self.graph, self._p.solver)
+            solve()
         # open hypotheses are about places in the frame of now
         if self.plant is not None and not self.deferred.pending and self.plant.update():
-            optimize(self.graph, self._p.solver)
+            solve()
         self._changed += self.closure_watch.review(self.scans.closures, final)
+        self.live.solve()
         self._optimized = True
         self._since_optimized = 0
         self.scans.changed = self.reflector_graph.changed = False
@@ -277,7 +279,7 @@ class BackEnd:
         graph alone knows of the loops that scans have closed, and of the survey.
         """
         before, last = self.keyframes[-2:]
-        cov = self.marginals().joint([before.index])
+        cov = self.live.joint([before.index])
         R = np.eye(3)
         R[:2, :2] = se2.rotation(self.T_map_local[2])
         in_plant = self.plant is not None and self.plant.found

@@ -19,7 +19,7 @@ from rlml_slam import se2
 from rlml_slam.graph import factors
 from rlml_slam.graph.evidence import evidence
 from rlml_slam.graph.graph import Graph
-from rlml_slam.graph.marginals import Marginals
+from rlml_slam.graph.live import Live
 from rlml_slam.se2 import Array
 
 Ints = NDArray[np.int64]
@@ -31,15 +31,15 @@ RISK = 0.1  # chances that any of the closures that wait agrees with another by 
 
 
 def may_enter(
-    graph: Graph, nodes: Ints, deltas: Array, covs: Array, wrong: Array, odds: Array | float = 0.0
+    live: Live, nodes: Ints, deltas: Array, covs: Array, wrong: Array, odds: Array | float = 0.0
 ) -> NDArray[np.bool_]:
-    """Which (k,) of the closures between poses (k, 2), none of them in the graph yet, may enter.
+    """Which (k,) of the closures between poses (k, 2), none of them in a graph yet, may enter.
 
     ``deltas`` (k, 3) with ``covs`` (k, 3, 3) of their residuals; ``wrong`` (k,) is the log
-    density of wrong errors, ``odds`` (k,) the logarithm of what else speaks for each. The estimate
-    need not be the optimum. Raises SolverError as Marginals.
+    density of wrong errors, ``odds`` (k,) the logarithm of what else speaks for each. The graph is
+    solved for it. Raises SolverError as Live.
     """
-    between = _Between(graph, np.unique(nodes))
+    graph, between = live.graph, _Between(live, np.unique(nodes))
     wrong = np.broadcast_to(wrong, len(nodes))
     i, j = nodes.T
     e = factors.relative_pose(graph.poses[i], graph.poses[j], deltas)[0]
@@ -53,10 +53,10 @@ def may_enter(
 class _Between:
     """Covariances of where some poses of a graph are from one another."""
 
-    def __init__(self, graph: Graph, poses: Ints) -> None:
-        self._poses, self._at = graph.poses, poses
+    def __init__(self, live: Live, poses: Ints) -> None:
         n = len(poses)
-        self._joint = Marginals(graph).joint(poses).reshape(n, 3, n, 3).swapaxes(1, 2)
+        self._joint = live.joint(poses).reshape(n, 3, n, 3).swapaxes(1, 2)
+        self._poses, self._at = live.graph.poses, poses
 
     def covs(self, i: Ints, j: Ints) -> Array:
         """Covariances (k, 3, 3) of the poses of j (k,) from i (k,), in the axes of j."""

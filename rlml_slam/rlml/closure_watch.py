@@ -16,10 +16,9 @@ import numpy as np
 from rlml_slam.errors import SolverError
 from rlml_slam.graph import factors
 from rlml_slam.graph.evidence import evidence, uniform
-from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.live import Live
 from rlml_slam.graph.robust import weights
 from rlml_slam.graph.selection import select_closures
-from rlml_slam.graph.solver import optimize
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.closure import Closure, State
 from rlml_slam.se2 import Array
@@ -33,9 +32,10 @@ CHANGED = 0.05  # change of a weight that is noted
 class ClosureWatch:
     """Notes residuals and weights, disables, revokes; closures are those of a ScanGraph."""
 
-    def __init__(self, params: Parameters, graph: Graph) -> None:
+    def __init__(self, params: Parameters, live: Live) -> None:
         self._p = params
-        self._graph = graph
+        self._live = live
+        self._graph = live.graph
         self._wrong = uniform(params.loop_closure.searched)
         self._judged = 0
 
@@ -100,7 +100,7 @@ class ClosureWatch:
             good = before[chosen.edges]
         good[is_revoked] = False
         self._graph.edges.enabled[chosen.edges] = good
-        optimize(self._graph, self._p.solver)
+        self._live.solve_all()
         is_good = dict(zip(chosen.edges.tolist(), good.tolist(), strict=True))
         changed = []
         for c in closures:

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from rlml_slam import se2
 from rlml_slam.graph.evidence import uniform
 from rlml_slam.graph.factors import relative_information
-from rlml_slam.graph.graph import Graph, Renumbering
+from rlml_slam.graph.graph import Renumbering
+from rlml_slam.graph.live import Live
 from rlml_slam.matching import observability, thinning
 from rlml_slam.matching.scan_match import match
 from rlml_slam.matching.submap import Submap
@@ -51,9 +52,10 @@ class ScanGraph:
     all that were accepted (True) and rejected (False).
     """
 
-    def __init__(self, params: Parameters, graph: Graph) -> None:
+    def __init__(self, params: Parameters, live: Live) -> None:
         self._p = params
-        self._graph = graph
+        self._live = live
+        self._graph = live.graph
         self._active: list[KeySubmap] = []
         self._finished: list[KeySubmap] = []
         self._matcher = Matcher(params)
@@ -362,7 +364,7 @@ class ScanGraph:
         covs: Array = np.asarray(np.linalg.inv(informations), dtype=np.float64)
         wrong = uniform(np.array([c.searched for c in matches]))
         odds = np.array([c.odds for c in matches])
-        may = may_enter(self._graph, nodes, deltas, covs, wrong, odds)
+        may = may_enter(self._live, nodes, deltas, covs, wrong, odds)
         out, waited = [], len(self._waiting)
         for n, (c, enters) in enumerate(zip(matches, may.tolist(), strict=True)):
             if enters:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.live import Live
 from rlml_slam.maps.survey import Survey
 from rlml_slam.matching.association import gate
 from rlml_slam.matching.pair_votes import MIN_MATCHES
@@ -26,14 +26,15 @@ class PlantFrame:
     """Ties the reflectors of a graph to a survey; ``why`` says in words how far that has come."""
 
     def __init__(
-        self, params: Parameters, graph: Graph, reflectors: ReflectorGraph, survey: Survey
+        self, params: Parameters, live: Live, reflectors: ReflectorGraph, survey: Survey
     ) -> None:
         self.survey = survey
         self.found = False
         self.why = 'no reflectors yet'
         self._sigma = params.back_end.survey_sigma
         self._limit = gate(params.reflector.new_gate)
-        self._graph = graph
+        self._live = live
+        self._graph = live.graph
         self._reflectors = reflectors
         self._asked: frozenset[int] = frozenset()
         self._refused: set[int] = set()
@@ -56,6 +57,7 @@ class PlantFrame:
         if placed.T_plant_map is None:
             return False
         self._graph.move(placed.T_plant_map)
+        self._live.start_over()
         self._reflectors.forget_views()
         self.found = True
         return self._tie()

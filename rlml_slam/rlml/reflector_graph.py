@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.graph.eliminate import Ties, limited
-from rlml_slam.graph.graph import Graph, Renumbering
+from rlml_slam.graph.graph import Renumbering
+from rlml_slam.graph.live import Live
 from rlml_slam.graph.marginals import Marginals
 from rlml_slam.matching.association import gate
 from rlml_slam.params import Reflector
@@ -33,9 +34,10 @@ COMMON2 = np.array([1e-4, 1e-4])
 class ReflectorGraph:
     """Sightings (e^R of eq. 12) and landmarks; keys are the front end's."""
 
-    def __init__(self, params: Reflector, graph: Graph) -> None:
+    def __init__(self, params: Reflector, live: Live) -> None:
         self._p = params
-        self._graph = graph
+        self._live = live
+        self._graph = live.graph
         self._landmarks: dict[int, Landmark] = {}
         self._alias: dict[int, int] = {}
         self.gone = GoneList()
@@ -145,13 +147,14 @@ class ReflectorGraph:
         pairs = [(i, j) for i, j in pairs if not self._distinct(alive[i], alive[j])]
         if not pairs:
             return False
-        marginals = Marginals(self._graph)
         merged: set[int] = set()
         limit = gate(self._p.gate)
-        for i, j in sorted(pairs, key=lambda p: gap[p[0], p[1]]):
+        pairs.sort(key=lambda p: gap[p[0], p[1]])
+        covs = [_difference_cov(self._live, alive[i].index, alive[j].index) for i, j in pairs]
+        for (i, j), cov in zip(pairs, covs, strict=True):
             if i in merged or j in merged:
                 continue
-            cov = _difference_cov(marginals, alive[i].index, alive[j].index) + 1e-6 * np.eye(2)
+            cov = cov + 1e-6 * np.eye(2)
             peak = 1.0 / (2.0 * math.pi * math.sqrt(np.linalg.det(cov)))
             if peak < self._p.sure * (peak + self._p.density):
                 continue
@@ -328,11 +331,12 @@ class ReflectorGraph:
         """Pose ``pose`` and all reflectors with their joint covariance."""
         alive = sorted(self.alive(), key=lambda m: m.key)
         index = [m.index for m in alive]
+        cov = self._live.joint([pose], index)
         return Belief(
             self._graph.poses[pose].copy(),
             np.array([m.key for m in alive], dtype=np.int64),
             self._graph.landmarks[index].reshape(-1, 2),
-            Marginals(self._graph).joint([pose], index),
+            cov,
             {key: self.resolve(key) for key in self._alias},
             tuple(self._given_up),
         )
@@ -402,9 +406,9 @@ def _first(a: Landmark, b: Landmark) -> tuple[Landmark, Landmark]:
     return (b, a) if better else (a, b)
 
 
-def _difference_cov(marginals: Marginals, a: int, b: int) -> Array:
+def _difference_cov(live: Live, a: int, b: int) -> Array:
     """Covariance (2, 2) of landmark a minus landmark b."""
-    joint = marginals.joint([], [a, b])
+    joint = live.joint([], [a, b])
     D = np.hstack([np.eye(2), -np.eye(2)])
     cov: Array = D @ joint @ D.T
     return cov

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from rlml_slam import se2
 from rlml_slam.graph.eliminate import Ties, eliminate
-from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.live import Live
 from rlml_slam.graph.prune import prune
 from rlml_slam.graph.table import FactorKind
 from rlml_slam.params import Parameters
@@ -35,10 +35,11 @@ class Sparsifier:
     """Judges every keyframe once, when no submap that is being built needs it any more."""
 
     def __init__(
-        self, params: Parameters, graph: Graph, scans: ScanGraph, reflectors: ReflectorGraph
+        self, params: Parameters, live: Live, scans: ScanGraph, reflectors: ReflectorGraph
     ) -> None:
         self._p = params.back_end
-        self._graph = graph
+        self._live = live
+        self._graph = live.graph
         self._scans = scans
         self._reflectors = reflectors
         self._judged = 0
@@ -66,7 +67,7 @@ class Sparsifier:
         recorded = np.zeros(len(self._graph.edges), dtype=np.bool_)
         of = [edges.get(k, k) for k in self._scans.edges_of_closures()]
         recorded[[k for k in of if k >= 0]] = True
-        new = self._graph.keep(kept, self._reflectors.keep_alive(), recorded)
+        new = self._live.keep(kept, self._reflectors.keep_alive(), recorded)
         self._reflectors.renumber(new)
         self._scans.renumber(new, edges, {k: onto for k, (onto, _) in ties.items()})
         onto_of = np.full(len(keys), -1)

@@ -11,6 +11,7 @@ from rlml_slam import se2
 from rlml_slam.graph.backbone import Backbone
 from rlml_slam.graph.evidence import uniform
 from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.live import Live
 from rlml_slam.rlml.closure_entry import _Between, may_enter
 from rlml_slam.types import EdgeKind
 
@@ -44,7 +45,7 @@ def tried(graph, ends, shift=(0.0, 0.0, 0.0)):
     nodes = np.array(ends)
     off = se2.compose(np.asarray(shift, dtype=np.float64), true(nodes[:, 1]))
     deltas = se2.between(true(nodes[:, 0]), off)
-    return may_enter(graph, nodes, deltas, np.broadcast_to(COV, (len(nodes), 3, 3)), WRONG)
+    return may_enter(Live(graph), nodes, deltas, np.broadcast_to(COV, (len(nodes), 3, 3)), WRONG)
 
 
 def sure(graph):
@@ -63,7 +64,7 @@ def sure(graph):
 
 def test_covariance_of_where_a_pose_is_adds_up_along_a_chain(graph):
     i, j = np.array([3, 90, 7, 0]), np.array([100, 20, 8, 159])
-    covs = _Between(graph, np.unique([i, j])).covs(i, j)
+    covs = _Between(Live(graph), np.unique([i, j])).covs(i, j)
     chain = Backbone(graph, np.arange(len(graph.edges))).motion(i, j)[1]
     assert_allclose(covs, chain, rtol=1e-6, atol=1e-12)
 
@@ -112,7 +113,7 @@ def test_wrong_ones_that_disagree_help_no_one(graph):
     shift[:, :2] += 2.0 * np.sign(shift[:, :2])
     deltas = se2.between(true(nodes[:, 0]), se2.compose(shift, true(nodes[:, 1])))
     covs = np.broadcast_to(COV, (len(nodes), 3, 3))
-    assert not may_enter(sure(graph), nodes, deltas, covs, WRONG).any()
+    assert not may_enter(Live(sure(graph)), nodes, deltas, covs, WRONG).any()
 
 
 def test_nothing_depends_on_the_order_of_submaps_or_on_the_frame(graph):

@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose
 from rlml_slam import se2
 from rlml_slam.errors import InputError, MapError, SolverError
 from rlml_slam.graph.graph import Graph, Renumbering
+from rlml_slam.graph.live import Live
 from rlml_slam.graph.robust import Loss, Losses, LossKind
 from rlml_slam.graph.solver import optimize
 from rlml_slam.params import Parameters
@@ -35,7 +36,7 @@ class Drive:
         self.graph = Graph(Losses(closure=Loss(LossKind.HUBER, 2.0)))
         self.closures = []
         self.rng = np.random.default_rng(0)
-        self.watch = ClosureWatch(Parameters(), self.graph)
+        self.watch = ClosureWatch(Parameters(), Live(self.graph))
 
     def true(self, k):
         phi = 2.0 * np.pi * np.asarray(k) / PER_LAP
@@ -76,10 +77,10 @@ def drive():
 def test_record_of_a_closure_stays_as_long_as_its_edge(monkeypatch):
     """Without it, nobody would know that the closure was revoked, and it would come back."""
     monkeypatch.setattr(loop_closure, 'RECORDS', 4)
-    scans = ScanGraph(Parameters(), Graph())
+    scans = ScanGraph(Parameters(), Live(Graph()))
     edges = [0, -1, -1, 1, -1, 2, -1, 3]
     scans.closures = [Closure(k, k + 9, np.zeros(3), 0.7, e, '') for k, e in enumerate(edges)]
-    same = [np.arange(n) for n in (20, 0, 4, 0)]
+    same = [np.arange(n) for n in (20, 0, 4, 0, 0, 0)]
     scans.renumber(Renumbering(*same), {}, {})
     assert [c.i for c in scans.closures] == [0, 3, 5, 7]
     monkeypatch.setattr(loop_closure, 'RECORDS', 3)

@@ -9,6 +9,7 @@ import pytest
 from made_worlds import ROOM, SECOND, STEP, TinyWorld, drive, messages, polygon
 
 from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.live import Live
 from rlml_slam.params import Parameters
 from rlml_slam.rlml import stored_map
 from rlml_slam.rlml.back_end import BackEnd
@@ -167,7 +168,7 @@ def test_nothing_is_given_up_where_that_is_not_wanted():
 
 def test_odds_follow_bayes():
     graph = Graph()
-    presence = Presence(PARAMS, graph, ReflectorGraph(PARAMS.reflector, graph))
+    presence = Presence(PARAMS, graph, ReflectorGraph(PARAMS.reflector, Live(graph)))
     m, pose = Landmark(0), np.zeros(3)
     empty = PARAMS.reflector.density * math.pi * PARAMS.reflector.min_separation**2
     m.views[0, 0] = (2, 1)
@@ -199,7 +200,7 @@ def test_odds_follow_bayes():
 def test_no_single_while_ends_a_reflector():
     """However often it is missed meanwhile, from wherever it was always seen."""
     graph = Graph()
-    presence = Presence(PARAMS, graph, ReflectorGraph(PARAMS.reflector, graph))
+    presence = Presence(PARAMS, graph, ReflectorGraph(PARAMS.reflector, Live(graph)))
     m = Landmark(0)
     for k in range(100):
         m.views[2 * k, 0] = (1000, 0)
@@ -216,7 +217,7 @@ def test_candidates_do_not_pile_up():
     """What was seen once is let go of, and listed as a ghost."""
     graph = Graph()
     graph.add_pose([1.0, 0.0, 0.0])
-    reflectors = ReflectorGraph(PARAMS.reflector, graph)
+    reflectors = ReflectorGraph(PARAMS.reflector, Live(graph))
     interval, sighting = Interval(np.zeros(3)), Sighting()
     interval.first_look = interval.last_look = SECOND
     sighting.add(np.array([0.5, 0.5]), 1e-4 * np.eye(2))

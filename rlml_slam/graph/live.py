@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The estimate of a graph that a robot adds to, kept at the optimum: what changed is solved.
+
+The common keyframe is a step or some of the incremental solver, which cost what it touches. The
+batch solver does what that cannot: it looks for another start where this one is bad, and never
+ends above it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rlml_slam import params
+from rlml_slam.graph.cost import total_cost
+from rlml_slam.graph.graph import Graph, Renumbering
+from rlml_slam.graph.incremental import Incremental
+from rlml_slam.graph.solver import BAD_START, DEFAULT, optimize
+from rlml_slam.se2 import Array
+
+# Steps that are made without a look at the cost of the whole graph, and in all: then the batch
+# solver takes over, which needs fewer from a start that is no bad one.
+FEW, MOST = 5, 40
+# Share of the cost that is too little to go on for. Robust weights may come to rest slowly: where
+# each step brings 0.9 of what the last one did, this leaves a tenth of 0.1 %, to be taken up when
+# more comes.
+LITTLE = 1e-5
+
+
+class Live:
+    """Solves ``graph`` and tells covariances of it; ``steps`` and ``batches`` count what it took.
+
+    Who moves the estimate itself has to say so by ``start_over``.
+    """
+
+    def __init__(self, graph: Graph, parameters: params.Solver = DEFAULT) -> None:
+        self.graph = graph
+        self.steps = self.batches = 0
+        self._p = parameters
+        self._incremental = Incremental(graph)
+
+    def solve(self) -> None:
+        """Bring the estimate to the optimum; raises SolverError as the solvers do."""
+        graph = self.graph
+        before = graph.poses.copy(), graph.landmarks.copy()
+        self._step()
+        if self._incremental.settled:
+            return  # linear models that still hold: the cost is where they say
+        start, num = total_cost(graph.tables(), *before)
+        cost, steps = start, 1
+        while start <= BAD_START * num and steps < MOST and cost <= start:
+            self._step()
+            steps += 1
+            if self._incremental.settled:
+                return
+            if steps >= FEW:
+                last, cost = cost, total_cost(graph.tables(), graph.poses, graph.landmarks)[0]
+                if abs(last - cost) <= LITTLE * cost:
+                    return
+        graph.poses[:], graph.landmarks[:] = before
+        self.solve_all()
+
+    def solve_all(self) -> None:
+        """The same by the batch solver, in the time that the whole graph takes."""
+        self.batches += 1
+        optimize(self.graph, self._p)
+        self.start_over()
+
+    def start_over(self) -> None:
+        """The estimate was changed by others."""
+        self._incremental.start_over()
+
+    def joint(self, poses: ArrayLike, landmarks: ArrayLike = ()) -> Array:
+        """Joint covariance (3k + 2l, 3k + 2l) of the poses (k,), then the landmarks (l,).
+
+        As that of Marginals; the graph is solved first if it was not, for robust weights count.
+        """
+        self.solve()
+        return self._incremental.joint(poses, landmarks)
+
+    def keep(
+        self,
+        poses: NDArray[np.bool_],
+        landmarks: NDArray[np.bool_],
+        disabled: NDArray[np.bool_] | None = None,
+    ) -> Renumbering:
+        """Graph.keep; what goes should have no enabled factor any more."""
+        self._step()
+        new = self.graph.keep(poses, landmarks, disabled)
+        self._incremental.renumber(new)
+        return new
+
+    def _step(self) -> None:
+        self.steps += 1
+        self._incremental.update()
