@@ -152,8 +152,8 @@ def test_damaged_bag_gives_what_came_before(tmp_path, monkeypatch, capsys):
 
     sound = BagReader.messages
 
-    def damaged(self, topics=None):
-        for k, message in enumerate(sound(self, topics)):
+    def damaged(self, topics=None, **more):
+        for k, message in enumerate(sound(self, topics, **more)):
             if k == 600:
                 raise BagError(f'{self.path}: damaged after {k} messages: cut')
             yield message
