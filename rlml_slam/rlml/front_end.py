@@ -25,12 +25,13 @@ from rlml_slam.rlml.doubt import Doubt
 from rlml_slam.rlml.free_sweep import Sweep
 from rlml_slam.rlml.grid_fix import Fix, SavedGrid
 from rlml_slam.rlml.health import Evidence, HealthMonitor
-from rlml_slam.rlml.joint_state import BIAS, JointState
+from rlml_slam.rlml.joint_state import STANDING, SYSTEMATIC, JointState
 from rlml_slam.rlml.reflector_term import USED, Matched, ReflectorTerm
 from rlml_slam.rlml.relocalize import is_mapped
 from rlml_slam.rlml.scan_term import ScanTerm
 from rlml_slam.rlml.submaps import Submaps
 from rlml_slam.rlml.tracks import Tracks
+from rlml_slam.rlml.wheels import went_on
 from rlml_slam.se2 import Array
 from rlml_slam.types import (
     ANONYMOUS,
@@ -57,7 +58,8 @@ class FrontEnd:
 
     def reset(self, pose: Array, cov: Array) -> None:
         """Forget everything and start at a pose (3,) of the map with covariance (3, 3)."""
-        self.state = JointState(pose, cov, self._p.motion.imu_bias, self._p.motion.free_speeds)
+        m = self._p.motion
+        self.state = JointState(pose, cov, m.imu_bias, m.free_speeds, m.wheels)
         self._reflectors = ReflectorTerm(self._p, self.state)
         self._scans = ScanTerm(self._p, self.state)
         self.health = HealthMonitor(self._p.health)
@@ -105,12 +107,12 @@ class FrontEnd:
         R[:2, :2] = se2.rotation(T_local_map[2])
         cov = R @ cov @ R.T
         if self._map is not None:
-            bias, variance = self.state.x[BIAS], self.state.P[BIAS, BIAS]
+            errors, cov_errors = self.state.x[SYSTEMATIC], self.state.P[SYSTEMATIC, SYSTEMATIC]
             T_map_local, last = self.T_map_local, self._last_stamp
             known = self._map
             self.reset(pose, cov)
             self.use_map(known.reflectors, known.grid)
-            self.state.x[BIAS], self.state.P[BIAS, BIAS] = bias, variance
+            self.state.x[SYSTEMATIC], self.state.P[SYSTEMATIC, SYSTEMATIC] = errors, cov_errors
             self._last_stamp = last
         else:
             self.state.place(pose, cov)
@@ -195,7 +197,9 @@ class FrontEnd:
         doubtful = self._is_doubtful(observation, matched, evidence)
         if coasts:
             motion = self._coasting.found(self.state, observation.motion)
-            observation = replace(observation, motion=motion)
+        else:
+            motion = self.state.corrected(observation.motion)
+        observation = replace(observation, motion=motion)
         observation = self._reflectors.with_spread(observation, matched)
         self._reflectors.grow(observation, matched, doubtful)
         self._scans.insert(observation, evidence, doubtful and evidence.misfit)
@@ -228,8 +232,10 @@ class FrontEnd:
         if coasts:
             self._coasting.predict(self.state, dt, observation.motion)
         else:
-            # the variance that the gyro's bias gains until now
-            self.state.predict(observation.motion, self._p.motion.imu_bias_walk**2 * dt)
+            p, motion = self._p.motion, observation.motion
+            went = went_on(self._velocity, dt, p) if motion.known else STANDING
+            kept = math.exp(-dt / p.wheels_time)
+            self.state.predict(motion, p.imu_bias_walk**2 * dt, kept, went)
         return coasts
 
     def _remember_velocity(self, stamp: int) -> None:

@@ -22,25 +22,35 @@ from rlml_slam.se2 import Array
 from rlml_slam.types import Motion
 
 BIAS = 3
-VELOCITY = 4
-ANCHORS = (7, 10)
-LANDMARKS = 13
+SPEED, TURN = 4, 5
+VELOCITY = 6
+ANCHORS = (9, 12)
+LANDMARKS = 15
+WHEELS = slice(SPEED, TURN + 1)
+SYSTEMATIC = slice(BIAS, TURN + 1)
+STANDING = np.zeros(2)
 MOVING = slice(VELOCITY, VELOCITY + 3)
 
 
 class JointState:
-    """Mean ``x`` (13 + 2m,) and covariance ``P`` of all that is estimated together.
+    """Mean ``x`` (15 + 2m,) and covariance ``P`` of all that is estimated together.
 
-    In this order: the pose, the gyro's bias, the velocity (forward, left, turn) of the base, which
-    a robot with odometry does not need (:mod:`coasting`), two anchors, the reflectors; and
+    In this order: the pose, the gyro's bias, the shares by which the robot is faster and turns
+    more than its wheels tell, the velocity (forward, left, turn) of the base, which a robot with
+    odometry does not need (:mod:`coasting`), two anchors, the reflectors; and
     ``extra`` rows, zero but while reflectors are left out (:mod:`distant`): of what they depend
     on, the rows ``tied``, those that are nothing else any more.
     """
 
     def __init__(
-        self, pose: Array, cov: Array, bias_sigma: float, speeds: Sequence[float] = (0.0, 0.0, 0.0)
+        self,
+        pose: Array,
+        cov: Array,
+        bias_sigma: float,
+        speeds: Sequence[float] = (0.0, 0.0, 0.0),
+        wheels: Sequence[float] = (0.0, 0.0),
     ) -> None:
-        """``speeds`` (3,) [m/s, m/s, rad/s] are the sigmas of an unknown velocity."""
+        """Sigmas: ``speeds`` (3,) [m/s, m/s, rad/s] of an unknown velocity, ``wheels`` (2,)."""
         self.x = np.zeros(LANDMARKS)
         self.P = np.zeros((LANDMARKS, LANDMARKS))
         self.x[:3] = pose
@@ -48,6 +58,8 @@ class JointState:
         self.P[BIAS, BIAS] = bias_sigma**2
         self._unknown = np.diag(np.array(speeds) ** 2)
         self.P[MOVING, MOVING] = self._unknown
+        self._wheels2 = np.array(wheels) ** 2
+        self.P[WHEELS, WHEELS] = np.diag(self._wheels2)
         self.extra = 0
         self.tied = np.zeros(0, dtype=np.int64)
 
@@ -96,21 +108,42 @@ class JointState:
         P[3:, :3], P[3:, 3:] = self.P[rows, :3], self.P[rows, rows]
         return P
 
-    def predict(self, motion: Motion, walk: float) -> None:
-        """Move the pose by a relative motion with its covariance (eq. 5), less the gyro's bias.
+    def predict(
+        self, motion: Motion, walk: float, kept: float = 1.0, went: Array = STANDING
+    ) -> None:
+        """Move the pose by a relative motion with its covariance (eq. 5), as wheels and gyro err.
 
-        ``walk`` is the variance that the bias gained meanwhile.
+        Meanwhile the gyro's bias gained the variance ``walk``, and of what the wheels err by, a
+        share of ``kept`` is left; the rest is new (an Ornstein-Uhlenbeck process).
+
+        ``went`` (2,) [m, rad] is how far the robot came and turned by what was known before, which
+        takes the place of odometry in the derivatives by these shares (:mod:`wheels`).
         """
         if math.isfinite(motion.bias_var):
-            self._measure_bias(motion.bias, motion.bias_var)
-        predict(self.x, self.P, motion.delta, motion.cov, motion.bias_gain, walk)
+            self._measure_bias(motion.bias, motion.bias_var, motion.bias_turn)
+        predict(
+            self.x, self.P, motion.delta, motion.cov, motion.bias_gain, motion.turn_gain,
+            went, walk, kept, self._wheels2,
+        )  # fmt: skip
 
-    def _measure_bias(self, bias: float, variance: float) -> None:
-        """Scalar update with what IMU and wheels say of the bias, gated against slip."""
-        S = float(self.P[BIAS, BIAS]) + variance
-        error = bias - float(self.x[BIAS])
+    def corrected(self, motion: Motion) -> Motion:
+        """A motion as it is by what is known now of how wheels and gyro err."""
+        bias, speed, turn = self.x[SYSTEMATIC].tolist()
+        delta = motion.delta + bias * motion.bias_gain + turn * motion.turn_gain
+        delta[:2] *= 1.0 + speed
+        delta[2] = se2.wrapped(delta[2])
+        return Motion(delta, motion.cov, motion.known)
+
+    def _measure_bias(self, bias: float, variance: float, turn: float = 0.0) -> None:
+        """Scalar update with what IMU and wheels say of the bias, gated against slip.
+
+        Wheels that turned by ``turn`` [rad/s] say it but for the share that they err by.
+        """
+        PH = self.P[:, BIAS] + turn * self.P[:, TURN]
+        S = float(PH[BIAS] + turn * PH[TURN]) + variance
+        error = bias - float(self.x[BIAS] + turn * self.x[TURN])
         if error * error < 16.0 * S:
-            gain = self.P[:, BIAS] / S
+            gain = PH / S
             self.x += gain * error
             self.x[2] = se2.wrapped(self.x[2])
             self.P -= np.outer(gain, gain) * S
@@ -165,6 +198,7 @@ class JointState:
         rows = np.r_[0:3, LANDMARKS:n]
         P[np.ix_(rows, rows)] = cov
         P[BIAS, BIAS] = self.P[BIAS, BIAS]
+        P[WHEELS, WHEELS] = self.P[WHEELS, WHEELS]
         P[MOVING, MOVING] = self.P[MOVING, MOVING]
         for a in ANCHORS:
             J, _ = se2.compose_jacobians(x[:3], se2.between(x[:3], x[a : a + 3]))
@@ -243,29 +277,55 @@ class JointState:
 
 
 @brief
-def predict(x: Array, P: Array, delta: Array, cov: Array, gain: Array, walk: float) -> None:
+def predict(
+    x: Array,
+    P: Array,
+    delta: Array,
+    cov: Array,
+    bias_gain: Array,
+    turn_gain: Array,
+    went: Array,
+    walk: float,
+    kept: float,
+    wheels2: Array,
+) -> None:
     """Eq. 5 and its covariance in place; see :meth:`JointState.predict`."""
     c, s = math.cos(x[2]), math.sin(x[2])
-    dx, dy = delta[0] + gain[0] * x[BIAS], delta[1] + gain[1] * x[BIAS]
-    turn = x[2] + delta[2] + gain[2] * x[BIAS]
-    gx, gy = -s * dx - c * dy, c * dx - s * dy  # by the heading
-    bx, by, bt = c * gain[0] - s * gain[1], s * gain[0] + c * gain[1], gain[2]  # by the bias
-    x[0] += gy
-    x[1] -= gx
+    moved = delta + bias_gain * x[BIAS] + turn_gain * x[TURN]
+    faster = 1.0 + x[SPEED]
+    D = np.zeros((3, 4))  # of the pose by the heading, and bias, share of speed and of turn
+    gx, gy = faster * (c * moved[0] - s * moved[1]), faster * (s * moved[0] + c * moved[1])
+    D[0, 0], D[1, 0] = -gy, gx
+    D[0, 1] = faster * (c * bias_gain[0] - s * bias_gain[1])
+    D[1, 1] = faster * (s * bias_gain[0] + c * bias_gain[1])
+    D[2, 1] = bias_gain[2]
+    # on an arc, a share of the way is along its chord, and one of the turn turns that by half
+    middle = x[2] + 0.5 * moved[2]
+    D[0, 2], D[1, 2] = math.cos(middle) * went[0], math.sin(middle) * went[0]
+    if turn_gain.any():
+        D[0, 3], D[1, 3], D[2, 3] = -0.5 * gy * went[1], 0.5 * gx * went[1], went[1]
+    x[0] += gx
+    x[1] += gy
+    turn = x[2] + moved[2]
     x[2] = np.pi - (np.pi - turn) % (2.0 * np.pi)
     for k in range(len(x)):
-        heading, bias = P[2, k], P[BIAS, k]
-        P[0, k] += gx * heading + bx * bias
-        P[1, k] += gy * heading + by * bias
-        P[2, k] += bt * bias
+        heading, bias, speed, share = P[2, k], P[BIAS, k], P[SPEED, k], P[TURN, k]
+        for r in range(3):
+            P[r, k] += D[r, 0] * heading + D[r, 1] * bias + D[r, 2] * speed + D[r, 3] * share
     for k in range(len(x)):
-        heading, bias = P[k, 2], P[k, BIAS]
-        P[k, 0] += gx * heading + bx * bias
-        P[k, 1] += gy * heading + by * bias
-        P[k, 2] += bt * bias
+        heading, bias, speed, share = P[k, 2], P[k, BIAS], P[k, SPEED], P[k, TURN]
+        for r in range(3):
+            P[k, r] += D[r, 0] * heading + D[r, 1] * bias + D[r, 2] * speed + D[r, 3] * share
     G = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     P[:3, :3] += np.dot(np.dot(G, cov), G.T.copy())
     P[BIAS, BIAS] += walk
+    if kept < 1.0:
+        for k in range(2):
+            e = SPEED + k
+            x[e] *= kept
+            P[e] *= kept
+            P[:, e] *= kept
+            P[e, e] += (1.0 - kept * kept) * wheels2[k]
 
 
 @kernel
@@ -287,5 +347,6 @@ def update(x: Array, P: Array, columns: NDArray[np.int64], H: Array, R: Array, v
 def warm_up() -> None:
     """Compile the kernels with the signatures that are used at run time."""
     state = JointState(np.zeros(3), np.eye(3), 0.1)
-    predict(state.x, state.P, np.zeros(3), np.eye(3), np.zeros(3), 0.0)
+    zero = np.zeros(3)
+    predict(state.x, state.P, zero, np.eye(3), zero, zero, STANDING, 0.0, 1.0, np.zeros(2))
     state.apply(np.arange(3), np.eye(3), np.eye(3), np.zeros(3))

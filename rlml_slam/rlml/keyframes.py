@@ -90,8 +90,7 @@ class Interval:
     def add_motion(self, frame: Frame) -> None:
         """Compose the odometry motion of one more frame."""
         self.motion = compose_motion(self.motion, frame.observation.motion)
-        motion = frame.observation.motion
-        self.scanned |= bool(np.isfinite(frame.scan_score)) or bool(motion.bias_gain.any())
+        self.scanned |= bool(np.isfinite(frame.scan_score))
 
     def jump(self, frame: Frame) -> None:
         """The frame's place was found anew: only that place tells how far it is from here."""

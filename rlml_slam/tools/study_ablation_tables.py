@@ -13,7 +13,7 @@ SENSORS: dict[str, dict[str, bool]] = {
     'reflectors': {'use_scan': False},
     'both': {},
 }
-FAULTS = ('slip', 'ghosts', 'missed', 'dropout', 'jitter')
+FAULTS = ('slip', 'worn', 'ghosts', 'missed', 'dropout', 'jitter')
 COLUMNS: dict[str, tuple[str, float, int]] = {
     'ate_m': ('ATE [cm]', 100.0, 2),
     'max_m': ('largest [cm]', 100.0, 1),

@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from differences import central_differences
@@ -6,33 +8,65 @@ from made_states import made
 
 from rlml_slam import se2
 from rlml_slam.matching.innovations import expected
-from rlml_slam.rlml.joint_state import ANCHORS, BIAS, LANDMARKS
+from rlml_slam.rlml.joint_state import ANCHORS, BIAS, LANDMARKS, SPEED, TURN, WHEELS
 from rlml_slam.types import Motion
 
 
 def motion(**kw):
     cov = np.array([[4e-4, 1e-5, 2e-5], [1e-5, 2e-4, 1e-5], [2e-5, 1e-5, 3e-4]])
-    return Motion(np.array([0.3, -0.02, 0.2]), cov, True, np.array([0.01, -0.02, -0.1]), **kw)
+    gains = {'bias_gain': np.array([0.01, -0.02, -0.1]), 'turn_gain': np.array([-0.02, 0.1, 0.15])}
+    return Motion(np.array([0.3, -0.02, 0.2]), cov, **gains, **kw)
+
+
+def moved(m, x):
+    """What a motion is by a state (n,) that tells how wheels and gyro err."""
+    delta = m.delta + m.bias_gain * x[BIAS] + m.turn_gain * x[TURN]
+    return delta * [1.0 + x[SPEED], 1.0 + x[SPEED], 1.0]
 
 
 @pytest.mark.parametrize('theta', [0.0, 0.4, 3.1, -3.1])
 def test_prediction_is_that_of_a_dense_ekf(theta):
-    state = made(theta=theta)
-    x, P, m = state.x.copy(), state.P.copy(), motion()
+    state, way, turn = made(theta=theta), 0.3, 0.2
+    state.x[[BIAS, TURN]] = 0.0
+    # an arc of the midpoint model, and a robot that went as far before
+    arc = np.array([way * np.cos(0.5 * turn), way * np.sin(0.5 * turn), turn])
+    by_turn = turn * np.array([-0.5 * arc[1], 0.5 * arc[0], 1.0])
+    m = replace(motion(), delta=arc, turn_gain=by_turn)
+    x, P = state.x.copy(), state.P.copy()
 
     def f(v):
         out = v.copy()
-        out[:3] = se2.compose(v[:3], m.delta + m.bias_gain * v[BIAS])
+        out[:3] = se2.compose(v[:3], moved(m, v))
+        out[WHEELS] *= 0.9
         return out
 
     F = central_differences(f, x, angles=(2,))
-    _, G = se2.compose_jacobians(x[:3], m.delta + m.bias_gain * x[BIAS])
+    _, G = se2.compose_jacobians(x[:3], moved(m, x))
     Q = np.zeros_like(P)
     Q[:3, :3] = G @ m.cov @ G.T
     Q[BIAS, BIAS] = 1e-6
-    state.predict(m, 1e-6)
+    Q[WHEELS, WHEELS] = (1.0 - 0.9**2) * np.diag([0.03, 0.05]) ** 2
+    state.predict(m, 1e-6, 0.9, np.array([way, turn]))
     np.testing.assert_allclose(state.x, f(x), atol=1e-12)
     np.testing.assert_allclose(state.P, F @ P @ F.T + Q, atol=1e-8)
+
+
+def test_prediction_and_corrected_motion_are_as_the_state_says_that_wheels_and_gyro_err():
+    state, m = made(11), motion()
+    x = state.x.copy()
+    np.testing.assert_allclose(state.corrected(m).delta, moved(m, x), atol=1e-12)
+    np.testing.assert_array_equal(state.corrected(m).cov, m.cov)
+    state.predict(m, 0.0)
+    np.testing.assert_allclose(state.pose, se2.compose(x[:3], moved(m, x)), atol=1e-12)
+
+
+def test_share_of_turn_changes_nothing_where_the_gyro_tells_the_turn():
+    state = made(12)
+    state.P[TURN] = state.P[:, TURN] = 0.0
+    before = state.P[:3].copy()
+    state.P[TURN, TURN] = 0.05**2
+    state.predict(replace(motion(), turn_gain=np.zeros(3)), 0.0, 1.0, np.array([0.0, 0.2]))
+    np.testing.assert_array_equal(state.P[TURN, :3], before[:, TURN])
 
 
 def test_update_is_that_of_a_dense_ekf():
@@ -72,6 +106,18 @@ def test_bias_is_measured_as_a_scalar_and_an_outlier_is_not():
     state._measure_bias(5.0, 1e-3)
     np.testing.assert_array_equal(state.x, x)
     np.testing.assert_array_equal(state.P, P)
+
+
+def test_bias_that_turning_wheels_tell_is_with_their_share_of_turn():
+    state = made(13)
+    x, P = state.x.copy(), state.P.copy()
+    H = np.zeros((1, len(x)))
+    H[0, BIAS], H[0, TURN] = 1.0, 0.7
+    S = H @ P @ H.T + 1e-3
+    K = P @ H.T / S
+    state._measure_bias(0.03, 1e-3, 0.7)
+    np.testing.assert_allclose(state.x, x + K[:, 0] * (0.03 - H[0] @ x), atol=1e-12)
+    np.testing.assert_allclose(state.P, P - S * K @ K.T, atol=1e-12)
 
 
 def test_motion_that_tells_the_bias_changes_it():
