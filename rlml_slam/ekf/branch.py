@@ -136,9 +136,11 @@ class Branch:
         f = self.filter
         delta, gains = f.corrected(motion)
         lasting = gains @ f.P[BIAS:ROBOT, BIAS:ROBOT] @ gains.T
-        f.predict(motion, walk, kept)
+        took = f.predict(motion, walk, kept)
         self.candidates.move(delta, motion.cov + lasting)
-        self._step = Step(motion, walk, kept)
+        # the smoother shall use what the filter did
+        used = motion if took else dataclasses.replace(motion, bias_var=math.inf)
+        self._step = Step(used, walk, kept)
 
     def log(self, stamp: int, steps: bool) -> None:
         """Remember the pose, and ``steps``, what it comes from."""

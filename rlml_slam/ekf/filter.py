@@ -71,15 +71,15 @@ class Filter:
 
     # --- step 1 ----------------------------------------------------------------------------
 
-    def predict(self, motion: Motion, walk: float = 0.0, kept: float = 1.0) -> None:
+    def predict(self, motion: Motion, walk: float = 0.0, kept: float = 1.0) -> bool:
         """Move the robot: P_rr <- A P_rr A^T + Q, P_ri <- A P_ri (eq. 7, 8), in O(n).
 
         Q = W C W^T is the motion's covariance turned into the map. Meanwhile the gyro's bias
         gained the variance ``walk``, and of what the wheels err by a share of ``kept`` is left,
-        the rest is new (Gauss-Markov process).
+        the rest is new (Gauss-Markov process). The answer is whether what IMU and wheels say of
+        the bias was used.
         """
-        if np.isfinite(motion.bias_var):
-            self._measure_bias(motion)
+        took = np.isfinite(motion.bias_var) and self._measure_bias(motion)
         delta, gains = self.corrected(motion)
         J_a, J_b = se2.compose_jacobians(self.x[:3], delta)
         self.x[:3] = se2.compose(self.x[:3], delta)
@@ -98,6 +98,7 @@ class Filter:
         P[:ROBOT, :ROBOT] = 0.5 * (rr + rr.T)
         if self._phi is not None:
             self._phi[:ROBOT] = A @ self._phi[:ROBOT]
+        return bool(took)
 
     def corrected(self, motion: Motion) -> tuple[Array, Array]:
         """The motion (3,) by what is known of gyro and wheels; d motion / d (b, s, t) (3, 3)."""
@@ -107,13 +108,15 @@ class Filter:
         gains = np.stack([scale * motion.bias_gain, way, scale * motion.turn_gain], axis=1)
         return scale * delta, gains
 
-    def _measure_bias(self, motion: Motion) -> None:
-        """What IMU and wheels together say of the bias, gated against slip."""
+    def _measure_bias(self, motion: Motion) -> bool:
+        """What IMU and wheels together say of the bias, gated against slip; whether it passed."""
         columns, H = np.array([BIAS, TURN]), np.array([[1.0, motion.bias_turn]])
         error = motion.bias - float(H[0] @ self.x[columns])
         variance = float(H[0] @ self.P[np.ix_(columns, columns)] @ H[0]) + motion.bias_var
-        if error * error < 16.0 * variance:
+        passed = error * error < 16.0 * variance
+        if passed:
             self.apply(columns, H, np.array([[motion.bias_var]]), np.array([error]))
+        return passed
 
     # --- step 2 ----------------------------------------------------------------------------
 

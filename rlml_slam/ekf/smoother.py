@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 ITERATIONS = 20
 SETTLED = 1e-6  # [m], [rad] of the largest correction
+LEAST = 1e-3  # share of a step below which a better one is not looked for
 FLOOR = 1e-6  # least sigma of anything: what is surer is taken for this, to be divided by
 
 
@@ -230,9 +231,11 @@ def smooth(start: Start, steps: Sequence[Step], model: Model, poses: Array) -> S
             placed = points + share * dx[x.size :].reshape(points.shape)
             rows = problem.rows(moved, placed)
             new = float(rows.errors() @ rows.errors())
-            if new <= cost * (1.0 + 1e-9) or share < 1e-3:
+            if new <= cost * (1.0 + 1e-9):
                 break
             share *= 0.5
+            if share < LEAST:  # nothing on the way is better, or it is no number
+                return Smoothed(x[0], x[1:], problem.keys, points)
         x, points, cost = moved, placed, new
         if np.abs(share * dx).max() < SETTLED:
             break

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rlml_slam import params
+from rlml_slam.errors import SolverError
 from rlml_slam.graph.cost import total_cost
 from rlml_slam.graph.graph import Graph, Renumbering
 from rlml_slam.graph.incremental import Incremental
@@ -44,22 +45,32 @@ class Live:
         """Bring the estimate to the optimum; raises SolverError as the solvers do."""
         graph = self.graph
         before = graph.poses.copy(), graph.landmarks.copy()
+        try:
+            if self._descend(before):
+                return
+        except SolverError:
+            pass  # where the graph itself is to blame, the batch solver says so
+        graph.poses[:], graph.landmarks[:] = before
+        self.solve_all()
+
+    def _descend(self, before: tuple[Array, Array]) -> bool:
+        """Steps until the optimum is reached, or False where they do not lead there."""
+        graph = self.graph
         self._step()
         if self._incremental.settled:
-            return  # linear models that still hold: the cost is where they say
+            return True  # linear models that still hold: the cost is where they say
         start, num = total_cost(graph.tables(), *before)
         cost, steps = start, 1
         while start <= BAD_START * num and steps < MOST and cost <= start:
             self._step()
             steps += 1
             if self._incremental.settled:
-                return
+                return True
             if steps >= FEW:
                 last, cost = cost, total_cost(graph.tables(), graph.poses, graph.landmarks)[0]
                 if abs(last - cost) <= LITTLE * cost:
-                    return
-        graph.poses[:], graph.landmarks[:] = before
-        self.solve_all()
+                    return True
+        return False
 
     def solve_all(self) -> None:
         """The same by the batch solver, in the time that the whole graph takes."""
@@ -86,7 +97,11 @@ class Live:
         disabled: NDArray[np.bool_] | None = None,
     ) -> Renumbering:
         """Graph.keep; what goes should have no enabled factor any more."""
-        self._step()
+        try:
+            self._step()
+        except SolverError:
+            self.start_over()
+            return self.graph.keep(poses, landmarks, disabled)
         new = self.graph.keep(poses, landmarks, disabled)
         self._incremental.renumber(new)
         return new

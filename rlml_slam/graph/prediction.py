@@ -13,6 +13,8 @@ from rlml_slam.graph.marginals import Marginals
 from rlml_slam.se2 import Array
 
 Ints = NDArray[np.int64]
+# of an edge's covariance: less than this is what is left of a difference of equal figures
+ROUNDING = 1e-9
 
 
 def difference_covs(marginals: Marginals, poses: Array, i: Ints, j: Ints) -> Array:
@@ -53,12 +55,21 @@ def left_out(graph: Graph, marginals: Marginals, edges: Ints) -> tuple[Array, Ar
     """
     e = graph.edges
     at = np.searchsorted(np.flatnonzero(e.enabled), edges)
-    R = np.linalg.inv(e.information[edges])
+    R = np.asarray(np.linalg.inv(e.information[edges]), dtype=np.float64)
     i, j = e.nodes[edges].T
     r = relative_pose(graph.poses[i], graph.poses[j], e.measured[edges])[0]
-    gain = R @ np.linalg.inv(R - residual_covs(graph, marginals)[at])
+    gain = R @ _inverse_rest(R, residual_covs(graph, marginals)[at])
     S = gain @ R
     return (gain @ r[..., None])[..., 0], 0.5 * (S + np.swapaxes(S, 1, 2))
+
+
+def _inverse_rest(R: Array, Q: Array) -> Array:
+    """(R - Q)^-1 (k, 3, 3), where an edge that alone ties two parts together leaves nothing."""
+    L = np.linalg.inv(np.linalg.cholesky(R))
+    rest = L @ (R - Q) @ np.swapaxes(L, 1, 2)
+    value, axes = np.linalg.eigh(0.5 * (rest + np.swapaxes(rest, 1, 2)))
+    W = np.swapaxes(axes, 1, 2) @ L
+    return np.asarray(np.swapaxes(W, 1, 2) @ (W / np.maximum(value, ROUNDING)[..., None]))
 
 
 def _jacobians(poses: Array, i: Ints, j: Ints) -> tuple[Array, Array]:

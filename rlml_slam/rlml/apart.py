@@ -92,8 +92,15 @@ class Apart:
         while self._owed and self._updates.poll():
             self._came += self._receive()
         self._owed += 1
-        self._frames.send(packed(self._waiting))
+        self._tell(packed(self._waiting))
         self._waiting = []
+
+    def _tell(self, what: Any) -> None:
+        try:
+            self._frames.send(what)
+        except BrokenPipeError:
+            self._receive()  # says how the process ended
+            raise
 
     def _ask(self, what: str) -> Any:
         if self._waiting:
@@ -101,7 +108,7 @@ class Apart:
         while self._owed:  # what frames did comes before the answer
             self._came += self._receive()
         self._owed += 1
-        self._frames.send(what)
+        self._tell(what)
         return self._receive()
 
     def _receive(self) -> Any:

@@ -233,7 +233,7 @@ class FrontEnd:
             self._coasting.predict(self.state, dt, observation.motion)
         else:
             p, motion = self._p.motion, observation.motion
-            went = went_on(self._velocity, dt, p) if motion.known else STANDING
+            went = went_on(self._velocity, dt, p, motion) if motion.known else STANDING
             kept = math.exp(-dt / p.wheels_time)
             self.state.predict(motion, p.imu_bias_walk**2 * dt, kept, went)
         return coasts

@@ -81,13 +81,13 @@ def drive(source: Source, out: Path, quiet: bool) -> Run:
             if not recorder.frames.stamps:
                 raise RlmlError('the front end never published a pose')
             if source.keeps_map:
-                problem = live_map.save(recorder, executor)
+                problem = live_map.save(recorder, executor, check)
         finally:
             executor.shutdown(timeout_sec=1.0)
             recorder.destroy_node()
         result = recorder.run(source.title)
         if source.keeps_map and not problem:
-            live_map.take(result, Path(maps))
+            problem = live_map.take(result, Path(maps))
     result.problem = problem
     result.extra = _live_figures(recorder, load)
     return result

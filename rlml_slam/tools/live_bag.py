@@ -83,7 +83,9 @@ def source(
         args.config,
         (inputs.topics[sensor], STREAMS[sensor][1]),
         # a survey and a map to localize in are in the map_directory that the file tells
-        keeps_map=not params.back_end.survey and params.node.mode == 'mapping',
+        keeps_map=not (
+            params.back_end.survey or params.node.continue_map or params.node.mode != 'mapping'
+        ),
     )  # fmt: skip
 
 

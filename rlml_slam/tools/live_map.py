@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from rclpy.executors import SingleThreadedExecutor
 from std_srvs.srv import Trigger
 
+from rlml_slam.errors import RlmlError
 from rlml_slam.rlml import stored_map
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.closure_table import closure_table
@@ -19,15 +21,21 @@ PATIENCE = 30.0  # [s] in which it answers: it may have keyframes to work off
 NAME = 'map'
 
 
-def save(node: Any, executor: SingleThreadedExecutor) -> str:
-    """Have the back end write its map into its map_directory; why it did not, or nothing."""
+def save(node: Any, executor: SingleThreadedExecutor, check: Callable[[], None]) -> str:
+    """Have the back end write its map into its map_directory; why it did not, or nothing.
+
+    ``check`` is called while it takes, and may raise.
+    """
     client = node.create_client(Trigger, 'back_end/save_map')
     deadline = time.monotonic() + PATIENCE
     while not client.service_is_ready() and time.monotonic() < deadline:
         executor.spin_once(timeout_sec=0.1)
+        check()
     future = client.call_async(Trigger.Request())
+    deadline = time.monotonic() + PATIENCE
     while not future.done() and time.monotonic() < deadline:
         executor.spin_once(timeout_sec=0.1)
+        check()
     if not future.done():
         future.cancel()
         return f'the map was not saved: no answer of the back end within {PATIENCE:g} s'
@@ -35,8 +43,16 @@ def save(node: Any, executor: SingleThreadedExecutor) -> str:
     return '' if answer.success else f'the map was not saved: {answer.message}'
 
 
-def take(run: Run, folder: Path) -> None:
-    """Give a run the map that was saved into a folder, and what it tells."""
+def take(run: Run, folder: Path) -> str:
+    """Give a run the map that was saved into a folder, and what it tells; else what is wrong."""
+    try:
+        _take(run, folder)
+    except RlmlError as e:
+        return f'the map that was saved cannot be read: {e}'
+    return ''
+
+
+def _take(run: Run, folder: Path) -> None:
     run.stored = stored_map.load(folder / f'{NAME}.rlml')
     back_end = BackEnd(stored_map.parameters_of(run.stored))
     stored_map.restore(run.stored, back_end)

@@ -33,9 +33,8 @@ def drive(rng, shares, steps, turning=0.6):
         cov = np.diag([sigma[0], 1e-4, sigma[1]]) ** 2
         by_turn = tells[1] * np.array([-0.5 * delta[1], 0.5 * delta[0], 1.0])
         before = state.pose
-        state.predict(
-            Motion(delta, cov, turn_gain=by_turn), 0.0, kept, went_on(velocity, DT, NOISE)
-        )
+        motion = Motion(delta, cov, turn_gain=by_turn)
+        state.predict(motion, 0.0, kept, went_on(velocity, DT, NOISE, motion))
         z = pose + SIGMA * rng.standard_normal(3)
         error = z - state.pose
         error[2] = se2.wrapped(error[2])
@@ -73,3 +72,10 @@ def test_noise_of_the_wheels_is_not_taken_for_a_share():
     x, P, _ = drive(np.random.default_rng(2), (0.0, 0.0), 2000, turning=0.0)
     assert abs(x[1]) < 0.01
     assert P[1, 1] == pytest.approx(NOISE.wheels[1] ** 2, rel=0.02)
+
+
+def test_way_is_bounded_by_what_wheels_tell():
+    """After a jump of the pose its velocity is none; unseen, a robot may have braked."""
+    motion = Motion(np.array([0.1, 0.0, 0.01]), np.diag([0.02, 0.02, 0.01]) ** 2)
+    way, turn = went_on(np.array([5.0, 0.0, -9.0]), 0.5, NOISE, motion)
+    np.testing.assert_allclose((way, turn), (0.1 + 3 * 0.02, 0.01 - 3 * 0.01))
