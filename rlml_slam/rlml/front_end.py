@@ -117,7 +117,7 @@ class FrontEnd:
         else:
             self.state.place(pose, cov)
             self._scans.begin_anew()
-            self._since = None
+            self._since, self._velocity = None, np.zeros(3)
             T_map_local = self.T_map_local
         # what the graph knows is of where the robot was
         self._correction = Correction(T_map_local)
@@ -233,7 +233,7 @@ class FrontEnd:
             self._coasting.predict(self.state, dt, observation.motion)
         else:
             p, motion = self._p.motion, observation.motion
-            went = went_on(self._velocity, dt, p, motion) if motion.known else STANDING
+            went = went_on(self._velocity, dt, p) if motion.known else STANDING
             kept = math.exp(-dt / p.wheels_time)
             self.state.predict(motion, p.imu_bias_walk**2 * dt, kept, went)
         return coasts

@@ -17,23 +17,23 @@ import numpy as np
 
 from rlml_slam.params import MotionNoise
 from rlml_slam.se2 import Array
-from rlml_slam.types import Motion
 
-SIGMAS = 3.0  # of a motion's noise
+FRESH = 1.0  # [s] for which a robot goes on about as it went: it takes as long to stop
 
 
-def went_on(velocity: Array, dt: float, noise: MotionNoise, motion: Motion) -> Array:
+def went_on(velocity: Array, dt: float, noise: MotionNoise) -> Array:
     """Way and turn (2,) [m, rad] in ``dt`` [s] at a velocity (3,), less the floors of noise.
 
-    Where the robot went on in another way, or the velocity is of a pose that was put right, what
-    the wheels themselves tell bounds it.
+    None where the robot may have gone on in another way, or the velocity is that of a pose that
+    was put right: such a motion tells nothing of a share. Today's wheels must not bound it, or
+    their noise would be in it again.
     """
     v, w = float(velocity[0]), float(velocity[2])
-    way = dt * math.copysign(max(abs(v) - noise.b, 0.0), v)
-    turn = dt * math.copysign(max(abs(w) - noise.d, 0.0), w)
-    return np.array([_within(way, motion, 0), _within(turn, motion, 2)])
-
-
-def _within(value: float, motion: Motion, k: int) -> float:
-    middle, wide = float(motion.delta[k]), SIGMAS * math.sqrt(motion.cov[k, k])
-    return min(max(value, middle - wide), middle + wide)
+    if dt > FRESH or abs(v) > noise.max_speed or abs(w) > noise.max_turn_rate:
+        return np.zeros(2)
+    return np.array(
+        [
+            dt * math.copysign(max(abs(v) - noise.b, 0.0), v),
+            dt * math.copysign(max(abs(w) - noise.d, 0.0), w),
+        ]
+    )
