@@ -50,8 +50,10 @@ class EkfSlam(Driven):
         found = self.estimator.reflectors()
         if self._smoothed is None:
             return found
-        at = np.searchsorted(self._smoothed.keys, found.keys)
-        return dataclasses.replace(found, points=self._smoothed.points[at])
+        _, at, here = np.intersect1d(found.keys, self._smoothed.keys, return_indices=True)
+        points = found.points.copy()
+        points[at] = self._smoothed.points[here]
+        return dataclasses.replace(found, points=points)
 
     def occupancy_grid(self) -> OccupancyGrid | None:
         """The scans drawn along the trajectory, None without any."""

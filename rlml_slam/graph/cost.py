@@ -5,7 +5,10 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from rlml_slam.compiled import brief, part
+from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.linearize import wrapped
 from rlml_slam.graph.robust import loss
 from rlml_slam.graph.structure import Ints
@@ -86,3 +89,8 @@ def _of_landmarks(
         cost += loss(losses[kinds[r], 0], losses[kinds[r], 1], squared)[0]
         num += 1
     return cost, num
+
+
+def warm_up() -> None:
+    """Compile the kernel."""
+    total_cost(Graph().tables(), np.zeros((0, 3)), np.zeros((0, 2)))

@@ -252,13 +252,16 @@ class Incremental:
             self._state = grown(state, *sizes)
 
 
-def compile_kernels() -> None:
-    """Compile the kernels of the incremental solver."""
+def warm_up() -> None:
+    """Compile every kernel of a graph that grows and lets go of nodes."""
     graph = Graph()
-    graph.add_pose([0.0, 0.0, 0.0], fixed=True)
-    graph.add_pose([1.0, 0.0, 0.0])
-    graph.add_edge(EdgeKind.ODOMETRY, 0, 1, [1.0, 0.0, 0.0], np.eye(3))
     solver = Incremental(graph)
-    solver.update()
-    solver.joint([1])
-    solver.renumber(graph.keep(np.ones(2, np.bool_), np.ones(0, np.bool_)))
+    graph.add_pose([0.0, 0.0, 0.0], fixed=True)
+    graph.add_landmark([1.0, 1.0])
+    for k in range(2):
+        graph.add_pose([k + 1.0, 0.0, 0.0])
+        graph.add_edge(EdgeKind.ODOMETRY, k, k + 1, [1.0, 0.1, 0.0], np.eye(3))
+        graph.add_sighting(k + 1, 0, [-k, 1.1], np.eye(2))
+        solver.update()
+    solver.joint([2], [0])
+    solver.renumber(graph.keep(np.ones(3, dtype=np.bool_), np.ones(1, dtype=np.bool_)))

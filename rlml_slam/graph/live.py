@@ -18,7 +18,6 @@ from rlml_slam.graph.graph import Graph, Renumbering
 from rlml_slam.graph.incremental import Incremental
 from rlml_slam.graph.solver import BAD_START, DEFAULT, optimize
 from rlml_slam.se2 import Array
-from rlml_slam.types import EdgeKind
 
 # Steps that are made without a look at the cost of the whole graph, and in all: then the batch
 # solver takes over, which needs fewer from a start that is no bad one.
@@ -109,21 +108,3 @@ class Live:
     def _step(self) -> None:
         self.steps += 1
         self._incremental.update()
-
-
-def warm_up() -> None:
-    """Compile every kernel of a graph that grows and lets go of nodes."""
-    graph = Graph()
-    live = Live(graph)
-    graph.add_pose([0.0, 0.0, 0.0], fixed=True)
-    graph.add_landmark([1.0, 1.0])
-    for k in range(3):
-        graph.add_pose([k + 1.0, 0.0, 0.0])
-        graph.add_edge(EdgeKind.ODOMETRY, k, k + 1, [1.0, 0.1, 0.0], np.eye(3))
-        graph.add_sighting(k + 1, 0, [-k, 1.1], np.eye(2))
-        live.solve()
-    live.joint([3], [0])
-    total_cost(graph.tables(), graph.poses, graph.landmarks)
-    graph.edges.enabled[2] = graph.sightings.enabled[2] = False
-    live.keep(np.arange(4) < 3, np.ones(1, dtype=np.bool_))
-    live.solve()

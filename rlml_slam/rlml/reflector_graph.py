@@ -150,11 +150,12 @@ class ReflectorGraph:
         merged: set[int] = set()
         limit = gate(self._p.gate)
         pairs.sort(key=lambda p: gap[p[0], p[1]])
-        covs = [_difference_cov(self._live, alive[i].index, alive[j].index) for i, j in pairs]
-        for (i, j), cov in zip(pairs, covs, strict=True):
+        close = np.unique(pairs)
+        joint = self._live.joint([], [alive[k].index for k in close])
+        for i, j in pairs:
             if i in merged or j in merged:
                 continue
-            cov = cov + 1e-6 * np.eye(2)
+            cov = _difference_cov(joint, *np.searchsorted(close, (i, j))) + 1e-6 * np.eye(2)
             peak = 1.0 / (2.0 * math.pi * math.sqrt(np.linalg.det(cov)))
             if peak < self._p.sure * (peak + self._p.density):
                 continue
@@ -406,9 +407,9 @@ def _first(a: Landmark, b: Landmark) -> tuple[Landmark, Landmark]:
     return (b, a) if better else (a, b)
 
 
-def _difference_cov(live: Live, a: int, b: int) -> Array:
-    """Covariance (2, 2) of landmark a minus landmark b."""
-    joint = live.joint([], [a, b])
+def _difference_cov(joint: Array, a: int, b: int) -> Array:
+    """Covariance (2, 2) of landmark a minus landmark b of those with a ``joint`` (2m, 2m) one."""
+    rows = np.array([2 * a, 2 * a + 1, 2 * b, 2 * b + 1])
     D = np.hstack([np.eye(2), -np.eye(2)])
-    cov: Array = D @ joint @ D.T
+    cov: Array = D @ joint[np.ix_(rows, rows)] @ D.T
     return cov

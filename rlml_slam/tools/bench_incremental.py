@@ -22,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
+from rlml_slam.graph import incremental
 from rlml_slam.graph.graph import Graph
-from rlml_slam.graph.incremental import Incremental, compile_kernels
+from rlml_slam.graph.incremental import Incremental
 from rlml_slam.graph.solver import optimize
 from rlml_slam.se2 import Array
 from rlml_slam.tools.bench_back_end import read_graphs
@@ -57,7 +58,7 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure and print."""
     single_thread()
-    compile_kernels()
+    incremental.warm_up()
     with_rival = not args.alone and importlib.util.find_spec('gtsam') is not None
     results = []
     for name, graph in _graphs(args.graphs, args.generated):

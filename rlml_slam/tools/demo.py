@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,7 @@ from rlml_slam.simulation.world import World
 from rlml_slam.simulation.world_file import load_world
 from rlml_slam.tools.live import LISTENERS, Source, drive
 from rlml_slam.tools.outputs import make_folder, write_outputs
-from rlml_slam.tools.summary import summary_text
+from rlml_slam.tools.summary import tell
 
 RATE = 2.0  # simulated seconds per second: two cores keep up with three processes and a recorder
 GYRO_RATE = 50.0  # [Hz] simulated: more would cost CPU time and tell nothing new
@@ -55,16 +53,7 @@ def run(args: argparse.Namespace) -> int:
             flush=True,
         )
     result = drive(source(args, world), out, args.json)
-    figures = write_outputs(result, out)
-    if args.json:
-        print(json.dumps(figures))
-    else:
-        print(summary_text(result.name, figures))
-        print(f'report: {out / "report.html"}')
-    if result.problem:
-        print(f'rlml: {result.problem}', file=sys.stderr)
-        return 1
-    return 0
+    return tell(result, write_outputs(result, out), out, args.json)
 
 
 def source(args: argparse.Namespace, world: World) -> Source:

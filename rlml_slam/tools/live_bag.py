@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,7 @@ from rlml_slam.tools.bag_inputs import BagInputs
 from rlml_slam.tools.live import LISTENERS, Source, drive
 from rlml_slam.tools.outputs import make_folder, write_outputs
 from rlml_slam.tools.recorder import Recorder
-from rlml_slam.tools.summary import summary_text
+from rlml_slam.tools.summary import tell
 
 
 def add_parser(subparsers: Any) -> None:
@@ -45,16 +43,7 @@ def run(args: argparse.Namespace) -> int:
     out = make_folder(args.out)
     result = drive(played, out, args.json)
     result.truth = truth
-    figures = write_outputs(result, out)
-    if args.json:
-        print(json.dumps(figures))
-    else:
-        print(summary_text(result.name, figures))
-        print(f'report: {out / "report.html"}')
-    if result.problem:
-        print(f'rlml: {result.problem}', file=sys.stderr)
-        return 1
-    return 0
+    return tell(result, write_outputs(result, out), out, args.json)
 
 
 def source(

@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -34,7 +32,7 @@ from rlml_slam.tools.map_survey import compare
 from rlml_slam.tools.outputs import make_folder, write_outputs
 from rlml_slam.tools.progress import Progress
 from rlml_slam.tools.record import FrameLog, Run, Truth
-from rlml_slam.tools.summary import summary_text
+from rlml_slam.tools.summary import tell
 from rlml_slam.tools.tum import Trajectory, read_tum
 
 # name -> the type of its parameters and its constructor
@@ -96,16 +94,7 @@ def run(args: argparse.Namespace) -> int:
         args.bag, params, truth, args.system, quiet=args.json, known=known, begun=begun,
         surveyed=surveyed,
     )  # fmt: skip
-    figures = write_outputs(result, args.out)
-    if args.json:
-        print(json.dumps(figures))
-    else:
-        print(summary_text(result.name, figures))
-        print(f'report: {args.out / "report.html"}')
-    if result.problem:
-        print(f'rlml: {result.problem}', file=sys.stderr)
-        return 1
-    return 0
+    return tell(result, write_outputs(result, args.out), args.out, args.json)
 
 
 def load_known(path: Path) -> SavedMap:

@@ -3,8 +3,13 @@
 
 from __future__ import annotations
 
+import json
+import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
+
+from rlml_slam.tools.record import Run
 
 
 def summary_rows(f: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -89,3 +94,15 @@ def summary_text(title: str, figures: Mapping[str, Any]) -> str:
     rows = summary_rows(figures)
     width = max(len(name) for name, _ in rows)
     return '\n'.join([title, *(f'  {name:<{width}}  {value}' for name, value in rows)])
+
+
+def tell(run: Run, figures: Mapping[str, Any], folder: Path, as_json: bool) -> int:
+    """Print the figures of a run whose results are in a folder, and its problem; the exit code."""
+    if as_json:
+        print(json.dumps(figures))
+    else:
+        print(summary_text(run.name, figures))
+        print(f'report: {folder / "report.html"}')
+    if run.problem:
+        print(f'rlml: {run.problem}', file=sys.stderr)
+    return 1 if run.problem else 0
