@@ -3,14 +3,11 @@
 
 No fastmath and no threads inside a kernel, so a replay is bit-identical from run to run.
 
-Numba compiles a kernel anew when its own file changed. Constants and kernels of other files are
-built into it as well, so here all of them go when any file of the package did.
+Those on disk that were compiled from other sources go when the package is first used.
 """
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -19,27 +16,9 @@ import numba
 from llvmlite import ir
 from numba.extending import intrinsic
 
+from rlml_slam.stale_kernels import forget_stale
+
 F = TypeVar('F', bound=Callable[..., Any])
-
-
-def forget_stale(package: Path) -> None:
-    """Delete compiled kernels of a package whose sources are not those of the last time.
-
-    Where the folder cannot be written to, Numba keeps them elsewhere, and an installation gives
-    all files new times.
-    """
-    seen = hashlib.sha256()
-    for path in sorted(package.rglob('*.py')):
-        stat = path.stat()
-        seen.update(f'{path.relative_to(package)} {stat.st_size} {stat.st_mtime_ns}\n'.encode())
-    stamp, now = package / '__pycache__' / 'kernels.stamp', seen.hexdigest()
-    with contextlib.suppress(OSError):
-        if stamp.exists() and stamp.read_text(encoding='utf-8') == now:
-            return
-        for path in package.rglob('__pycache__/*.nb[ci]'):
-            path.unlink(missing_ok=True)
-        stamp.parent.mkdir(exist_ok=True)
-        stamp.write_text(now, encoding='utf-8')
 
 
 forget_stale(Path(__file__).parent)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernels that were compiled from other sources are not used."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -8,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import rlml_slam
-from rlml_slam.compiled import forget_stale
+from rlml_slam.stale_kernels import forget_stale
 
 
 @pytest.fixture
@@ -20,7 +21,8 @@ def package(tmp_path):
     (folder / 'constants.py').write_text('N = 1\n')
     (folder / 'kernels.py').write_text(
         'from pathlib import Path\n'
-        'from rlml_slam.compiled import forget_stale, kernel\n'
+        'from rlml_slam.compiled import kernel\n'
+        'from rlml_slam.stale_kernels import forget_stale\n'
         'forget_stale(Path(__file__).parent)\n'
         'from some.constants import N\n'
         '@kernel\n'
@@ -55,8 +57,33 @@ def test_kernels_of_the_same_sources_stay(package):
     forget_stale(package)
     assert compiled.exists()
     (package / 'more.py').write_text('')
+    (package / 'constants.py').touch()
+    forget_stale(package)
+    assert compiled.exists()
+
+
+@pytest.mark.parametrize('changed', ['constants.py', 'kernels.py', '__init__.py', 'deep/base.py'])
+def test_kernel_goes_with_a_source_that_it_is_made_of(package, changed):
+    (package / 'deep').mkdir()
+    (package / 'deep' / '__init__.py').write_text('')
+    (package / 'deep' / 'base.py').write_text('M = 1\n')
+    (package / 'constants.py').write_text('from some.deep import base\nN = base.M\n')
+    forget_stale(package)
+    compiled = package / '__pycache__' / 'kernels.answer.nbi'
+    compiled.touch()
+    with (package / changed).open('a') as source:
+        source.write('# changed\n')
     forget_stale(package)
     assert not compiled.exists()
+
+
+def test_every_file_with_kernels_is_known():
+    """One that is not would keep kernels of other sources."""
+    package = Path(rlml_slam.__file__).parent
+    known = json.loads((package / '__pycache__' / 'kernels.stamp').read_text())
+    for compiled in package.rglob('__pycache__/*.nbi'):
+        source = compiled.parents[1] / (compiled.name.split('.')[0] + '.py')
+        assert source.relative_to(package).as_posix() in known
 
 
 def test_folder_that_cannot_be_written_to_is_no_error(package):

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compiled kernels on disk whose sources have changed since.
+
+Numba compiles a kernel anew when its own file changed. Constants and kernels of the files that
+this one imports are built into it as well, so here a kernel goes when any of those changed.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import hashlib
+import json
+from pathlib import Path
+
+# What a file with kernels imports to make them.
+MAKER = 'rlml_slam.compiled'
+
+
+def forget_stale(package: Path) -> None:
+    """Delete the compiled kernels of a package which were made of other sources.
+
+    Where the folder cannot be written to, Numba keeps them elsewhere, and an installation gives
+    all files new times.
+    """
+    folder = package / '__pycache__'
+    stamp = folder / 'kernels.stamp'
+    paths = sorted(package.rglob('*.py'))
+    times = _times(package, paths)
+    with contextlib.suppress(OSError):
+        known = _read(stamp)
+        if known.get('times') == times:
+            return
+        made_of = _made_of(package, paths)
+        for name, digest in made_of.items():
+            if known.get(name) != digest:
+                source = package / name
+                for path in source.parent.glob(f'__pycache__/{source.stem}.*.nb[ci]'):
+                    path.unlink(missing_ok=True)
+        folder.mkdir(exist_ok=True)
+        stamp.write_text(json.dumps({'times': times, **made_of}), encoding='utf-8')
+
+
+def _read(stamp: Path) -> dict[str, str]:
+    """What was written the last time, nothing where it cannot be read."""
+    try:
+        known = json.loads(stamp.read_text(encoding='utf-8'))
+    except (OSError, ValueError):
+        return {}
+    return known if isinstance(known, dict) else {}
+
+
+def _times(package: Path, paths: list[Path]) -> str:
+    """Digest of names, sizes and times of change: the same ones mean the same sources."""
+    seen = hashlib.sha256()
+    for path in paths:
+        stat = path.stat()
+        seen.update(f'{path.relative_to(package)} {stat.st_size} {stat.st_mtime_ns}\n'.encode())
+    return seen.hexdigest()
+
+
+def _made_of(package: Path, paths: list[Path]) -> dict[str, str]:
+    """Digest of all that the kernels of a file are made of, by the name of the file."""
+    texts = {path.relative_to(package).as_posix(): path.read_bytes() for path in paths}
+    imported: dict[str, set[str]] = {}
+    digests = {}
+    for name, text in texts.items():
+        if MAKER.encode() not in text:
+            continue
+        reached, ahead = {name}, [name]
+        while ahead:
+            at = ahead.pop()
+            if at not in imported:
+                imported[at] = _imports(texts[at], package.name) & texts.keys()
+            ahead += imported[at] - reached
+            reached |= imported[at]
+        seen = hashlib.sha256()
+        for one in sorted(reached):
+            seen.update(f'{one} {len(texts[one])}\n'.encode() + texts[one])
+        digests[name] = seen.hexdigest()
+    return digests
+
+
+def _imports(text: bytes, package: str) -> set[str]:
+    """Files of the package which a source may import, as far as there are such."""
+    names = {package}
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {node.module, *(f'{node.module}.{alias.name}' for alias in node.names)}
+    files = set()
+    for name in names:
+        top, *rest = name.split('.')
+        if top == package:
+            files |= {'/'.join([*rest, '__init__.py'])} | (
+                {'/'.join(rest) + '.py'} if rest else set()
+            )
+    return files
