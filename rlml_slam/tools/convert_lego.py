@@ -6,8 +6,10 @@
     robot4_reference.txt        P time_ms x_mm y_mm  (of the scanner, in the arena)
     robot_arena_landmarks.txt   L C x_mm y_mm diameter_mm
 
-``base_link`` is the middle between the wheels. The sensors log the end of what they did, and the
-camera another clock's time; row k of all three belongs together.
+``base_link`` is the middle between the wheels. Each stream has stamps of its own: motors are asked
+less often than scans come, so that every fifth of their rows is the one before once more, and the
+scanner's data is the oldest by the time it is stamped. Here all stamps are the scanner's, those of
+the first beams of its sweeps; :mod:`rlml_slam.tools.lego_time` estimates what lies between.
 """
 
 from __future__ import annotations
@@ -29,12 +31,16 @@ from rlml_slam.types import Odometry, Scan
 
 MM = 1e-3
 METRES_PER_TICK = 0.349e-3
-WHEEL_BASE = 0.173  # [m] between the tracks; of 0.150 to 0.173 in use, fits the camera best
+WHEEL_BASE = 0.173  # [m] between the tracks; of 0.150 to 0.173 in use
 BEAM, MOUNTING, MIDDLE = 0.006135923151543, 0.06981317007977318, 330
 T_BASE_LASER = np.array([0.03, 0.0, -MOUNTING])
 START = (1.850, 1.897, math.radians(213.0))  # of the scanner
 LASER_FRAME = 'laser'
 RANGE_MIN, RANGE_MAX = 0.02, 5.0
+BEAM_TIME = 0.1 / 1024  # [s] of an URG-04LX: 600 revolutions per minute
+# [s] by which the middle of a sweep is older than its stamp says, by the wheels' clock, and the
+# camera's pictures: by turn rates of scans and wheels and by speeds of camera and wheels alone
+SCAN_LAG, CAMERA_LAG = 0.46, 0.20
 
 
 @dataclass(frozen=True)
@@ -59,19 +65,33 @@ def read_lego(folder: str | Path) -> Lego:
         for _, line in read_lines(folder / 'robot_arena_landmarks.txt')
         if line.startswith('L C')
     ]
-    stamps = np.array([s.stamp for s in scans], dtype=np.int64)
-    if not len(scans) == len(motors) == len(track):
-        raise FileFormatError(f'{folder}: scans, motors and reference differ in number of rows')
     ticks = np.array([v[[0, 4]] for _, v in motors], dtype=np.float64)
+    at, first = _times(motors, 0.0)
+    # the first scans are from before the wheels were asked
+    scans = [scan for scan in scans if scan.stamp >= at[0]]
+    seen, row = _times(track, CAMERA_LAG)
     poses = np.array([[v[0] * MM, v[1] * MM, np.nan] for _, v in track])
     counts = Counter(scans=len(scans), cylinders=len(cylinders))
     return Lego(
-        _odometry(stamps, np.asarray(ticks, dtype=np.float64) * METRES_PER_TICK),
+        _odometry(at, ticks[first] * METRES_PER_TICK),
         scans,
-        Trajectory(stamps, poses),
+        Trajectory(seen, poses[row]),
         np.array(cylinders)[:, :2] * MM,
         counts,
     )
+
+
+def _times(
+    rows: list[tuple[int, Array]], lag: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Stamps of the first beams' clock and the rows that have them, each once.
+
+    ``lag`` [s] is what the rows are older than their stamps by the wheels' clock.
+    """
+    stamps, first = np.unique([stamp for stamp, _ in rows], return_index=True)
+    # a sweep's stamp is its first beam's, half a sweep before its middle
+    later = round((SCAN_LAG - lag + MIDDLE * BEAM_TIME) * 1e9)
+    return stamps + later, first
 
 
 def _rows(path: Path, kind: str) -> list[tuple[int, Array]]:
@@ -94,7 +114,7 @@ def _scan(stamp: int, values: Array) -> Scan:
     ranges = values[1:] * MM
     none = np.zeros(0, dtype=np.float32)
     return Scan(
-        stamp, LASER_FRAME, -MIDDLE * BEAM, BEAM, 0.0, RANGE_MIN, RANGE_MAX,
+        stamp, LASER_FRAME, -MIDDLE * BEAM, BEAM, BEAM_TIME, RANGE_MIN, RANGE_MAX,
         np.where(ranges > RANGE_MIN, ranges, np.nan).astype(np.float32), none,
     )  # fmt: skip
 

@@ -16,15 +16,23 @@ from rlml_slam.ekf.slam import EkfSlam
 from rlml_slam.maps.atomic import write_atomically
 from rlml_slam.params import EkfParameters, from_mapping, read_yaml
 from rlml_slam.se2 import Array
-from rlml_slam.tools.convert_lego import LASER_FRAME, T_BASE_LASER, Lego, read_lego
-from rlml_slam.tools.lego_scale import ScaleFit, fit_scale, ranges_of
+from rlml_slam.tools.convert_lego import (
+    CAMERA_LAG,
+    LASER_FRAME,
+    SCAN_LAG,
+    T_BASE_LASER,
+    Lego,
+    read_lego,
+)
+from rlml_slam.tools.lego_scale import Ranges, at, fit_scale, ranges_of
+from rlml_slam.tools.lego_time import camera_lag, scan_lag
 from rlml_slam.types import Odometry, Reflectors, Scan
 
-# what the robot and its laser are like; the offset, which holds the cylinder's radius and an error
-# of this laser, makes the mapped cylinders as far apart as the true ones
+# what the laser and its cylinders are like: ranges and bearings to the true cylinders have so much
+# noise; the offset, which holds the cylinder's radius and an error of this laser, makes the mapped
+# cylinders as far apart as the true ones
 PARAMETERS: dict[str, Any] = {
     'ekf.extractor': 'spikes',
-    'ekf.sightings': 6,
     'ekf.min_separation': 0.35,
     'spikes.threshold': 0.1,
     'spikes.offset': 0.115,
@@ -32,14 +40,8 @@ PARAMETERS: dict[str, Any] = {
     'spikes.max_width': 0.15,
     'spikes.max_range': 2.0,
     'spikes.min_beams': 3,
-    'spikes.sigma_range': 0.05,
-    'spikes.sigma_bearing': 0.05,
-    'motion.a': 0.1,
-    'motion.b': 0.01,
-    'motion.c': 0.5,
-    'motion.d': 0.2,
-    'motion.interval': 0.2,
-    'transform_timeout': 1.0,
+    'spikes.sigma_range': 0.02,
+    'spikes.sigma_bearing': 0.02,
 }
 SCANNER = np.array([T_BASE_LASER[0], T_BASE_LASER[1], 0.0])
 AIM = 0.03  # [m] of position against the camera
@@ -85,19 +87,19 @@ def verdict_text(figures: dict[str, Any]) -> str:
     """Position against the camera, as the track is and as the ranges say it is, and the proof."""
     f = figures
     scale, sigma = f['track_scale_by_ranges'], f['track_scale_sigma']
-    ahead, doubt = 100 * f['camera_point_by_ranges_m'][0], 100 * f['camera_point_sigma_m'][0]
     rms, before = 100 * f['range_rms_m'], 100 * f['range_rms_without_scale_m']
     lines = [
         f'position RMSE against the camera track after rigid alignment, aim {100 * AIM:.0f} cm:',
         f'  the track as it is               {_verdict(f["position_rmse_m"])}',
         f'  the track {scale:.3f} times smaller    {_verdict(f["position_rmse_track_scaled_m"])}',
-        f'  ... and of a point {ahead:.1f} cm ahead  '
-        f'{_verdict(f["position_rmse_track_corrected_m"])}',
         f'{f["ranges"]} ranges to the true cylinders, without wheels and places of the filter,',
-        f'say that the track is {scale:.3f} +- {sigma:.3f} times too large and of a point',
-        f'{ahead:.1f} +- {doubt:.1f} cm ahead of the laser. They fit the true map to',
-        f'{before:.1f} cm with the track as it is, to {rms:.1f} cm with it corrected. A camera',
+        f'say that the track is {scale:.3f} +- {sigma:.3f} times too large. They fit the true map',
+        f'to {before:.1f} cm with the track as it is, to {rms:.1f} cm with it corrected. A camera',
         'calibrated to the floor, H above it, shows what is h above it H/(H-h) too large.',
+        f'Scans are stamped {f["scan_lag_s"]:.2f} s late by the turns of scans and wheels '
+        f'({SCAN_LAG:.2f} is taken),',
+        f'pictures {f["camera_lag_s"]:.2f} s by the ways of camera and wheels '
+        f'({CAMERA_LAG:.2f} is taken).',
     ]
     return '\n' + '\n'.join(lines)
 
@@ -119,12 +121,17 @@ def drive(data: Lego, values: dict[str, Any] | None = None) -> Result:
         else:
             slam.add_odometry(item)
     slam.finish()
+    stamps, poses = slam.trajectory()
     odometry = np.array([o.pose for o in data.odometry])
-    return Result(
-        se2.compose(slam.trajectory()[1], SCANNER),
-        se2.compose(odometry, SCANNER),
-        slam.reflectors(),
-    )
+    odometry[:, 2] = np.unwrap(odometry[:, 2])
+    told = [o.stamp for o in data.odometry]
+    wheels = np.stack([np.interp(stamps, told, odometry[:, i]) for i in range(3)], -1)
+    return Result(se2.compose(poses, SCANNER), se2.compose(wheels, SCANNER), slam.reflectors())
+
+
+def track_places(data: Lego) -> Array:
+    """Where the camera saw the scanner (n, 2) at the scans' stamps."""
+    return at(data.track, np.array([scan.stamp for scan in data.scans]) * 1e-9)
 
 
 def judge(data: Lego, result: Result) -> dict[str, Any]:
@@ -135,7 +142,7 @@ def judge(data: Lego, result: Result) -> dict[str, Any]:
     follows a point of its own on the robot, ``camera_point_m`` ahead of the scanner and to its
     left.
     """
-    track, points = data.track.poses[:, :2], result.reflectors.points
+    track, points = track_places(data), result.reflectors.points
     nearest = associate(data, result)
     found = nearest >= 0
     position, _ = residual(result.scanner[:, :2], track)
@@ -160,37 +167,38 @@ def judge(data: Lego, result: Result) -> dict[str, Any]:
 
 
 def judge_scale(data: Lego, result: Result) -> dict[str, Any]:
-    """How large the camera's track is by the ranges to the true cylinders, and of what point.
+    """How large the camera's track is by the ranges to the true cylinders, and how late it is.
 
-    The filter tells which range is of which cylinder and where the robot heads, and no more.
-    ``position_rmse_by_ranges_m`` is what the places that fit the ranges best have to the track,
-    ``position_rmse_track_scaled_m`` and ``position_rmse_track_corrected_m`` what the EKF has to a
-    track of the size that they tell, and to those places.
+    The filter tells which range is of which cylinder, and no more. About ``track_grows_about_m``
+    the camera shows the robot's ways too large. ``position_rmse_track_scaled_m`` is what the EKF
+    has to a track of the size that the ranges tell. The lags are those of the streams' stamps.
     """
-    track, scanner = data.track.poses[:, :2], result.scanner[:, :2]
-    free, rigid = range_fit(data, result), range_fit(data, result, rigid=True)
+    track, ranges = data.track, cylinder_ranges(data, result)
+    free = fit_scale(track, data.landmarks, ranges)
+    rigid = fit_scale(track, data.landmarks, ranges, rigid=True)
+    scans, camera = scan_lag(data, ranges, free.offset), camera_lag(data)
+    scaled, _ = residual(result.scanner[:, :2], free.scale * track_places(data))
     return {
         'ranges': free.ranges,
         'track_scale_by_ranges': round(1.0 / free.scale, 4),
         'track_scale_sigma': round(free.sigma / free.scale**2, 4),
-        'camera_point_by_ranges_m': [round(float(v), 4) for v in free.point],
-        'camera_point_sigma_m': [round(float(v), 4) for v in free.point_sigma],
+        'track_grows_about_m': [round(float(v), 3) for v in free.centre],
         'range_offset_m': round(free.offset, 4),
         'range_rms_m': round(free.rms, 4),
         'range_rms_without_scale_m': round(rigid.rms, 4),
-        'position_rmse_track_scaled_m': round(residual(scanner, free.scale * track)[0], 4),
-        'position_rmse_track_corrected_m': round(residual(scanner, free.places)[0], 4),
-        'position_rmse_by_ranges_m': round(residual(free.places, track)[0], 4),
+        'position_rmse_track_scaled_m': round(scaled, 4),
+        'scan_lag_s': round(SCAN_LAG + scans.seconds, 3),
+        'scan_lag_sigma_s': round(scans.sigma, 3),
+        'camera_lag_s': round(CAMERA_LAG + camera.seconds, 3),
+        'camera_lag_sigma_s': round(camera.sigma, 3),
+        'track_scale_by_wheels': round(camera.factor, 4),
     }
 
 
-def range_fit(data: Lego, result: Result, rigid: bool = False) -> ScaleFit:
-    """The track fitted to the ranges to the true cylinders, or ``rigid``, as it is."""
+def cylinder_ranges(data: Lego, result: Result) -> Ranges:
+    """What the scans measured of the true cylinders."""
     params: EkfParameters = from_mapping(PARAMETERS, EkfParameters)
-    ranges = ranges_of(data, result.scanner, params.spikes)
-    track = data.track.poses[:, :2]
-    headings = result.scanner[:, 2] + se2.align(result.scanner[:, :2], track)[2]
-    return fit_scale(track, data.landmarks, ranges, rigid, None if rigid else headings)
+    return ranges_of(data, result.scanner, params.spikes)
 
 
 @dataclass(frozen=True)
@@ -229,7 +237,7 @@ def rms(errors: Array) -> float:
 
 def associate(data: Lego, result: Result) -> np.ndarray[Any, np.dtype[np.int64]]:
     """(k,): the cylinder that each landmark is, -1 for none, by the alignment of the track."""
-    T = se2.align(result.scanner[:, :2], data.track.poses[:, :2])
+    T = se2.align(result.scanner[:, :2], track_places(data))
     gap = np.linalg.norm(
         se2.transform(T, result.reflectors.points)[:, None] - data.landmarks[None], axis=-1
     )
@@ -250,21 +258,20 @@ def picture(data: Lego, result: Result) -> bytes:
     """Truth, dead reckoning, EKF and its landmarks with 95 % ellipses, in the arena.
 
     Each as far as a rigid alignment brings it; on the left to the camera's track as it is, on the
-    right to the places of the laser that the ranges to the true cylinders make of it.
+    right to the track of the size that the ranges to the true cylinders tell.
     """
     # matplotlib takes half a second to import, which other commands need not wait for
     from matplotlib.figure import Figure
 
     from rlml_slam.tools.pictures import LIVE, PATH, REFLECTOR, TRUTH, ellipse, png
 
-    track = data.track.poses[:, :2]
-    free = range_fit(data, result)
+    track = track_places(data)
+    free = fit_scale(data.track, data.landmarks, cylinder_ranges(data, result))
+    corrected = free.centre + free.scale * (track - free.centre)
     figure = Figure(figsize=(13, 7), layout='constrained')
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
-    corrected = f'/ {1.0 / free.scale:.3f}, {100 * free.point[0]:.1f} cm ahead'
-    for axes, title, true in zip(
-        panels, ('as it is', corrected), (track, free.places), strict=True
-    ):
+    smaller = f'/ {1.0 / free.scale:.3f}'
+    for axes, title, true in zip(panels, ('as it is', smaller), (track, corrected), strict=True):
         for poses, colour, name in (
             (result.dead_reckoning, LIVE, 'dead reckoning'),
             (result.scanner, PATH, 'EKF'),
