@@ -88,15 +88,17 @@ class ScanTerm:
         )  # fmt: skip
 
     def _matched_freely(
-        self, submap: Submap, points: Array, prior: Array, strength: Array
+        self, submap: Submap, points: Array, prior: Array, strength: Array, least: float
     ) -> ScanMatchResult:
-        """The match of a robot that only its speed leads to where it is: searched as far."""
+        """The match where it may be off by ``least`` [m], or by as much as the prior tells."""
         p = self._p.scan_match
         spread: Array = np.asarray(np.linalg.inv(strength), dtype=np.float64)
         reach = FAR * math.sqrt(ends_of(spread[:2, :2])[1])
         turn = min(FAR * math.sqrt(spread[2, 2]), p.wide_angle)
-        window = (min(max(reach, p.search_window), p.wide_window), turn)
-        return match(submap, points, prior, strength, p, window=window, usual=self.doubt.usual)
+        window = (min(max(reach, least), p.wide_window), turn)
+        # all that odometry may be wrong by is in this window
+        usual = 0.0 if self.has_odometry else self.doubt.usual
+        return match(submap, points, prior, strength, p, window=window, usual=usual)
 
     def use(self, observation: Observation, sweep: Sweep, agrees: bool) -> Evidence:
         """Match against the submap and update with the scan term (e_s of eq. 2)."""
@@ -111,12 +113,17 @@ class ScanTerm:
         if self.has_odometry:
             found = match(submap, points, prior, strength, p, searched=False)
         else:
-            found = self._matched_freely(submap, points, prior, strength)
+            found = self._matched_freely(submap, points, prior, strength, p.search_window)
+        usual = AS_USUAL * self.doubt.usual
         # where nothing but the speed leads to the start, a fit that is worse is of another place
-        least = 0.0 if self.has_odometry else AS_USUAL * self.doubt.usual
-        if found.score < max(p.good_score, least) or found.prior_weight < 0.5:
+        least = p.good_score if self.has_odometry else max(p.good_score, usual)
+        if found.score < least or found.prior_weight < 0.5:
             searched = match(submap, points, prior, strength, p)
             found = searched if searched.score > found.score else found
+        if self.has_odometry and found.score < usual:
+            # beside its place, where a wrong stamp leads, a scan may fit, but not as usual
+            searched = self._matched_freely(submap, points, prior, strength, p.wide_window)
+            found = searched if searched.score >= usual else found
         misfit = self.doubt.misfits(found.score, submap.insertions)
         if misfit and not agrees and not self.lasts(observation.stamp):
             turn = TURN if self.has_odometry else math.pi

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_worlds import CORRIDOR, ROOM, drive, errors, observations
+from made_worlds import CORRIDOR, ROOM, TinyWorld, drive, errors, observations, polygon
 
 from rlml_slam import se2
 from rlml_slam.params import Parameters
@@ -69,5 +69,31 @@ def test_scan_after_a_slip_is_used_and_mapped_without_a_doubt(slip):
     assert all(f.scan_used for f in frames[1:])
     assert all(f.health.level is not Level.LOST for f in frames)
     distance, turn = errors(np.array([f.T_local_base for f in frames]), PATH)
+    assert distance.max() < 0.06
+    assert turn.max() < 0.03
+
+
+def with_doors():
+    """A corridor with doors in its walls, its ends out of sight."""
+    right, left = [(-20.0, -1.2)], [(20.0, 1.2)]
+    for x in (-5.0, -1.6, 0.7, 3.9, 6.1, 9.8):
+        right += [(x, -1.2), (x, -1.4), (x + 0.9, -1.4), (x + 0.9, -1.2)]
+    for x in (8.6, 4.4, 2.6, -0.9, -4.2):
+        left += [(x + 0.9, 1.2), (x + 0.9, 1.4), (x, 1.4), (x, 1.2)]
+    return TinyWorld(polygon(*right, (20.0, -1.2), *left, (-20.0, 1.2)), np.zeros((0, 2)))
+
+
+@pytest.mark.parametrize('late', [-0.35, -0.25, 0.35])
+def test_scan_with_a_wrong_stamp_is_placed_where_it_was_taken(late):
+    path = drive((0.6, 0.0, 6.0))
+    seen = observations(with_doors(), path, reflectors=False, rng=np.random.default_rng(0))
+    k = len(path) - 3
+    for n, way in ((k, late), (k + 1, -late)):  # odometry is right again for the next one
+        delta = se2.compose(seen[n].motion.delta, np.array([way, 0.0, 0.0]))
+        seen[n] = replace(seen[n], motion=Motion(delta, seen[n].motion.cov))
+    front_end = FrontEnd(Parameters())
+    frames = [front_end.process(o) for o in seen]
+    assert all(f.scan_used for f in frames[1:])
+    distance, turn = errors(np.array([f.T_local_base for f in frames]), path)
     assert distance.max() < 0.06
     assert turn.max() < 0.03
