@@ -46,14 +46,14 @@ class EkfSlam(Driven):
         return stamps, poses if self._smoothed is None else self._smoothed.states[:, :3].copy()
 
     def reflectors(self) -> Reflectors:
-        """The landmarks of the state, where the smoothed path has them."""
+        """The landmarks of the state, where the smoothed path has them and as sure as it is."""
         found = self.estimator.reflectors()
         if self._smoothed is None:
             return found
         _, at, here = np.intersect1d(found.keys, self._smoothed.keys, return_indices=True)
-        points = found.points.copy()
-        points[at] = self._smoothed.points[here]
-        return dataclasses.replace(found, points=points)
+        points, cov = found.points.copy(), found.cov.copy()
+        points[at], cov[at] = self._smoothed.points[here], self._smoothed.covs[here]
+        return dataclasses.replace(found, points=points, cov=cov)
 
     def occupancy_grid(self) -> OccupancyGrid | None:
         """The scans drawn along the trajectory, None without any."""

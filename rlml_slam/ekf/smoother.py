@@ -26,10 +26,12 @@ from rlml_slam.types import Motion
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
+    from scipy.sparse.linalg import SuperLU
 
 ITERATIONS = 20
 SETTLED = 1e-6  # [m], [rad] of the largest correction
 LEAST = 1e-3  # share of a step below which a better one is not looked for
+AT_ONCE = 32  # landmarks whose covariances are solved for together
 FLOOR = 1e-6  # least sigma of anything: what is surer is taken for this, to be divided by
 
 
@@ -67,13 +69,15 @@ class Start:
 class Smoothed:
     """States (n, 6) of the robot after each step, and the landmarks (m, 2) of the ``keys``.
 
-    ``start`` (6,) is the state before the first step.
+    ``start`` (6,) is the state before the first step, ``covs`` (m, 2, 2) the landmarks' marginal
+    covariances.
     """
 
     start: Array
     states: Array
     keys: NDArray[np.int64]
     points: Array
+    covs: Array
 
 
 class _Rows:
@@ -113,14 +117,36 @@ class _Rows:
 
     def step(self, width: int) -> Array:
         """The dx (width,) of the least squares."""
-        from scipy.sparse.linalg import splu
-
         J = self.jacobian(width)
-        normal = splu(
-            (J.T @ J).tocsc(), permc_spec='MMD_AT_PLUS_A', diag_pivot_thresh=0.0,
-            options={'SymmetricMode': True},
-        )  # fmt: skip
-        return np.asarray(normal.solve(-(J.T @ self.errors())))
+        return np.asarray(_factor(J).solve(-(J.T @ self.errors())))
+
+    def covariances(self, width: int, first: int) -> Array:
+        """Blocks (m, 2, 2) on the diagonal of (J^T J)^-1, of the last columns from ``first`` on.
+
+        They are the joint information with all else eliminated, inverted (Schur complement).
+        """
+        normal = _factor(self.jacobian(width))
+        out = np.empty(((width - first) // 2, 2, 2))
+        for at in range(0, len(out), AT_ONCE):
+            columns = first + 2 * at + np.arange(2 * min(AT_ONCE, len(out) - at))
+            unit = np.zeros((width, len(columns)))
+            unit[columns, np.arange(len(columns))] = 1.0
+            block = normal.solve(unit)[columns]
+            for k in range(len(columns) // 2):
+                cov = block[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
+                out[at + k] = 0.5 * (cov + cov.T)
+        return out
+
+
+def _factor(J: csc_matrix) -> SuperLU:
+    """Factors of the normal equations J^T J."""
+    # takes a while to import, which other commands need not wait for
+    from scipy.sparse.linalg import splu
+
+    return splu(
+        (J.T @ J).tocsc(), permc_spec='MMD_AT_PLUS_A', diag_pivot_thresh=0.0,
+        options={'SymmetricMode': True},
+    )  # fmt: skip
 
 
 class _Problem:
@@ -224,7 +250,7 @@ def smooth(start: Start, steps: Sequence[Step], model: Model, poses: Array) -> S
     cost = float(rows.errors() @ rows.errors())
     for _ in range(ITERATIONS):
         dx = rows.step(x.size + points.size)
-        share = 1.0
+        share, best = 1.0, rows
         while True:
             moved = x + share * dx[: x.size].reshape(x.shape)
             moved[:, 2] = se2.wrap(moved[:, 2])
@@ -235,11 +261,17 @@ def smooth(start: Start, steps: Sequence[Step], model: Model, poses: Array) -> S
                 break
             share *= 0.5
             if share < LEAST:  # nothing on the way is better, or it is no number
-                return Smoothed(x[0], x[1:], problem.keys, points)
+                return _smoothed(problem, best, x, points)
         x, points, cost = moved, placed, new
         if np.abs(share * dx).max() < SETTLED:
             break
-    return Smoothed(x[0], x[1:], problem.keys, points)
+    return _smoothed(problem, rows, x, points)
+
+
+def _smoothed(problem: _Problem, rows: _Rows, x: Array, points: Array) -> Smoothed:
+    """The result, and how sure its landmarks are by the ``rows`` there."""
+    covs = rows.covariances(x.size + points.size, x.size)
+    return Smoothed(x[0], x[1:], problem.keys, points, covs)
 
 
 def _first_points(

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from differences import central_differences
 from rlml.made_worlds import ROOM, drive, observations
+from scipy.stats import chi2
 
 from rlml_slam import se2
 from rlml_slam.ekf.filter import ROBOT, SPEED, TURN, Filter
@@ -111,7 +112,10 @@ def test_linear_case_is_the_dense_solution_of_everything(seed):
     assert np.abs(found.states[:, :2] - poses[:, :2]).max() > 1e-2
     # the filter's last is the smoother's last
     assert np.abs(found.states[-1, :2] - f.pose[:2]).max() < 1e-8
-    assert np.abs(found.points - f.points[[slots[k] for k in found.keys]]).max() < 1e-8
+    at = [slots[k] for k in found.keys]
+    assert np.abs(found.points - f.points[at]).max() < 1e-8
+    # and so are the covariances: of a linear case the filter's are those of everything
+    assert np.abs(found.covs - f.point_covs()[at]).max() < 1e-8
 
 
 def curved_case(rng, n=40):
@@ -175,6 +179,47 @@ def test_smoothed_path_is_the_most_probable_one():
     assert np.linalg.norm(rows.errors()) < np.linalg.norm(at_truth)
 
 
+def test_covariances_are_those_of_the_joint_information():
+    start, steps, _ = curved_case(np.random.default_rng(4))
+    poses, _, _ = filtered(steps, start, POINT, invariant=True)
+    found = smooth(start, steps, POINT, poses)
+    x = np.concatenate([found.start[None], found.states])
+    rows = _Problem(start, steps, POINT).rows(x, found.points)
+    J = rows.jacobian(x.size + found.points.size).toarray()
+    # the Schur complement, whose inverse needs no inverse of all
+    left, right = J[:, : x.size], J[:, x.size :]
+    Q, _ = np.linalg.qr(left)
+    rest = right - Q @ (Q.T @ right)
+    cov = np.linalg.inv(rest.T @ rest)
+    for k, found_cov in enumerate(found.covs):
+        block = cov[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
+        assert np.abs(found_cov - block).max() < 1e-6 * np.abs(block).max()
+
+
+def test_smoothed_landmarks_are_as_sure_as_they_say():
+    """Of landmarks seen from one drive the errors are correlated: a run counts as one."""
+    runs, nees, before = 40, [], []
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        start, steps, _ = curved_case(rng, 60)
+        # the landmarks are the first that are drawn after the start's errors
+        again = np.random.default_rng(seed)
+        again.standard_normal(ROBOT)
+        landmarks = again.uniform(-4.0, 4.0, (6, 2))
+        poses, f, slots = filtered(steps, start, POINT, invariant=True)
+        found = smooth(start, steps, POINT, poses)
+        e = found.points - landmarks[found.keys]
+        nees.append(
+            np.mean([d @ np.linalg.solve(P, d) for d, P in zip(e, found.covs, strict=True)])
+        )
+        live = f.point_covs()[[slots[k] for k in found.keys]]
+        before.append(np.trace(found.covs, axis1=1, axis2=2) / np.trace(live, axis1=1, axis2=2))
+    low, high = chi2.ppf([0.001, 0.999], 2 * runs) / runs
+    assert low < np.mean(nees) < high
+    # the filter has used all of it too, where its linearisations were good
+    assert 0.5 < np.median(np.concatenate(before)) < 1.1
+
+
 def test_smoothing_takes_out_error_of_wheels_that_err():
     before, after = [], []
     for seed in range(8):
@@ -206,7 +251,10 @@ def test_frames_are_live_and_the_trajectory_is_smoothed():
     assert np.array_equal(plain.trajectory()[1], live)
     error = [np.hypot(*(p - LOOP)[:, :2].T).mean() for p in (slam.trajectory()[1], live)]
     assert error[0] < error[1]
-    assert len(slam.reflectors()) == len(plain.reflectors())
+    smoothed, filtered_ = slam.reflectors(), plain.reflectors()
+    assert len(smoothed) == len(filtered_)
+    assert not np.array_equal(smoothed.cov, filtered_.cov)
+    assert (np.linalg.eigvalsh(smoothed.cov) > 0.0).all()
     # the last pose knows no more than the filter: the same, but for where it was linearised
     last = slam.trajectory()[1][-1] - live[-1]
     assert np.abs(last).max() < 0.02
