@@ -27,6 +27,7 @@ from rlml_slam.motion import SECOND, STILL, MotionBuffer, compose_motion
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.deskew import project, sweep_time
+from rlml_slam.sensing.no_return import NoReturns
 from rlml_slam.sensing.steady_clock import SteadyClock
 from rlml_slam.types import Detections, Imu, Motion, Observation, Odometry, Scan
 
@@ -91,6 +92,7 @@ class Sequencer:
         self._newest: dict[str, int] = {}
         self._newest_of: dict[tuple[str, str], int] = {}
         self._lidars: dict[str, tuple[int, int]] = {}  # by frame: newest stamp and period
+        self._no_returns = NoReturns()
         self._newest_any = -(2**62)
         self._first_any: int | None = None
         self._step: dict[str, int] = {}  # by stream: between its last two stamps
@@ -161,7 +163,7 @@ class Sequencer:
             'scan', scan.stamp, source=scan.frame_id
         ):
             self._note_lidar(scan)
-            self._wait(scan.stamp, 'scan', scan)
+            self._wait(scan.stamp, 'scan', self._no_returns.left_out(scan))
         return self._release()
 
     def add_detections(self, detections: Detections) -> list[Observation]:

@@ -8,7 +8,8 @@
 
 The stamps are ipc_time. (x, y, theta) is the laser's pose and odom_… the robot's, so the two tell
 where the laser sits. Old lines do not say what angles their beams have: 180 or 181 of them step
-by 1 degree, 360 or 361 by half a degree, any other number spans 180 degrees; all begin at -90.
+by 1 degree and 360 or 361 by half a degree from -90 on, 400 or 401 by a quarter from -50 on (a
+SICK set to 100 degrees), as CARMEN reads them; any other number spans 180 degrees.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ from rlml_slam.types import Odometry, Scan
 LASER_FRAME = 'laser'
 MAX_RANGE = 80.0  # [m] a SICK's farthest; its codes for "no return" are above
 RANGE_MIN = 0.02  # [m] a SICK reports errors as zero
+# beams of a FLASER line, odd: angle of the first one and step [deg]
+OLD_ANGLES = {181: (-90.0, 1.0), 361: (-90.0, 0.5), 401: (-50.0, 0.25)}
 MAX_BROKEN = 0.01  # more broken lines than this share: it is not a CARMEN log
 _OLD = ('FLASER', 'RAWLASER')
 _NEW = ('ROBOTLASER1', 'RAWLASER1')
@@ -70,11 +73,17 @@ class _Reader:
         """Range [m] from which on a FLASER line's value is "no return"."""
         if self._given_range is not None:
             return self._given_range
-        stated = self.params.get('robot_front_laser_max', self.params.get('laser_front_laser_max'))
-        try:
-            return float(stated) if stated is not None else MAX_RANGE
-        except ValueError:
-            return MAX_RANGE
+        stated = self.number('robot_front_laser_max', 'laser_front_laser_max')
+        return MAX_RANGE if stated is None else stated
+
+    def number(self, *names: str) -> float | None:
+        """What the first of these PARAM lines states that states a number, None without any."""
+        for name in names:
+            try:
+                return float(self.params[name])
+            except (KeyError, ValueError):
+                continue
+        return None
 
     def odometry(self, words: Sequence[str]) -> Odometry:
         """ODOM x y theta tv rv accel ipc_time [host logger_time]."""
@@ -92,8 +101,7 @@ class _Reader:
         laser = robot = None
         if has_poses:
             laser, robot, at = _pose(words[at : at + 3]), _pose(words[at + 3 : at + 6]), at + 6
-        step = self._step(n)
-        scan = _scan(words[at], (self._start(), step), ranges, (), self.max_range())
+        scan = _scan(words[at], self._angles(n), ranges, (), self.max_range())
         return _LaserLine(scan, laser, robot)
 
     def new_laser(self, words: Sequence[str]) -> _LaserLine:
@@ -119,17 +127,12 @@ class _Reader:
         )
         return _LaserLine(scan, laser, robot)
 
-    def _start(self) -> float:
-        return -0.5 * (math.pi if self._fov is None else self._fov)
-
-    def _step(self, n: int) -> float:
+    def _angles(self, n: int) -> tuple[float, float]:
+        """Angle [rad] of the first of n beams and the step, of a line that tells neither."""
         if self._fov is not None:
-            return self._fov / max(n - 1, 1)
-        if n in (180, 181):
-            return math.pi / 180.0
-        if n in (360, 361):
-            return math.pi / 360.0
-        return math.pi / max(n - 1, 1)
+            return -0.5 * self._fov, self._fov / max(n - 1, 1)
+        start, step = OLD_ANGLES.get(n + 1 - n % 2, (-90.0, 180.0 / max(n - 1, 1)))
+        return math.radians(start), math.radians(step)
 
 
 def _count(words: Sequence[str], at: int) -> int:
@@ -226,12 +229,11 @@ def _sensor_pose(lines: list[_LaserLine], reader: _Reader) -> Array:
 
     An offset that changes is that of a log whose poses were corrected: then it says nothing.
     """
-    stated = reader.params.get('robot_frontlaser_offset')
+    stated = reader.number('robot_frontlaser_offset')
     if stated is not None:
-        try:
-            return np.array([float(stated), 0.0, 0.0])
-        except ValueError:
-            pass
+        left = reader.number('robot_frontlaser_side_offset')
+        turn = reader.number('robot_frontlaser_angular_offset')
+        return np.array([stated, left or 0.0, turn or 0.0])
     pairs = [(line.robot, line.laser) for line in lines if line.robot is not None]
     if not pairs:
         return np.zeros(3)

@@ -57,14 +57,14 @@ def test_flaser_and_odom(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ('n', 'step'),
-    [(180, np.pi / 180), (181, np.pi / 180), (360, np.pi / 360), (361, np.pi / 360),
-     (91, np.pi / 90)],
+    ('n', 'first', 'step'),
+    [(180, -90.0, 1.0), (181, -90.0, 1.0), (360, -90.0, 0.5), (361, -90.0, 0.5),
+     (400, -50.0, 0.25), (401, -50.0, 0.25), (91, -90.0, 2.0)],
 )  # fmt: skip
-def test_angles_that_old_lines_do_not_say(tmp_path, n, step):
+def test_angles_that_old_lines_do_not_say(tmp_path, n, first, step):
     (s,) = read(tmp_path, flaser(n, 1.0)).scans
-    assert s.angle_min == pytest.approx(-np.pi / 2)
-    assert s.angle_increment == pytest.approx(step)
+    assert np.degrees(s.angle_min) == pytest.approx(first)
+    assert np.degrees(s.angle_increment) == pytest.approx(step)
 
 
 def test_given_field_of_view_and_range_win(tmp_path):
@@ -115,6 +115,10 @@ def test_stated_offset_wins_and_corrected_poses_say_nothing(tmp_path):
     assert_allclose(read(tmp_path, *corrected).T_base_laser, 0.0)
     stated = 'PARAM robot_frontlaser_offset 0.17 0 host 0'
     assert_allclose(read(tmp_path, stated, *corrected).T_base_laser, [0.17, 0.0, 0.0])
+    left = 'PARAM robot_frontlaser_side_offset -0.05'
+    turned = 'PARAM robot_frontlaser_angular_offset 0.1'
+    laser = read(tmp_path, stated, left, turned, *corrected).T_base_laser
+    assert_allclose(laser, [0.17, -0.05, 0.1])
 
 
 def test_lines_out_of_order_are_sorted_and_counted(tmp_path):
