@@ -10,12 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rlml_slam.errors import SolverError
 from rlml_slam.graph import factors
+from rlml_slam.graph.places import Places, places_of
 from rlml_slam.graph.robust import Losses
 from rlml_slam.graph.system import Tables
 from rlml_slam.graph.table import Column, FactorKind, FactorTable, renumbered
@@ -68,6 +70,11 @@ class Graph:
         self.sightings = FactorTable(('pose', 'landmark'), 2)
         self.pose_priors = FactorTable(('pose',), 3)
         self.landmark_priors = FactorTable(('landmark',), 2)
+        self._places: Places | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but addresses, which are others in a copy."""
+        return {**self.__dict__, '_places': None}
 
     @property
     def poses(self) -> Array:
@@ -203,6 +210,22 @@ class Graph:
             self.sightings.factors(), self.pose_priors.factors(), self.landmark_priors.factors(),
             self.losses.codes,
         )  # fmt: skip
+
+    def places(self) -> Places:
+        """Where the buffers lie, of poses, landmarks and in the order of Tables.
+
+        They are looked up again only after one of them has changed its place or its length.
+        """
+        buffers = (
+            self._poses.view, self._landmarks.view,
+            self._fixed_poses.view, self._fixed_landmarks.view,
+            *self.edges.factors(), *self.sightings.factors(),
+            *self.pose_priors.factors(), *self.landmark_priors.factors(),
+        )  # fmt: skip
+        last = self._places
+        if last is None or any(a is not b for a, b in zip(buffers, last.buffers, strict=True)):
+            self._places = last = places_of(buffers)
+        return last
 
     def residuals(self) -> Residuals:
         """Squared Mahalanobis norms of all factors at the current estimate."""

@@ -25,13 +25,16 @@ from rlml_slam.graph.increments import (
     IN_USE,
     LANDMARKS,
     LISTED,
+    LITTLE,
     POSES,
+    ROWS,
     SEEDS,
     STEP,
     TOP,
     UNKNOWNS,
     State,
     ask,
+    compacted,
     grown,
     new_state,
 )
@@ -45,9 +48,13 @@ from rlml_slam.graph.tree_joint import tree_joint
 from rlml_slam.se2 import Array
 from rlml_slam.types import EdgeKind
 
-# The blocks of a tree whose parts come and go lie ever farther apart: beyond this many times the
-# room of those in use, it is made anew. As much has been factored by then as that costs.
-SCATTERED = 2.0
+# Beyond this many times the room of the blocks in use, the pool is made anew without gaps: from
+# 5/4 of it, as much has been factored by then as that takes to copy.
+SCATTERED = 2.5
+# Parts that are ordered on their own fill the tree more than the whole does. Beyond this many
+# times the room that it took when it was ordered as a whole, or for a graph that has grown as
+# much, it is again: as much has been factored by then as that costs.
+FILLED = 2.0
 
 
 @dataclass(frozen=True)
@@ -146,14 +153,30 @@ class Incremental:
         self.thresholds = thresholds or Thresholds()
         self._losses = graph.losses
         self._state = new_state(64, 64, 64, 256)
-        self._pool = np.empty(1 << 14)
+        self._pool = np.empty(LITTLE)
         self._whole = False
+        self._in_one = 0  # elements of the tree when it was ordered as a whole
         self._fixed = graph.fixed_poses.copy(), graph.fixed_landmarks.copy()
 
     @property
     def settled(self) -> bool:
         """Whether no factor waits to be relinearised: another update would change nothing."""
         return not self._whole and not self._state.counts[LISTED]
+
+    @property
+    def is_current(self) -> bool:
+        """Whether the last update knew all that is in the graph now."""
+        graph, state = self.graph, self._state
+        tables = graph.edges, graph.sightings, graph.pose_priors, graph.landmark_priors
+        now = len(graph.poses), len(graph.landmarks), *map(len, tables)
+        return (
+            not self._whole
+            and graph.losses is self._losses
+            and tuple(state.counts[: ROWS + 4].tolist()) == now
+            and np.array_equal(self._fixed[0], graph.fixed_poses)
+            and np.array_equal(self._fixed[1], graph.fixed_landmarks)
+            and all(np.array_equal(state.on[k, : len(t)], t.enabled) for k, t in enumerate(tables))
+        )
 
     def start_over(self) -> None:
         """The estimate in the graph was changed: the next update takes it as it is."""
@@ -171,12 +194,16 @@ class Incremental:
         self._mind_fixed()
         self._reserve()
         count = self._state.counts
-        scattered = count[TOP] > SCATTERED * count[IN_USE] + (1 << 14)
-        whole = whole or self._whole or bool(scattered)
+        filled = bool(count[IN_USE] > FILLED * self._in_one + LITTLE)
+        whole = whole or self._whole or filled
+        if not whole and len(self._pool) > SCATTERED * (count[IN_USE] + LITTLE):
+            self._pool = compacted(self._state, self._pool)
         self._pool, failed, step = advance(
             self._state, self._pool, graph.tables(), graph.poses, graph.landmarks,
             whole, limits.due, limits.turn, limits.still,
         )  # fmt: skip
+        if step.refactored and not step.kept:
+            self._in_one = int(count[IN_USE])
         self._whole = failed >= 0
         if self._whole:
             node = self._state.unknowns[failed]
@@ -264,4 +291,5 @@ def warm_up() -> None:
         graph.add_sighting(k + 1, 0, [-k, 1.1], np.eye(2))
         solver.update()
     solver.joint([2], [0])
+    compacted(solver._state, solver._pool)
     solver.renumber(graph.keep(np.ones(3, dtype=np.bool_), np.ones(1, dtype=np.bool_)))

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.compiled import part
+from rlml_slam.compiled import kernel, part
 from rlml_slam.graph.structure import Ints, Records
 from rlml_slam.se2 import Array
 
@@ -51,7 +51,7 @@ EDGES, SIGHTINGS, POSE_PRIORS, LANDMARK_PRIORS = 0, 1, 2, 3
 # A clique: its place in the tree (-1: none), ``own`` of its ``members`` variables, ``width`` own
 # of ``height`` rows. At ``block`` of the pool lie the members, as integers; at ``panel`` ``width``
 # columns of ``height`` + 1 rows, of which the last is the right-hand side, then the update matrix
-# of ``height`` - ``width`` + 1 rows and columns. ``room`` is the size class of the block.
+# of ``height`` - ``width`` + 1 rows (refactor.py). ``room`` is the size class of the block.
 CLIQUE = np.dtype(
     [
         (k, np.int64)
@@ -69,6 +69,7 @@ POSES, LANDMARKS, ROWS, UNKNOWNS, FACTORS, CLIQUES = 0, 1, 2, 6, 7, 8
 FREE_CLIQUE, TOP, STEP, SEEDS, LISTED, FREE_UNKNOWN, FREE_FACTOR, IN_USE, COUNTS = range(9, 18)
 
 CLASSES = 256  # size classes of blocks: four to an octave
+LITTLE = 1 << 14  # elements that are not worth a thought
 
 
 class State(NamedTuple):
@@ -150,6 +151,35 @@ def with_room(pool: Array, top: int, need: int) -> Array:
 
 
 @part
+def elements_of(room: int) -> int:
+    """Elements of a block of a class."""
+    least = 16 << (room // 4)
+    return int(least + room % 4 * (least // 4))
+
+
+@kernel
+def compacted(state: State, pool: Array) -> Array:
+    """A pool of the blocks in use, one after the other, and a quarter more."""
+    numbers, cliques = pool.view(np.int64), state.cliques
+    more = np.empty(state.counts[IN_USE] * 5 // 4 + LITTLE)
+    top = 0
+    for v in range(state.counts[UNKNOWNS]):
+        c = state.unknowns[v]['clique']
+        if c < 0 or numbers[cliques[c]['block']] != v:  # each clique with its first own unknown
+            continue
+        first, elements = cliques[c]['block'], elements_of(cliques[c]['room'])
+        for k in range(elements):
+            more[top + k] = pool[first + k]
+        cliques[c]['block'] = top
+        cliques[c]['panel'] += top - first
+        top += elements
+    state.counts[TOP] = top
+    for k in range(len(state.free)):
+        state.free[k] = -1
+    return more
+
+
+@part
 def take_clique(cliques: Records, count: Ints) -> int:
     """A record for a clique."""
     c: int = count[FREE_CLIQUE]
@@ -189,8 +219,7 @@ def take_factor(factors: Records, count: Ints) -> int:
 def drop_clique(state: State, numbers: Ints, c: int) -> None:
     """Give back a clique and its block."""
     clique = state.cliques[c]
-    least = 16 << (clique['room'] // 4)
-    state.counts[IN_USE] -= least + clique['room'] % 4 * (least // 4)
+    state.counts[IN_USE] -= elements_of(clique['room'])
     numbers[clique['block']] = state.free[clique['room']]
     state.free[clique['room']] = clique['block']
     clique['next'] = state.counts[FREE_CLIQUE]

@@ -39,18 +39,32 @@ class Live:
         self.steps = self.batches = 0
         self._p = parameters
         self._incremental = Incremental(graph)
+        self._at_rest = False  # the last solve ended, and no step came since
+        # the optimum, where ``joint`` has solved for it but the graph does not show it yet
+        self._ahead: tuple[Array, Array] | None = None
 
     def solve(self) -> None:
         """Bring the estimate to the optimum; raises SolverError as the solvers do."""
+        self._catch_up()
+        if self._at_rest and self._incremental.is_current:
+            return
         graph = self.graph
         before = graph.poses.copy(), graph.landmarks.copy()
         try:
-            if self._descend(before):
-                return
+            self._at_rest = self._descend(before)
         except SolverError:
-            pass  # where the graph itself is to blame, the batch solver says so
-        graph.poses[:], graph.landmarks[:] = before
-        self.solve_all()
+            self._at_rest = False  # where the graph itself is to blame, the batch solver says so
+        if not self._at_rest:
+            graph.poses[:], graph.landmarks[:] = before
+            self.solve_all()
+
+    def _catch_up(self) -> None:
+        """Show what was solved on the side."""
+        if self._ahead is not None:
+            poses, landmarks = self._ahead
+            self.graph.poses[: len(poses)] = poses
+            self.graph.landmarks[: len(landmarks)] = landmarks
+            self._ahead = None
 
     def _descend(self, before: tuple[Array, Array]) -> bool:
         """Steps until the optimum is reached, or False where they do not lead there."""
@@ -73,20 +87,30 @@ class Live:
 
     def solve_all(self) -> None:
         """The same by the batch solver, in the time that the whole graph takes."""
+        self._catch_up()
         self.batches += 1
         optimize(self.graph, self._p)
         self.start_over()
 
     def start_over(self) -> None:
         """The estimate was changed by others."""
+        self._at_rest, self._ahead = False, None
         self._incremental.start_over()
 
     def joint(self, poses: ArrayLike, landmarks: ArrayLike = ()) -> Array:
         """Joint covariance (3k + 2l, 3k + 2l) of the poses (k,), then the landmarks (l,).
 
-        As that of Marginals; the graph is solved first if it was not, for robust weights count.
+        As that of Marginals. For robust weights count, it is that at the optimum; but the estimate
+        stays where it is: until the next solve if that has to be found first.
         """
-        self.solve()
+        if not (self._at_rest and self._incremental.is_current):
+            graph = self.graph
+            shown = graph.poses.copy(), graph.landmarks.copy()
+            self.solve()
+            if not self._at_rest:  # the batch solver left no tree
+                self._step()
+            self._ahead = graph.poses.copy(), graph.landmarks.copy()
+            graph.poses[:], graph.landmarks[:] = shown
         return self._incremental.joint(poses, landmarks)
 
     def keep(
@@ -96,6 +120,7 @@ class Live:
         disabled: NDArray[np.bool_] | None = None,
     ) -> Renumbering:
         """Graph.keep; what goes should have no enabled factor any more."""
+        self._catch_up()
         try:
             self._step()
         except SolverError:
@@ -107,4 +132,5 @@ class Live:
 
     def _step(self) -> None:
         self.steps += 1
+        self._at_rest = False
         self._incremental.update()

@@ -3,7 +3,8 @@
 
 Made anew are the cliques of the unknowns that were asked for and all cliques above them; what
 hangs below stays as it is and counts as eliminated: a node of size 0 that joins its separator.
-The unknowns with new factors are eliminated last, so that the next ones find them near the root.
+The unknowns with new factors are eliminated last, so that the next ones find them near the root;
+not where these are more than fit there: an order that keeps many for the end fills the tree.
 """
 
 from __future__ import annotations
@@ -65,13 +66,15 @@ def take_out(state: State, numbers: Ints) -> Part:
     dims = np.zeros(m + 1 + k, np.int64)
     total, late = 0, 0
     for n in range(m):
-        v = unknowns[n]
-        dims[n] = state.unknowns[v]['size']
+        dims[n] = state.unknowns[unknowns[n]]['size']
         total += dims[n]
-        if state.unknowns[v]['late'] == step:
+        if state.unknowns[unknowns[n]]['late'] == step:
+            late += dims[n]
+    for n in range(m):
+        v = unknowns[n]
+        if late <= WIDEST and state.unknowns[v]['late'] == step:
             pairs[w, 0], pairs[w, 1] = m, n
             w += 1
-            late += 1
         # every factor between two unknowns starts from a pose
         link = state.unknowns[v]['head'] if dims[n] == 3 else -1
         while link >= 0:

@@ -2,6 +2,9 @@
 """Numeric factorisation of a part of the tree: assemble, take up the children, eliminate.
 
 The right-hand side is the last row of every front, so the forward solve comes with the factor.
+
+Of an update matrix of k rows and k - 1 columns the lower triangle is kept: four columns at a time,
+as dense.rank_update takes them, each four from the row of their first one on.
 """
 
 from __future__ import annotations
@@ -30,19 +33,38 @@ from rlml_slam.se2 import Array
 
 @part
 def reserve(state: State, pool: Array, anew: Part) -> Array:
-    """The pool with room for all new cliques."""
-    need = 0
+    """The pool with room for all new cliques that do not fit into free blocks."""
+    numbers, need = pool.view(np.int64), 0
+    free = state.free.copy()
     for s in range(len(anew.fronts) - 1):
         width, height = anew.fronts[s]['width'], anew.fronts[s]['height']
         entries = anew.fronts[s + 1]['start'] - anew.fronts[s]['start']
-        need += room_of(_size(width, height, entries))[1]
+        room, elements = room_of(_size(width, height, entries))
+        if free[room] >= 0:
+            free[room] = numbers[free[room]]
+        else:
+            need += elements
     return with_room(pool, state.counts[TOP], need)
 
 
 @part
 def _size(width: int, height: int, members: int) -> int:
     below = height + 1 - width
-    return width * (height + 1) + below * below + members
+    return width * (height + 1) + _triangle(below) + members
+
+
+@part
+def _triangle(below: int) -> int:
+    """Elements of an update matrix of so many rows, of which the last one is no column."""
+    full = (below - 1) // 4
+    return _column(below, 4 * full) + 4 * full + (below - 1 - 4 * full) * (below - 4 * full)
+
+
+@part
+def _column(below: int, j: int) -> int:
+    """Where row 0 of its column j would be: the rows above the first of its four are not kept."""
+    first = j - j % 4
+    return first * below - first * (first - 4) // 2 + j % 4 * (below - first) - first
 
 
 @part
@@ -106,8 +128,10 @@ def refactor(
         tall, below = height + 1, height + 1 - width
         update = at + width * tall
         for j in range(height):
-            column[j] = at + j * tall if j < width else update + (j - width) * below - width
-        for k in range(at, update + below * below):
+            column[j] = at + j * tall
+            if j >= width:
+                column[j] = update + _column(below, j - width) - width
+        for k in range(at, update + _triangle(below)):
             pool[k] = 0.0
         for p in range(fronts[s]['start'], fronts[s + 1]['start']):
             row_of[anew.order[entries[p]['position']]] = entries[p]['local']
@@ -127,7 +151,7 @@ def refactor(
             return numbers[clique['block']], assembled
         for j in range(0, below - 1, 4):
             rank_update(
-                pool, update + j * (below + 1), below, min(4, below - 1 - j),
+                pool, update + _column(below, j) + j, below - j, min(4, below - 1 - j),
                 pool, at + width + j, tall, width, below - j,
             )  # fmt: skip
     return -1, assembled
@@ -285,10 +309,11 @@ def _extend(
             w += 1
     rows[w] = height
     below = w + 1
-    source = clique['panel'] + clique['width'] * (clique['height'] + 1)
-    for k in range(source, source + below * below, 8):
+    update = clique['panel'] + clique['width'] * (clique['height'] + 1)
+    for k in range(update, update + _triangle(below), 8):
         fetch(pool, k, 0)
     for j in range(w):
+        source = update + _column(below, j)
         t = rows[j]
         to = column[t]
         if ascending:
@@ -300,4 +325,3 @@ def _extend(
                     pool[to + rows[i]] += pool[source + i]
                 else:
                     pool[column[rows[i]] + t] += pool[source + i]
-        source += below

@@ -19,7 +19,9 @@ from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.initialize import initialize
 from rlml_slam.graph.iterate import Progress, copy, gauss_newton
 from rlml_slam.graph.linearize import linearize
-from rlml_slam.graph.system import System, Tables, set_up
+from rlml_slam.graph.places import nodes_at, tables_at
+from rlml_slam.graph.structure import Ints
+from rlml_slam.graph.system import System, set_up
 from rlml_slam.se2 import Array
 from rlml_slam.types import EdgeKind
 
@@ -28,9 +30,21 @@ from rlml_slam.types import EdgeKind
 BAD_START = 9.0
 # costs below this per residual are rounding
 NOTHING = 1e-18
-# the memory that the last solves of a thread needed: taking it anew from the operating system, a
-# page at a time, would cost as much as a factorisation of a small graph
-_KEPT = threading.local()
+
+
+class _Kept(threading.local):
+    """Of the last solves of a thread: the memory that they needed, and where they report.
+
+    Taking memory anew from the operating system, a page at a time, would cost as much as a
+    factorisation of a small graph.
+    """
+
+    def __init__(self) -> None:
+        self.memory = np.empty(0)
+        self.report = np.empty((2, 4))
+
+
+_KEPT = _Kept()
 DEFAULT = params.Solver()
 # when headings are relaxed first
 NEVER, IF_BAD, ALWAYS = 0, 1, 2
@@ -67,15 +81,16 @@ def optimize(graph: Graph, parameters: params.Solver = DEFAULT) -> Solution:
         start = _evaluate(graph)
         initialize(graph, p.initialization)
     if p.method in ('auto', 'gauss_newton'):
-        memory = getattr(_KEPT, 'memory', np.empty(0))
-        used, at, end = _gauss_newton(
-            graph.tables(), graph.poses, graph.landmarks, memory, relaxing, p.max_iterations,
+        places, memory, report = graph.places(), _KEPT.memory, _KEPT.report
+        used = _gauss_newton(
+            places.at, graph.losses.codes, memory, report, relaxing, p.max_iterations,
             p.relative_tolerance,
         )  # fmt: skip
         if used < 0:
             system_of(graph)  # tells what is wrong
         elif used > len(memory):
             _KEPT.memory = np.empty(used + used // 4)
+        at, end = (Progress(a, b, int(k), c > 0.0) for a, b, k, c in report.tolist())
         if p.method == 'auto' and not end.converged:
             more = _descend(graph, at, p, NEVER)
             end = more._replace(iterations=end.iterations + more.iterations)
@@ -115,27 +130,40 @@ def _evaluate(graph: Graph) -> Progress:
 
 @kernel
 def _gauss_newton(
-    tables: Tables, poses: Array, landmarks: Array, memory: Array, relaxing: int,
-    max_iterations: int, tolerance: float,
-) -> tuple[int, Progress, Progress]:  # fmt: skip
-    """(memory used or -1 if the graph cannot be solved, start, end) by Gauss-Newton.
+    places: Ints, losses: Array, memory: Array, report: Array, relaxing: int, max_iterations: int,
+    tolerance: float,
+) -> int:  # fmt: skip
+    """Memory used, or -1 if the graph cannot be solved; Gauss-Newton on a graph at ``places``.
 
-    All in one call, which saves the wrapping and unwrapping of what lies between. Relaxed
-    headings that lead nowhere better are taken back.
+    All in one call, which saves the wrapping and unwrapping of what lies between. ``report``
+    (2, 4) becomes the Progress at the start and at the end.
     """
-    nothing = Progress(0.0, 0.0, 0, False)
+    poses, landmarks = nodes_at(places)
     if not (finite(poses) and finite(landmarks)):
-        return -1, nothing, nothing
-    loose, system = set_up(tables, memory)
+        return -1
+    loose, system = set_up(tables_at(places, losses), memory)
     if loose >= 0:
-        return -1, nothing, nothing
-    used = len(system.values) + len(system.left) + len(system.right)
+        return -1
+    start, end = _descend_from(system, poses, landmarks, relaxing, max_iterations, tolerance)
+    for k in range(2):
+        at = start if k == 0 else end
+        report[k, 0], report[k, 1], report[k, 2] = at.cost, at.chi2, at.iterations
+        report[k, 3] = 1.0 if at.converged else 0.0
+    return len(system.values) + len(system.left) + len(system.right)
+
+
+@part
+def _descend_from(
+    system: System, poses: Array, landmarks: Array, relaxing: int, max_iterations: int,
+    tolerance: float,
+) -> tuple[Progress, Progress]:  # fmt: skip
+    """(Start, end); relaxed headings that lead nowhere better are taken back."""
     num = num_residuals(system)
     floor = NOTHING * num
     cost, chi2 = linearize(system, poses, landmarks, True)
     start = Progress(cost, chi2, 0, len(system.variables) == 0)
     if start.converged:
-        return used, start, start
+        return start, start
     if relaxing == ALWAYS or (relaxing == IF_BAD and cost > BAD_START * num):
         kept, kept_landmarks = poses.copy(), landmarks.copy()
         if relax(system, poses, landmarks):
@@ -144,12 +172,12 @@ def _gauss_newton(
                 system, poses, landmarks, at[0], at[1], max_iterations, tolerance, floor
             )
             if end.cost < cost:
-                return used, start, end
+                return start, end
         copy(kept, poses)
         copy(kept_landmarks, landmarks)
         linearize(system, poses, landmarks, True)
     end = gauss_newton(system, poses, landmarks, cost, chi2, max_iterations, tolerance, floor)
-    return used, start, end
+    return start, end
 
 
 @kernel

@@ -193,7 +193,7 @@ def resident_mb() -> float:
 def row(slam: Slam, errors: list[float], t: float, before_mb: float) -> dict[str, Any]:
     """Sizes at ``t`` [s], and cost and error since the last row."""
     back_end = slam.back_end
-    ms = np.array([u.wall_ms for u in slam.updates])
+    ms = np.array([u.cpu_ms for u in slam.updates])
     slam.updates.clear()
     return {
         'hours': t / HOUR,
