@@ -70,6 +70,11 @@ class Graph:
         self.sightings = FactorTable(('pose', 'landmark'), 2)
         self.pose_priors = FactorTable(('pose',), 3)
         self.landmark_priors = FactorTable(('landmark',), 2)
+        tables = self.edges, self.sightings, self.pose_priors, self.landmark_priors
+        self._columns = (
+            self._poses, self._landmarks, self._fixed_poses, self._fixed_landmarks,
+            *(column for table in tables for column in table.columns),
+        )  # fmt: skip
         self._places: Places | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -216,16 +221,15 @@ class Graph:
 
         They are looked up again only after one of them has changed its place or its length.
         """
-        buffers = (
-            self._poses.view, self._landmarks.view,
-            self._fixed_poses.view, self._fixed_landmarks.view,
-            *self.edges.factors(), *self.sightings.factors(),
-            *self.pose_priors.factors(), *self.landmark_priors.factors(),
-        )  # fmt: skip
         last = self._places
-        if last is None or any(a is not b for a, b in zip(buffers, last.buffers, strict=True)):
-            self._places = last = places_of(buffers)
-        return last
+        if last is not None:
+            for column, buffer in zip(self._columns, last.buffers, strict=True):
+                if column.view is not buffer:
+                    break
+            else:
+                return last
+        self._places = places_of(tuple(column.view for column in self._columns))
+        return self._places
 
     def residuals(self) -> Residuals:
         """Squared Mahalanobis norms of all factors at the current estimate."""

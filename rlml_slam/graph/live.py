@@ -40,7 +40,7 @@ class Live:
         self._p = parameters
         self._incremental = Incremental(graph)
         self._at_rest = False  # the last solve ended, and no step came since
-        # the optimum, where ``joint`` has solved for it but the graph does not show it yet
+        # the estimate of the solver, where the graph shows an older one until the next solve
         self._ahead: tuple[Array, Array] | None = None
 
     def solve(self) -> None:
@@ -119,15 +119,23 @@ class Live:
         landmarks: NDArray[np.bool_],
         disabled: NDArray[np.bool_] | None = None,
     ) -> Renumbering:
-        """Graph.keep; what goes should have no enabled factor any more."""
+        """Graph.keep; what goes should have no enabled factor any more.
+
+        The others stay where they are until the next solve.
+        """
+        graph = self.graph
+        shown = graph.poses.copy(), graph.landmarks.copy()
         self._catch_up()
         try:
             self._step()
         except SolverError:
             self.start_over()
-            return self.graph.keep(poses, landmarks, disabled)
-        new = self.graph.keep(poses, landmarks, disabled)
+            return graph.keep(poses, landmarks, disabled)
+        ahead = graph.poses[poses], graph.landmarks[landmarks]
+        graph.poses[:], graph.landmarks[:] = shown
+        new = graph.keep(poses, landmarks, disabled)
         self._incremental.renumber(new)
+        self._ahead = ahead
         return new
 
     def _step(self) -> None:

@@ -38,6 +38,9 @@ GROUPS = 0.1  # the same for the groups, whose members speak for each other alre
 DOUBT = 0.05  # chance of being wrong with which the last one enters
 STEP = 2.0  # by which the demands sink
 TRIES = 2  # times that a closure may be thrown out again
+# times that all are judged in the end, each as long as a solve: far more than it takes where
+# closures do not take turns
+ROUNDS = 50
 
 
 @dataclass(frozen=True)
@@ -219,10 +222,11 @@ class _Selector:
         What entered early was judged by a graph that knew little. Now all can be judged by what
         all the others say, and by errors as they have turned out to be (calibration.py). Of those
         that fail, the ones likelier wrong than right go at once; otherwise the worst goes alone,
-        as two that contradict each other need not both be wrong.
+        as two that contradict each other need not both be wrong. After ``ROUNDS`` times all that
+        are in doubt go, and none comes back.
         """
         self._left = np.where(self._may & ~self._held, TRIES, 0)
-        while True:
+        for left in range(ROUNDS, -1, -1):
             judged, evidence = self._judge_again()
             demand = self._strict() - self._lowest()
             doubt = judged & self._accepted & (evidence < demand)
@@ -230,10 +234,10 @@ class _Selector:
             self._evidence[judged] = evidence[judged]
             if doubt.any():
                 worst = evidence[doubt].min()
-                out = doubt & (evidence <= max(worst, 0.0))
+                out = doubt & (evidence <= max(worst, 0.0)) if left else doubt
                 self._left[out] -= 1
                 self._accepted &= ~out
-            elif back.any():
+            elif back.any() and left:
                 self._accepted |= back
             else:
                 return

@@ -77,6 +77,10 @@ class FactorTable:
         self._information = Column((dimension, dimension))
         self._kinds = Column((), np.int64)
         self._enabled = Column((), np.bool_)
+        # in the order of Factors
+        self.columns = (
+            self._nodes, self._measured, self._information, self._kinds, self._enabled,
+        )  # fmt: skip
 
     def __len__(self) -> int:
         return len(self._nodes)
@@ -118,9 +122,7 @@ class FactorTable:
 
         ``new`` has the indices of the nodes from then on, per column.
         """
-        for column in (
-            self._nodes, self._measured, self._information, self._kinds, self._enabled,
-        ):  # fmt: skip
+        for column in self.columns:
             column.keep(kept)
         for k, indices in enumerate(new):
             self._nodes.view[:, k] = indices[self._nodes.view[:, k]]

@@ -10,7 +10,8 @@ from scipy import sparse
 from rlml_slam import se2
 from rlml_slam.errors import SolverError
 from rlml_slam.graph.graph import Graph
-from rlml_slam.graph.incremental import Incremental, Step, Thresholds
+from rlml_slam.graph.incremental import FILLED, SCATTERED, Incremental, Step, Thresholds
+from rlml_slam.graph.increments import IN_USE, LITTLE, TOP, compacted
 from rlml_slam.graph.partial import WIDEST
 from rlml_slam.graph.robust import Loss, Losses, LossKind
 from rlml_slam.graph.solver import optimize
@@ -299,3 +300,66 @@ def test_a_pose_with_one_sighting_is_named() -> None:
     graph.add_sighting(i, 0, [1.0, 0.0], np.eye(2))
     with pytest.raises(SolverError, match='too few measurements'):
         ours.solver.update()
+
+
+def test_memory_is_that_of_the_tree_whatever_came_and_went() -> None:
+    """Blocks come and go with each closure; what they leave behind is given back."""
+    rng = np.random.default_rng(0)
+    graph = city(400)
+    solver = Incremental(graph)
+    solver.update()
+    closures = np.flatnonzero(graph.edges.kinds == 2)
+    for _ in range(300):
+        graph.edges.enabled[rng.choice(closures, 3)] ^= True
+        solver.update()
+        in_use = int(solver._state.counts[IN_USE])
+        # the quarter to spare, on what one more step may need besides
+        assert len(solver._pool) <= 1.25 * SCATTERED * (in_use + LITTLE)
+    solver.update(whole=True)
+    assert in_use < FILLED * solver._state.counts[IN_USE] + LITTLE
+
+
+def test_pool_without_gaps_holds_the_same_tree() -> None:
+    graph = city(300)
+    ours = driven(graph)
+    solver = ours.solver
+    before = solver.joint(np.arange(0, 300, 7))
+    solver._pool = compacted(solver._state, solver._pool)
+    assert solver._state.counts[TOP] == solver._state.counts[IN_USE]
+    np.testing.assert_array_equal(solver.joint(np.arange(0, 300, 7)), before)
+    closures = np.flatnonzero(ours.graph.edges.kinds == 2)
+    ours.graph.edges.enabled[closures[-5:]] = False
+    for _ in range(5):
+        solver.update()
+    assert ours.graph.chi2() == pytest.approx(batch_chi2(ours.graph), rel=1e-3)
+
+
+def test_many_changes_at_a_time_do_not_fill_the_tree() -> None:
+    """An order that keeps many for the end has fronts of all of them."""
+    graph = warehouse(300, 40)
+    solver = Incremental(graph)
+    solver.update(whole=True)
+    before = int(solver._state.counts[IN_USE])
+    graph.sightings.enabled[graph.sightings.nodes[:, 1] % 3 == 0] = False
+    solver.update()
+    assert solver._state.counts[IN_USE] < 1.5 * before
+
+
+def test_whether_an_update_is_due_is_told() -> None:
+    graph = chain(12)
+    solver = Incremental(graph)
+    assert not solver.is_current
+    changes = (
+        lambda: graph.add_pose([12.0, 0.0, 0.0]),
+        lambda: graph.add_edge(EdgeKind.ODOMETRY, 11, 12, [1.0, 0.0, 0.0], np.eye(3)),
+        lambda: graph.sightings.enabled.__setitem__(3, False),
+        lambda: graph.fixed_landmarks.__setitem__(1, True),
+        lambda: graph.add_landmark_prior(0, [0.0, 3.0], np.eye(2)),
+        lambda: setattr(graph, 'losses', Losses(scan=Loss(LossKind.HUBER, 2.0))),
+        solver.start_over,
+    )
+    for change in changes:
+        solver.update()
+        assert solver.is_current
+        change()
+        assert not solver.is_current

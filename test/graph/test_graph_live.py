@@ -196,3 +196,61 @@ def test_joint_covariance_is_that_of_the_whole_graph(seed: int) -> None:
     assert (np.abs(found - expected) <= 1e-6 * np.outer(sigma, sigma)).all()
     assert (found[:3] == 0.0).all()  # fixed
     assert live.joint([], []).shape == (0, 0)
+
+
+def test_what_is_at_rest_stays_there() -> None:
+    """Robust weights come to rest slowly: a solve that ended may have left a little to gain."""
+    rng = np.random.default_rng(3)
+    graph, true, points = loop_graph(3, poses=40, losses=ROBUST)
+    truth, live = list(true), Live(graph)
+    for _ in range(60):
+        do_something(live, truth, points, rng)
+        live.solve()
+        before, steps = graph.poses.copy(), live.steps
+        live.joint([3, len(truth) - 1], [0])
+        live.solve()
+        np.testing.assert_array_equal(graph.poses, before)
+        if live.batches == 0:
+            assert live.steps == steps
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_joint_covariance_moves_nothing_until_the_next_solve(seed: int) -> None:
+    """Also where it has to be solved for; and the next solve has no more to do then."""
+    rng = np.random.default_rng(seed)
+    graph, true, _ = loop_graph(seed, poses=40, losses=ROBUST)
+    truth, live = list(true), Live(graph)
+    live.solve()
+    moved = 0
+    for k in range(40):
+        drive_on(graph, truth, rng)
+        if k % 5 == 0:
+            i, j = int(rng.integers(20)), len(truth) - 1
+            delta = se2.compose(se2.between(truth[i], truth[j]), SIGMA * rng.standard_normal(3))
+            graph.add_edge(EdgeKind.CLOSURE, i, j, delta, np.diag(SIGMA**-2))
+        before = graph.poses.copy(), graph.landmarks.copy()
+        cov = live.joint([len(truth) - 1], [0])
+        assert np.linalg.eigvalsh(cov).min() > 0.0
+        np.testing.assert_array_equal(graph.poses, before[0])
+        np.testing.assert_array_equal(graph.landmarks, before[1])
+        steps = live.steps
+        live.solve()
+        assert live.steps == steps
+        moved += not np.array_equal(graph.poses, before[0])
+        np.testing.assert_array_equal(live.joint([len(truth) - 1], [0]), cov)
+        assert_at_the_optimum(live)
+    assert moved > 30
+
+
+def test_joint_covariance_is_there_where_the_batch_solver_had_to_come() -> None:
+    graph, _, _ = loop_graph(0, poses=40)
+    graph.poses[1:] += np.random.default_rng(0).normal(0.0, 2.0, (39, 3))
+    live, before = Live(graph), graph.poses.copy()
+    cov = live.joint([7])
+    assert live.batches == 1
+    np.testing.assert_array_equal(graph.poses, before)
+    live.solve()
+    expected = Marginals(graph).joint([7])
+    sigma = np.sqrt(np.diag(expected))
+    # the linear models may be off by a twentieth of a sigma
+    assert (np.abs(cov - expected) <= 0.1 * np.outer(sigma, sigma)).all()

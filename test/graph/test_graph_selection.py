@@ -18,7 +18,7 @@ from rlml_slam.graph.gnc import graduate, truncated_weights
 from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.marginals import Marginals
 from rlml_slam.graph.robust import Loss, Losses, LossKind
-from rlml_slam.graph.selection import select_closures
+from rlml_slam.graph.selection import ROUNDS, _Selector, select_closures
 from rlml_slam.graph.solver import optimize
 from rlml_slam.graph.table import FactorKind
 from rlml_slam.types import EdgeKind
@@ -259,3 +259,19 @@ def test_graduated_non_convexity_disables_a_few_wrong_closures():
     # the truncation at 99 % costs some of the right ones as well
     assert len(refused) - len(wrong) <= 2
     assert_array_equal(np.flatnonzero(~graph.edges.enabled), refused)
+
+
+def test_closures_that_take_turns_are_judged_a_bounded_number_of_times(monkeypatch):
+    """Whoever is in is doubted, whoever is out comes back: it ends with nobody in doubt inside."""
+    judged = []
+
+    def turns(self):
+        judged.append(int(self._accepted.sum()))
+        self._left[:] = 2  # as many times as they like
+        return np.ones(len(self._edges), np.bool_), np.where(self._accepted, -1e3, 1e3)
+
+    monkeypatch.setattr(_Selector, '_judge_again', turns)
+    selection = select_closures(laps())
+    assert len(judged) == ROUNDS + 1
+    assert judged[0] > 0
+    assert not selection.accepted.any()

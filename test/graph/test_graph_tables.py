@@ -1,9 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
+import copy
+import pickle
+
 import numpy as np
 import pytest
+from made_graphs import loop_graph
 
 from rlml_slam.errors import SolverError
 from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.solver import optimize
 from rlml_slam.graph.table import Column, FactorKind, is_positive_definite
 from rlml_slam.types import EdgeKind
 
@@ -100,3 +105,36 @@ def test_column_goes_on_after_it_has_let_rows_go():
     column.append(rows)
     assert len(column) == 27
     np.testing.assert_array_equal(column.view, np.vstack([rows[kept], rows]))
+
+
+def test_places_are_those_of_the_buffers_whatever_becomes_of_them():
+    """A graph that has grown, let go of nodes or is a copy has others."""
+    graph = loop_graph(0)[0]
+    first = graph.places()
+    assert graph.places() is first
+    copies = [copy.deepcopy(graph), pickle.loads(pickle.dumps(graph))]
+    graph.add_poses(np.zeros((100, 3)))
+    kept = np.arange(130) < 20
+    graph.keep(kept, np.ones(8, np.bool_))
+    for one in (graph, *copies):
+        at, buffers = one.places()
+        t = one.tables()
+        now = (
+            one.poses, one.landmarks, t.fixed_poses, t.fixed_landmarks,
+            *t.edges, *t.sightings, *t.pose_priors, *t.landmark_priors,
+        )  # fmt: skip
+        assert len(at) == len(buffers) == len(now)
+        for (address, length), array in zip(at.tolist(), now, strict=True):
+            assert (address, length) == (array.ctypes.data, len(array))
+
+
+def test_solving_a_copy_leaves_the_graph_alone():
+    graph = loop_graph(1, start_noise=1.0)[0]
+    optimize(graph)
+    graph.poses[1:] += 0.1
+    before = graph.poses.copy()
+    other = copy.deepcopy(graph)
+    optimize(other)
+    np.testing.assert_array_equal(graph.poses, before)
+    optimize(graph)
+    np.testing.assert_array_equal(graph.poses, other.poses)

@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -6,6 +7,8 @@ import pytest
 from made_worlds import ROOM, TinyWorld, drive, errors, observations, polygon
 
 from rlml_slam import se2
+from rlml_slam.graph.cost import total_cost
+from rlml_slam.graph.solver import optimize
 from rlml_slam.params import BackEnd as BackEndParameters
 from rlml_slam.params import LoopClosure, Parameters
 from rlml_slam.rlml.back_end import BackEnd
@@ -186,3 +189,41 @@ def test_room_is_mapped_the_same_where_no_place_is_full():
     a, _ = mapped(observed, Parameters())
     b, _ = mapped(observed, params(keyframes_per_place=0, submap_size=40))
     assert a.trajectory()[1].tobytes() == b.trajectory()[1].tobytes()
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_estimate_is_that_of_the_batch_solver_all_along_a_drive(seed):
+    """With loops that are closed, reflectors that are merged, keyframes that go."""
+    rng = np.random.default_rng(seed)
+    path = drive(*ROUND * 3, start=START)
+    observed = observations(SQUARE, path, rng=rng)
+    parameters = replace(
+        params(),
+        node=replace(Parameters().node, map_start_pose=START),
+        loop_closure=LoopClosure(max_distance=4.0, every=1),
+    )
+    front_end, back_end = FrontEnd(parameters), BackEnd(parameters)
+    graph, live = back_end.graph, back_end.live
+    solved = sparsified = 0
+    for o in observed:
+        num = len(back_end.keyframes)
+        update = back_end.add(front_end.process(o))
+        before = graph.poses.copy()
+        if back_end.belief() is not None:  # asks for covariances in the middle of a drive
+            np.testing.assert_array_equal(graph.poses, before)
+        if update is None or not update.optimized:
+            continue
+        front_end.correct(update.T_map_local)
+        last = back_end.keyframes[-1]
+        there = se2.compose(update.T_map_local, last.T_local)
+        np.testing.assert_allclose(graph.poses[last.index], there, atol=1e-12)
+        sparsified += len(back_end.keyframes) <= num
+        live.solve()
+        other = copy.deepcopy(graph)
+        optimize(other)
+        best = total_cost(other.tables(), other.poses, other.landmarks)[0]
+        assert total_cost(graph.tables(), graph.poses, graph.landmarks)[0] <= 1.001 * best + 0.01
+        solved += 1
+    assert solved > 10
+    assert sparsified > 3
+    assert any(c.accepted for c in back_end.scans.closures)
