@@ -25,7 +25,7 @@ from rlml_slam.params import Parameters
 from rlml_slam.rlml.closure import Closure
 from rlml_slam.rlml.closure_watch import ClosureWatch
 from rlml_slam.rlml.constellation_closure import Constellations
-from rlml_slam.rlml.correction import Correction, Known, either
+from rlml_slam.rlml.correction import Correction, Known, either, turned
 from rlml_slam.rlml.deferred import DeferredMatches
 from rlml_slam.rlml.keyframes import Interval, Keyframe
 from rlml_slam.rlml.loop_closure import ScanGraph
@@ -35,6 +35,7 @@ from rlml_slam.rlml.presence import Presence
 from rlml_slam.rlml.reflector_graph import ReflectorGraph
 from rlml_slam.rlml.reflector_states import ReflectorState, reflector_states
 from rlml_slam.rlml.sparsify import Sparsifier
+from rlml_slam.rlml.surest_way import SurestWay
 from rlml_slam.se2 import Array
 from rlml_slam.types import Belief, EdgeKind, Frame, Reflectors
 
@@ -95,6 +96,7 @@ class BackEnd:
         self.presence = Presence(p, self.graph, self.reflector_graph)
         self._gone: tuple[int, ...] = ()  # since the newest keyframe began
         self.closure_watch = ClosureWatch(p, self.live)
+        self.surest_way = SurestWay()
         self.plant = self._plant_frame(self._survey)
         self._changed: tuple[Closure, ...] = ()  # since the newest keyframe began
         self.T_map_local = np.zeros(3)
@@ -199,6 +201,8 @@ class BackEnd:
             points, o.origin if placed else None, frame.stamp,
         )  # fmt: skip
         self.keyframes.append(key)
+        if frame.jumped:
+            self.surest_way.begin(key)
         self._interval = Interval(frame.T_local_base)
         return key
 
@@ -265,7 +269,10 @@ class BackEnd:
         # open hypotheses are about places in the frame of now
         if self.plant is not None and not self.deferred.pending and self.plant.update():
             solve()
-        self._changed += self.closure_watch.review(self.scans.closures, final)
+        changed = self.closure_watch.review(self.scans.closures, final)
+        if changed:
+            self._changed += changed
+            self.surest_way.forget()
         self.live.solve()
         self._optimized = True
         self._since_optimized = 0
@@ -278,16 +285,15 @@ class BackEnd:
         """How well the newest keyframe is known in the map.
 
         Nothing that was seen near it is in the graph yet: that is of the keyframe before, from
-        which the front end's covariance has grown. What both have seen neither judges better; the
-        graph alone knows of the loops that scans have closed, and of the survey.
+        which the front end's covariance has grown. What the graph and any way that leads there
+        have both seen neither judges better; of the survey the graph alone knows.
         """
         before, last = self.keyframes[-2:]
         cov = self.live.joint([before.index])
-        R = np.eye(3)
-        R[:2, :2] = se2.rotation(self.T_map_local[2])
-        in_plant = self.plant is not None and self.plant.found
-        if not in_plant and not any(closure.accepted for closure in self.scans.closures):
-            cov = either(cov, R @ before.cov_local @ R.T)
+        if self.plant is None or not self.plant.found:
+            self.surest_way.close(self.scans.closures, self.keyframes, self.graph.edges)
+            heading = float(self.T_map_local[2] + before.T_local[2])
+            cov = either(cov, turned(self.surest_way.cov(before), heading))
         since = Correction(self.T_map_local, Known(before.T_local, before.cov_local, cov))
         _, cov_map = since.apply(last.T_local, last.cov_local)
         return Known(last.T_local, last.cov_local, cov_map)
@@ -295,6 +301,7 @@ class BackEnd:
     def revoke(self, number: int) -> Closure:
         """Take a loop closure out of the map for good; SolverError if there is no such one."""
         closure = self.closure_watch.revoke(self.scans.closures, number)
+        self.surest_way.forget()
         self.optimize()
         return closure
 

@@ -78,6 +78,17 @@ def _since(
     return T_map_base, carried(cov_map, there) + turned
 
 
+def turned(cov: Array, angle: float) -> Array:
+    """Covariance (3, 3) of a pose, from the axes of a frame that lies at ``angle`` to the others.
+
+    From those of the pose itself, that is its heading, and back by the heading's negative.
+    """
+    R = np.eye(3)
+    R[:2, :2] = se2.rotation(angle)
+    out: Array = R @ cov @ R.T
+    return out
+
+
 def either(P: Array, Q: Array) -> Array:
     """The least covariance (3, 3) that is, along common axes, no smaller than P or than Q."""
     # Q may be singular, that of the pose where all began
