@@ -8,8 +8,9 @@ import math
 
 import numpy as np
 
+from rlml_slam import se2
 from rlml_slam.matching import observability, thinning
-from rlml_slam.matching.scan_match import ScanMatchResult, match
+from rlml_slam.matching.scan_match import UNKNOWN, ScanMatchResult, match
 from rlml_slam.matching.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.doubt import Doubt
@@ -23,6 +24,7 @@ from rlml_slam.se2 import Array
 from rlml_slam.types import Observation
 
 FAR = 3.0  # [sigma] a search without odometry reaches
+KNOWN = 0.33  # share of a scan's end points that tells whether it is of the submap
 
 
 class ScanTerm:
@@ -100,6 +102,17 @@ class ScanTerm:
         usual = 0.0 if self.has_odometry else self.doubt.usual
         return match(submap, points, prior, strength, p, window=window, usual=usual)
 
+    def _misfits(self, submap: Submap, points: Array, found: ScanMatchResult) -> bool:
+        """Whether a scan fits far worse than usual, and not because it sees what is new.
+
+        What ends where nothing is known yet contradicts nothing; the rest has to fit as usual.
+        """
+        if not self.doubt.misfits(found.score, submap.insertions):
+            return False
+        known = submap.knows(se2.transform(found.pose, points))
+        least = AS_USUAL * self.doubt.usual
+        return known < KNOWN or found.score - (1.0 - known) * UNKNOWN < known * least
+
     def use(self, observation: Observation, sweep: Sweep, agrees: bool) -> Evidence:
         """Match against the submap and update with the scan term (e_s of eq. 2)."""
         p = self._p.scan_match
@@ -124,11 +137,11 @@ class ScanTerm:
             # beside its place, where a wrong stamp leads, a scan may fit, but not as usual
             searched = self._matched_freely(submap, points, prior, strength, p.wide_window)
             found = searched if searched.score >= usual else found
-        misfit = self.doubt.misfits(found.score, submap.insertions)
+        misfit = self._misfits(submap, points, found)
         if misfit and not agrees and not self.lasts(observation.stamp):
             turn = TURN if self.has_odometry else math.pi
             found = second_look(submap, points, prior, self.doubt.usual, self._p, turn) or found
-            misfit = self.doubt.misfits(found.score, submap.insertions)
+            misfit = self._misfits(submap, points, found)
         if found.score < p.min_score or (misfit and not agrees):
             return Evidence(scan=True, misfit=misfit, beams=len(points), score=found.score)
         self.doubt.learn(found.score)

@@ -97,3 +97,19 @@ def test_scan_with_a_wrong_stamp_is_placed_where_it_was_taken(late):
     distance, turn = errors(np.array([f.T_local_base for f in frames]), path)
     assert distance.max() < 0.06
     assert turn.max() < 0.03
+
+
+@pytest.mark.parametrize('turn', [1.4, -1.45])
+def test_scan_of_what_is_new_by_half_contradicts_nothing(turn):
+    path = np.array([*drive((0.3, 0.0, 2.0)), *drive((0.0, 0.0, 0.5))])
+    path[21:] = se2.compose(path[20], np.array([0.0, 0.0, turn]))
+    seen = observations(ROOM, path, reflectors=False, rng=np.random.default_rng(0))
+    # a laser of 120 degrees
+    ahead = [np.abs(np.arctan2(o.points[:, 1], o.points[:, 0])) < 1.05 for o in seen]
+    seen = [replace(o, points=o.points[a]) for o, a in zip(seen, ahead, strict=True)]
+    front_end = FrontEnd(Parameters())
+    frames = [front_end.process(o) for o in seen]
+    assert all(f.scan_used and not f.doubtful for f in frames[1:])
+    distance, off = errors(np.array([f.T_local_base for f in frames]), path)
+    assert distance.max() < 0.06
+    assert off.max() < 0.03
