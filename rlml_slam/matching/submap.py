@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import params
-from rlml_slam.compiled import brief, kernel, part
+from rlml_slam.compiled import brief, kernel
 from rlml_slam.errors import InputError
 from rlml_slam.matching import surfaces
+from rlml_slam.matching.carving import carve
 from rlml_slam.se2 import Array
 
 P_MIN, P_MAX = 0.1, 0.97
@@ -27,12 +28,6 @@ LEVELS = 32767
 STEP = (P_MAX - P_MIN) / (LEVELS - 1)
 MARGIN = 64  # cells of slack when a grid grows, and of free border that kernels may read
 BORDER = 4
-TOUCHED = np.uint16(0x8000)
-WHOLE_RAY = 2.0**40  # a ray's length as an integer
-FEWEST = 64  # of so many rays, one is followed from the sensor on
-CLOSE = 0.99  # [cells] between two rays, so that a cell does not fit in between
-DIAGONAL = 1.5  # [cells] that one cell covers of a ray at most
-ENDS = 3.0 * DIAGONAL  # [cells] of the last cells of a ray, which it does not miss, and one more
 EMPTY = np.zeros(0, dtype=np.int32)
 FIRST_LIST = 4096
 
@@ -208,137 +203,6 @@ def extent(points: Array, origin: Array) -> tuple[float, float, float, float]:
     if not np.isfinite(total + origin[0] + origin[1]):
         return np.nan, np.nan, np.nan, np.nan
     return x_min, y_min, x_max, y_max
-
-
-@kernel
-def carve(
-    values: NDArray[np.uint16],
-    points: Array,
-    origin: Array,
-    corner_j: float,
-    corner_i: float,
-    scale: float,
-    hit: NDArray[np.uint16],
-    miss: NDArray[np.uint16],
-    touched: NDArray[np.int32],
-) -> int:
-    """Apply one scan to ``values``; number of cells touched, or -1 if ``touched`` is too short.
-
-    ``points`` (n, 2) are end points in scan order. Every touched cell is marked with the top bit
-    and listed, and unmarked at the end; the length of the list is checked before anything is
-    changed.
-    """
-    columns = values.shape[1]
-    flat = values.reshape(-1)
-    x0, y0 = origin[0] * scale - corner_j, origin[1] * scale - corner_i
-    rays = np.empty((len(points), 2))
-    for k in range(len(points)):
-        rays[k, 0] = points[k, 0] * scale - corner_j - x0
-        rays[k, 1] = points[k, 1] * scale - corner_i - y0
-    starts = uncovered(rays)
-    # upper bound on touched cells: each ray crosses |di| + |dj| + 1 cells
-    bound = 0
-    for k in range(len(points)):
-        share = 1.0 - starts[k]
-        bound += int(abs(rays[k, 0]) * share) + int(abs(rays[k, 1]) * share) + 4
-    if min(bound, flat.size) > touched.size:
-        return -1
-    n = 0
-    for k in range(len(points)):
-        x1, y1 = points[k, 0] * scale - corner_j, points[k, 1] * scale - corner_i
-        cell = int(np.floor(y1)) * columns + int(np.floor(x1))
-        v = flat[cell]
-        if v < TOUCHED:
-            flat[cell] = hit[v] | TOUCHED
-            touched[n] = cell
-            n += 1
-    hits = n
-    for k in range(len(points)):
-        x1, y1 = points[k, 0] * scale - corner_j, points[k, 1] * scale - corner_i
-        sx, sy = x0 + starts[k] * (x1 - x0), y0 + starts[k] * (y1 - y0)
-        n = touch_ray(flat, columns, sx, sy, x1, y1, touched, n)
-    for m in range(hits):
-        flat[touched[m]] ^= TOUCHED
-    for m in range(hits, n):
-        at = np.uint64(touched[m])
-        flat[at] = miss[np.uint64(flat[at] ^ TOUCHED)]
-    return n
-
-
-@part
-def uncovered(rays: Array) -> Array:
-    """Share (n,) of each ray up to which the cells that it crosses are crossed by others as well.
-
-    ``rays`` (n, 2) [cells] from one origin, in the order of their angles or nearly so. A cell
-    that a ray crosses between two others is crossed by one of these, too, wherever they are less
-    than the side of a cell apart: it would not fit in between. So of rays 0, 8, 16 ... all is
-    needed, of 4, 12 ... what lies beyond where their neighbours 4 away are that close, of 2, 6
-    ... beyond where those 2 away are, and so on: near the sensor, few rays do for all.
-    """
-    n = len(rays)
-    length, share = np.empty(n), np.zeros(n)
-    for k in range(n):
-        length[k] = math.hypot(rays[k, 0], rays[k, 1])
-    stride = 1
-    while stride <= FEWEST // 2:
-        for k in range(stride, n - stride, 2 * stride):
-            a, b = k - stride, k + stride
-            ax, ay, bx, by = rays[a, 0], rays[a, 1], rays[b, 0], rays[b, 1]
-            dot, cross = ax * bx + ay * by, ax * by - ay * bx
-            before = ax * rays[k, 1] - ay * rays[k, 0]
-            after = rays[k, 0] * by - rays[k, 1] * bx
-            if dot <= 0.0 or before * after < 0.0 or length[k] == 0.0:
-                continue
-            reach = min(length[a], length[b]) - ENDS
-            if abs(cross) * reach > CLOSE * dot:  # twice the tangent of half the angle is less
-                reach = CLOSE * dot / abs(cross)
-            share[k] = max(reach - DIAGONAL, 0.0) / length[k]
-        stride *= 2
-    return share
-
-
-@kernel
-def touch_ray(
-    flat: NDArray[np.uint16],
-    columns: int,
-    x0: float,
-    y0: float,
-    x1: float,
-    y1: float,
-    touched: NDArray[np.int32],
-    n: int,
-) -> int:
-    """Mark and list the cells from (x0, y0) to (x1, y1) [cells], but the last two (Amanatides).
-
-    The cell before the end point's is not known to be free: the wall's noise reaches into it, and
-    beams that graze the wall would wear off its near side. The loop has no branches, which no
-    processor could predict: the place along the ray is an integer, and a cell that is marked
-    already is overwritten by the next one in the list.
-    """
-    j, i = int(np.floor(x0)), int(np.floor(y0))
-    dx, dy = x1 - x0, y1 - y0
-    left = abs(int(np.floor(x1)) - j) + abs(int(np.floor(y1)) - i)
-    step_j = 1 if dx > 0 else -1
-    step_i = columns if dy > 0 else -columns
-    per_j = 1.0 / abs(dx) if dx != 0 else np.inf
-    per_i = 1.0 / abs(dy) if dy != 0 else np.inf
-    first_j = ((j + 1 - x0) if dx > 0 else (x0 - j)) * per_j if dx != 0 else np.inf
-    first_i = ((i + 1 - y0) if dy > 0 else (y0 - i)) * per_i if dy != 0 else np.inf
-    # where along the ray the next column (row) begins; how far beyond its end does not matter
-    next_j, next_i = int(min(first_j, 2.0) * WHOLE_RAY), int(min(first_i, 2.0) * WHOLE_RAY)
-    width, height = int(min(per_j, 2.0) * WHOLE_RAY), int(min(per_i, 2.0) * WHOLE_RAY)
-    cell, turn, both, ahead = i * columns + j, step_j - step_i, width + height, next_j - next_i
-    for _ in range(left - 1):
-        # unsigned: an index that may be negative is looked at twice
-        at = np.uint64(cell)
-        touched[np.uint64(n)] = cell
-        v = flat[at]
-        flat[at] = v | TOUCHED
-        n += int(v < TOUCHED)
-        sideways = ahead >> 63  # all bits where the next column begins first, or none
-        cell = cell + step_i + (sideways & turn)
-        ahead = (ahead - height) + (sideways & both)
-    return n
 
 
 def warm_up() -> None:
