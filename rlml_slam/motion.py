@@ -22,6 +22,7 @@ from rlml_slam.types import Imu, Motion, Odometry
 
 SECOND = 1_000_000_000
 Stamps = NDArray[np.int64]
+BATCH = 256  # samples at least that are forgotten at once
 COAST = 0.2  # [s] for which a robot is taken to go on as it went before its odometry ended
 
 
@@ -283,8 +284,9 @@ class MotionBuffer:
         self._forget(self._imu_stamps, sample.stamp, self._rates)
 
     def _forget(self, stamps: list[int], now: int, *columns: list) -> None:  # type: ignore[type-arg]
-        k = bisect_left(stamps, now - self._memory)
-        if k > 256:  # in batches: deleting from the front of a list moves all of it
+        # in batches: deleting from the front of a list moves all of it
+        if len(stamps) > BATCH and stamps[BATCH] < now - self._memory:
+            k = bisect_left(stamps, now - self._memory)
             for column in (stamps, *columns):
                 del column[:k]
 

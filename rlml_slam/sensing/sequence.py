@@ -326,6 +326,8 @@ class Sequencer:
         self._waiting.sort(key=lambda w: (w[0], w[1]))
 
     def _release(self, ready: Callable[[int, int], bool] | None = None) -> list[Observation]:
+        if not self._waiting and not self._parked:
+            return []
         out = self._unpark(CONFIRM if ready is None else 1)
         while self._waiting:
             stamp = self._waiting[0][0]

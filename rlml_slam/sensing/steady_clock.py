@@ -65,8 +65,8 @@ class SteadyClock:
         self._lost = 0  # messages thought lost before the newest
         # sums over the window of 1, k, k^2, s, k s, s^2, k being the number, s the stamp since
         # the first; and over its steps of n^2, n d, d^2
-        self._sums = [0] * 6
-        self._steps = [0] * 3
+        self._sums = (0, 0, 0, 0, 0, 0)
+        self._steps = (0, 0, 0)
         self._overtakes = 0
 
     def steady(self, stamp: int) -> int:
@@ -123,10 +123,9 @@ class SteadyClock:
         return number + lost
 
     def _renumber_newest(self, number: int) -> None:
-        last, stamp = self._stamps.pop()
-        self._count(last, stamp, -1)
-        self._count_step(self._stamps[-1], (last, stamp), -1)
-        self._append(number, stamp)
+        newest, before = self._stamps.pop(), self._stamps[-1]
+        self._count(newest, before, newest, -1)
+        self._append(number, newest[1])
 
     def _is_jitter(self, line: Line) -> bool:
         """Whether the stamps may be those of a steady sensor and white jitter."""
@@ -151,32 +150,29 @@ class SteadyClock:
         self._append(number, stamp)
         if len(self._stamps) > WINDOW:
             oldest = self._stamps.popleft()
-            self._count(*oldest, -1)
-            self._count_step(oldest, self._stamps[0], -1)
+            self._count(oldest, oldest, self._stamps[0], -1)
 
     def _append(self, number: int, stamp: int) -> None:
-        if self._stamps:
-            self._count_step(self._stamps[-1], (number, stamp), 1)
-        self._stamps.append((number, stamp))
-        self._count(number, stamp, 1)
+        newest = (number, stamp)
+        before = self._stamps[-1] if self._stamps else newest
+        self._stamps.append(newest)
+        self._count(newest, before, newest, 1)
 
-    def _count(self, k: int, stamp: int, sign: int) -> None:
-        s = stamp - self._first
-        sums, signed_k, signed_s = self._sums, sign * k, sign * s
-        sums[0] += sign
-        sums[1] += signed_k
-        sums[2] += signed_k * k
-        sums[3] += signed_s
-        sums[4] += signed_s * k
-        sums[5] += signed_s * s
-
-    def _count_step(self, a: tuple[int, int], b: tuple[int, int], sign: int) -> None:
-        n, d = b[0] - a[0], b[1] - a[1]
+    def _count(
+        self, at: tuple[int, int], a: tuple[int, int], b: tuple[int, int], sign: int
+    ) -> None:
+        """Add to the sums, or take from them, a stamp and its step from ``a`` to ``b``."""
+        k, s = at[0], at[1] - self._first
+        n, sum_k, sum_kk, sum_s, sum_ks, sum_ss = self._sums
+        signed = sign * s
+        self._sums = (
+            n + sign, sum_k + sign * k, sum_kk + sign * k * k,
+            sum_s + signed, sum_ks + signed * k, sum_ss + signed * s,
+        )  # fmt: skip
+        m, d = b[0] - a[0], b[1] - a[1]
         self._overtakes += sign * (d < 0)
-        steps, signed_n = self._steps, sign * n
-        steps[0] += signed_n * n
-        steps[1] += signed_n * d
-        steps[2] += sign * d * d
+        nn, nd, dd = self._steps
+        self._steps = (nn + sign * m * m, nd + sign * m * d, dd + sign * d * d)
 
     def _line(self) -> Line | None:
         """The line through the window, None through too few or those of a clock that stands."""
