@@ -52,7 +52,7 @@ def _accumulate(
             continue
         count = 0
         sx = sy = sxx = sxy = syy = 0.0
-        for q in range(max(0, k - WINDOW), min(n, k + WINDOW + 1)):
+        for q in range(np.uint64(max(0, k - WINDOW)), np.uint64(min(n, k + WINDOW + 1))):
             dx, dy = points[q, 0] - px, points[q, 1] - py
             if dx * dx + dy * dy < REACH * REACH:
                 count += 1
@@ -70,8 +70,10 @@ def _accumulate(
         root = math.sqrt(half * half + sxy * sxy)
         along, across = mean + root, mean - root
         flat = across < FLAT * along
-        angle = 0.5 * math.atan2(sxy, half)  # of the surface
-        nx, ny = -math.sin(angle), math.cos(angle)
+        # the normal, by half of the surface's double angle
+        cosine = half / root if root > 0.0 else 1.0
+        nx = -math.copysign(math.sqrt(max(0.5 * (1.0 - cosine), 0.0)), sxy)
+        ny = math.sqrt(max(0.5 * (1.0 + cosine), 0.0))
         noise = max(across, 0.0) / along / (count - 2)  # variance of that angle
         for axis in range(2):
             if axis == 0 and flat:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rlml_slam import params
 from rlml_slam.compiled import brief, kernel
-from rlml_slam.matching import surfaces, thinning, window_search
+from rlml_slam.matching import surfaces, window_search
 from rlml_slam.matching.submap import P_MIN, STEP, Submap
 from rlml_slam.se2 import Array, wrapped
 
@@ -359,15 +359,15 @@ def match(
     """Pose of base in the submap from ``points`` (n, 2), base frame, and an odometry prior.
 
     ``prior_pose`` (3,), ``prior_information`` (3, 3) in raw coordinates of the submap frame.
-    Points are in scan order and thinned here. With ``searched`` a correlative search in the
-    window of the parameters gives the start, and where the fit is poor another one in the wide
-    window; else the prior does. A ``window`` [m, rad] replaces that of the parameters, and then
+    Points are in scan order, and thinned as scans are that are matched. With ``searched`` a
+    correlative search in the window of the parameters gives the start, and where the fit is poor
+    another one in the wide window; else the prior does. A ``window`` [m, rad] replaces that of the parameters, and then
     the prior is tried as well; a fit below ``usual`` counts as poor. With no points, or no submap,
     the prior is returned with no information and score 0.
     """
     p = parameters or params.ScanMatch()
     prior_pose = np.ascontiguousarray(prior_pose, dtype=np.float64)
-    points = thinning.thin(points, p.voxel, p.max_points)
+    points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
     if not len(points) or not submap.values.size:
         return ScanMatchResult(
             prior_pose.copy(), np.zeros((3, 3)), 0.0, 0, False, 1.0, np.zeros(3)

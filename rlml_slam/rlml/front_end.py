@@ -74,6 +74,7 @@ class FrontEnd:
         self.confirmation = Confirmation(self._p)
         self._last_stamp: int | None = None
         self._settling = 0.0  # [s] since the last frame
+        self._is_settled = True
 
     def use_map(self, reflectors: Reflectors, grid: OccupancyGrid | None = None) -> None:
         """Localise against given reflectors and grid (map frame); nothing is added to them.
@@ -184,6 +185,9 @@ class FrontEnd:
         What the frame can do without is left for :meth:`settle`, or for the next call.
         """
         began, self._settling = time.perf_counter() - self._settling, 0.0
+        if not self._is_settled:
+            self.submaps.settle()
+        self._is_settled = False
         coasts = self._predict(observation)
         sweep = Sweep()
         if coasts:
@@ -218,6 +222,7 @@ class FrontEnd:
         """Do what could wait until the frame was on its way; it counts as time of the next one."""
         began = time.perf_counter()
         self.submaps.settle()
+        self._is_settled = True
         self._settling += time.perf_counter() - began
 
     # --- prior -----------------------------------------------------------------------------
@@ -320,7 +325,7 @@ class FrontEnd:
             health=health,
             scan_score=evidence.score,
             scan_used=evidence.used,
-            chi2=float(np.nansum(matched.distance2[used])) if used.any() else 0.0,
+            chi2=float(matched.distance2[used].sum()),
             iterations=evidence.iterations,
             wall_ms=(time.perf_counter() - began) * 1e3,
             doubtful=doubtful or self.confirmation.is_pending,

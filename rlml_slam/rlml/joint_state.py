@@ -29,6 +29,7 @@ LANDMARKS = 15
 WHEELS = slice(SPEED, TURN + 1)
 SYSTEMATIC = slice(BIAS, TURN + 1)
 STANDING = np.zeros(2)
+GATE = 16.0  # squared sigmas of a bias beyond which the wheels slip
 MOVING = slice(VELOCITY, VELOCITY + 3)
 
 
@@ -120,7 +121,7 @@ class JointState:
         takes the place of odometry in the derivatives by these shares (:mod:`wheels`).
         """
         if math.isfinite(motion.bias_var):
-            self._measure_bias(motion.bias, motion.bias_var, motion.bias_turn)
+            measure_bias(self.x, self.P, motion.bias, motion.bias_var, motion.bias_turn)
         predict(
             self.x, self.P, motion.delta, motion.cov, motion.bias_gain, motion.turn_gain,
             went, walk, kept, self._wheels2,
@@ -133,20 +134,6 @@ class JointState:
         delta[:2] *= 1.0 + speed
         delta[2] = se2.wrapped(delta[2])
         return Motion(delta, motion.cov, motion.known)
-
-    def _measure_bias(self, bias: float, variance: float, turn: float = 0.0) -> None:
-        """Scalar update with what IMU and wheels say of the bias, gated against slip.
-
-        Wheels that turned by ``turn`` [rad/s] say it but for the share that they err by.
-        """
-        PH = self.P[:, BIAS] + turn * self.P[:, TURN]
-        S = float(PH[BIAS] + turn * PH[TURN]) + variance
-        error = bias - float(self.x[BIAS] + turn * self.x[TURN])
-        if error * error < 16.0 * S:
-            gain = PH / S
-            self.x += gain * error
-            self.x[2] = se2.wrapped(self.x[2])
-            self.P -= np.outer(gain, gain) * S
 
     def place(self, pose: Array, cov: Array) -> None:
         """Put the pose (3,) elsewhere, with an error of covariance (3, 3) of its own."""
@@ -328,6 +315,25 @@ def predict(
             P[e, e] += (1.0 - kept * kept) * wheels2[k]
 
 
+@brief
+def measure_bias(x: Array, P: Array, bias: float, variance: float, turn: float) -> None:
+    """Scalar update with what IMU and wheels say of the gyro's bias, gated against slip.
+
+    Wheels that turned by ``turn`` [rad/s] say it but for the share that they err by.
+    """
+    PH = P[:, BIAS] + turn * P[:, TURN]
+    S = PH[BIAS] + turn * PH[TURN] + variance
+    error = bias - (x[BIAS] + turn * x[TURN])
+    if error * error >= GATE * S:
+        return
+    for r in range(len(x)):
+        gain = PH[r] / S
+        x[r] += gain * error
+        for c in range(len(x)):
+            P[r, c] -= gain * PH[c]
+    x[2] = np.pi - (np.pi - x[2]) % (2.0 * np.pi)
+
+
 @kernel
 def update(x: Array, P: Array, columns: NDArray[np.int64], H: Array, R: Array, v: Array) -> None:
     """Kalman update in place; see :meth:`JointState.apply`."""
@@ -349,4 +355,5 @@ def warm_up() -> None:
     state = JointState(np.zeros(3), np.eye(3), 0.1)
     zero = np.zeros(3)
     predict(state.x, state.P, zero, np.eye(3), zero, zero, STANDING, 0.0, 1.0, np.zeros(2))
+    measure_bias(state.x, state.P, 0.0, 1.0, 0.0)
     state.apply(np.arange(3), np.eye(3), np.eye(3), np.zeros(3))

@@ -45,7 +45,7 @@ class Matched:
     @property
     def num_used(self) -> int:
         """Detections that moved the estimate."""
-        return int((self.status == USED).sum()) if len(self.status) else 0
+        return int(np.count_nonzero(self.status == USED))
 
     @property
     def agrees(self) -> bool:
@@ -91,8 +91,9 @@ class ReflectorTerm:
         if detections is None or not matched.open.any():
             return
         rows = np.flatnonzero(matched.open)
+        afresh = len(rows) == len(detections)
         result = self._associator.associate(
-            _subset(detections, rows),
+            detections if afresh else _subset(detections, rows),
             association.Believed(
                 self._state.pose,
                 self._state.landmarks(),
@@ -102,19 +103,21 @@ class ReflectorTerm:
                 self.tracks.spread2,
             ),
         )
-        taken = (result.match >= 0) & (result.match[:, None] == matched.index).any(axis=1)
-        used = (result.match >= 0) & ~taken
-        matched.status[rows] = np.where(taken, AMBIGUOUS, result.status)
+        used = result.match >= 0
+        matched.status[rows] = result.status
+        if not afresh:
+            taken = used & (result.match[:, None] == matched.index).any(axis=1)
+            matched.status[rows[taken]] = AMBIGUOUS
+            used &= ~taken
         if not used.any():
             return
         k, index = rows[used], result.match[used]
         matched.index[k] = index
         matched.distance2[k] = result.distance2[used]
-        R = detections.cov[k] + self.tracks.spread2[index][:, None, None] * np.eye(2)
-        # Huber on the innovation: beyond the scale a detection pulls no harder than at it
-        excess = matched.distance2[k] / self._p.reflector.robust_scale**2
-        R *= np.maximum(excess, 1.0)[:, None, None]
-        use_reflectors(self._state.x, self._state.P, index, detections.points[k], R)
+        use_reflectors(
+            self._state.x, self._state.P, index, detections.points[k], detections.cov[k],
+            self.tracks.spread2[index], matched.distance2[k], self._p.reflector.robust_scale,
+        )  # fmt: skip
         self.tracks.see(index, observation.stamp, detections.ids[k])
 
     def _recent(self, stamp: int) -> NDArray[np.bool_] | None:
@@ -135,7 +138,7 @@ class ReflectorTerm:
         seen = np.flatnonzero(matched.index >= 0)
         spread2 = np.zeros(len(detections))
         spread2[seen] = self.tracks.spread2[matched.index[seen]]
-        if self._p.node.mode == 'mapping':
+        if self._p.node.mode == 'mapping' and 0 < len(seen) < len(detections):
             double = self._associator.doubles(detections, matched.index)
             for k in np.flatnonzero(double >= 0):
                 gap = detections.points[k] - detections.points[double[k]]

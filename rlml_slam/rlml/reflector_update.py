@@ -16,11 +16,22 @@ CONVERGED = (1e-5, 1e-5, 1e-6)  # [m, m, rad] a last step of the pose
 
 
 @kernel
-def use_reflectors(x: Array, P: Array, index: NDArray[np.int64], z: Array, noise: Array) -> None:
+def use_reflectors(
+    x: Array,
+    P: Array,
+    index: NDArray[np.int64],
+    z: Array,
+    noise: Array,
+    spread2: Array,
+    distance2: Array,
+    robust_scale: float,
+) -> None:
     """Update ``x`` and ``P`` with detections z (q, 2) of reflectors ``index`` (q,).
 
-    ``noise`` (q, 2, 2) are their covariances. Gauss-Newton on the prior and the reflector terms
-    of eq. 3, over the pose and the reflectors that were seen; then all else follows.
+    ``noise`` (q, 2, 2) are their covariances, ``spread2`` (q,) variances per axis besides,
+    ``distance2`` (q,) the squared Mahalanobis distances of their innovations: by Huber's loss, one
+    beyond ``robust_scale`` pulls no harder than at it. Gauss-Newton on the prior and the reflector
+    terms of eq. 3, over the pose and the reflectors that were seen; then all else follows.
     """
     q = len(index)
     n = 3 + 2 * q
@@ -39,7 +50,11 @@ def use_reflectors(x: Array, P: Array, index: NDArray[np.int64], z: Array, noise
     R = np.zeros((2 * q, 2 * q))
     v, here, y = np.empty(2 * q), np.empty(2), np.empty(2 * q)
     for k in range(q):
-        R[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = noise[k]
+        excess = max(distance2[k] / robust_scale**2, 1.0)
+        for r in range(2):
+            R[2 * k + r, 2 * k] = noise[k, r, 0] * excess
+            R[2 * k + r, 2 * k + 1] = noise[k, r, 1] * excess
+            R[2 * k + r, 2 * k + r] = (noise[k, r, r] + spread2[k]) * excess
     for _ in range(ITERATIONS):
         for k in range(q):
             expected(now[:3], now[3 + 2 * k], now[4 + 2 * k], here, J)
@@ -66,4 +81,5 @@ def warm_up() -> None:
     """Compile the kernel with the signature that is used at run time."""
     state = JointState(np.zeros(3), np.eye(3), 0.1)
     state.fix_landmarks(np.ones((1, 2)), np.eye(2)[None])
-    use_reflectors(state.x, state.P, np.zeros(1, dtype=np.int64), np.ones((1, 2)), np.eye(2)[None])
+    index, one = np.zeros(1, dtype=np.int64), np.ones(1)
+    use_reflectors(state.x, state.P, index, np.ones((1, 2)), np.eye(2)[None], one, one, 1.0)

@@ -28,13 +28,13 @@ from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.deskew import project, sweep_time
 from rlml_slam.sensing.no_return import NoReturns
+from rlml_slam.sensing.placing import placed
 from rlml_slam.sensing.steady_clock import SteadyClock
 from rlml_slam.types import Detections, Imu, Motion, Observation, Odometry, Scan
 
 PAIRING = 2_000_000  # [ns] stamps of one instant: drivers round to milliseconds
 CARRY = 5 * SECOND  # motion older than this is summed up; an observation later than it is late
 MAX_SWEEP = 1.0  # [s] of one scan
-SIGMA = (1e-4, 10.0)  # [m] a detection that claims to be better or worse is believed this much
 INSTANTS = 20  # instants remembered: the other half of one comes soon after
 AHEAD = SECOND  # a stamp this far before all others is strange; sensors lag by less
 CONFIRM = 3  # messages that tell whether time did go on where a stamp is strange
@@ -458,21 +458,12 @@ class Sequencer:
 
     def _in_base(self, d: Detections, T: Array) -> Detections:
         """Detections moved from a sensor at ``T`` (3,) to the base frame, far ones left out."""
-        R = se2.rotation(T[2])
-        near = np.hypot(d.points[:, 0], d.points[:, 1]) <= self._p.reflector.max_range
-        if not near.all():
+        moved, bounded = placed(d, self._node.base_frame, T, self._p.reflector.max_range)
+        if len(moved) < len(d):
             self.inputs.count('reflectors', 'points_too_far')
-        cov, bounded = believable(d.cov[near])
         if bounded:
             self.inputs.count('reflectors', 'sigma_bounded')
-        return Detections(
-            d.stamp,
-            self._node.base_frame,
-            se2.transform(T, d.points[near]),
-            R @ cov @ R.T,
-            d.ids[near],
-            d.diameters[near],
-        )
+        return moved
 
 
 def widened(motion: Motion, lasted: int, sigma: float) -> Motion:
@@ -481,19 +472,3 @@ def widened(motion: Motion, lasted: int, sigma: float) -> Motion:
         return motion
     gone = motion.delta / (lasted / SECOND) * sigma
     return dataclasses.replace(motion, cov=motion.cov + np.outer(gone, gone))
-
-
-def believable(cov: Array) -> tuple[Array, bool]:
-    """Covariances (k, 2, 2) with every sigma inside SIGMA, and whether one had to be bounded.
-
-    A driver that fills in 0 or the largest float for "unknown" must not make the state singular.
-    """
-    least, most = SIGMA[0] ** 2, SIGMA[1] ** 2
-    mean = 0.5 * (cov[:, 0, 0] + cov[:, 1, 1])
-    across = 0.5 * (cov[:, 0, 1] + cov[:, 1, 0])
-    spread = np.hypot(0.5 * (cov[:, 0, 0] - cov[:, 1, 1]), across)
-    if (mean - spread >= least).all() and (mean + spread <= most).all():
-        return cov, False
-    values, axes = np.linalg.eigh(0.5 * (cov + np.swapaxes(cov, 1, 2)))
-    bounded = np.clip(values, least, most)
-    return (axes * bounded[:, None, :]) @ np.swapaxes(axes, 1, 2), True

@@ -27,7 +27,8 @@ def live(state, near, rng):
         state.predict(Motion(rng.normal(0.0, 0.3, 3), cov, True, np.array([0.0, 0.0, -0.1])), 1e-6)
         index = rng.choice(near, 2, replace=False)
         z = rng.normal(0.0, 2.0, (2, 2))
-        use_reflectors(state.x, state.P, index, z, np.tile(0.01 * np.eye(2), (2, 1, 1)))
+        noise, zero = np.tile(0.01 * np.eye(2), (2, 1, 1)), np.zeros(2)
+        use_reflectors(state.x, state.P, index, z, noise, zero, zero, 1.0)
         if k % 2:
             state.move_anchor(0, 1)
             state.clone_pose(0, rng.normal(), 1e-4 * np.eye(3))

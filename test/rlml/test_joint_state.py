@@ -8,7 +8,15 @@ from made_states import made
 
 from rlml_slam import se2
 from rlml_slam.matching.innovations import expected
-from rlml_slam.rlml.joint_state import ANCHORS, BIAS, LANDMARKS, SPEED, TURN, WHEELS
+from rlml_slam.rlml.joint_state import (
+    ANCHORS,
+    BIAS,
+    LANDMARKS,
+    SPEED,
+    TURN,
+    WHEELS,
+    measure_bias,
+)  # fmt: skip
 from rlml_slam.types import Motion
 
 
@@ -98,12 +106,12 @@ def test_bias_is_measured_as_a_scalar_and_an_outlier_is_not():
     state = made(2)
     x, P = state.x.copy(), state.P.copy()
     m = motion(bias=0.03, bias_var=1e-3)
-    state._measure_bias(m.bias, m.bias_var)
+    measure_bias(state.x, state.P, m.bias, m.bias_var, 0.0)
     K = P[:, BIAS] / (P[BIAS, BIAS] + 1e-3)
     np.testing.assert_allclose(state.x, x + K * (0.03 - x[BIAS]), atol=1e-12)
     np.testing.assert_allclose(state.P, P - np.outer(K, P[BIAS]), atol=1e-12)
     x, P = state.x.copy(), state.P.copy()
-    state._measure_bias(5.0, 1e-3)
+    measure_bias(state.x, state.P, 5.0, 1e-3, 0.0)
     np.testing.assert_array_equal(state.x, x)
     np.testing.assert_array_equal(state.P, P)
 
@@ -115,7 +123,7 @@ def test_bias_that_turning_wheels_tell_is_with_their_share_of_turn():
     H[0, BIAS], H[0, TURN] = 1.0, 0.7
     S = H @ P @ H.T + 1e-3
     K = P @ H.T / S
-    state._measure_bias(0.03, 1e-3, 0.7)
+    measure_bias(state.x, state.P, 0.03, 1e-3, 0.7)
     np.testing.assert_allclose(state.x, x + K[:, 0] * (0.03 - H[0] @ x), atol=1e-12)
     np.testing.assert_allclose(state.P, P - S * K @ K.T, atol=1e-12)
 

@@ -44,11 +44,25 @@ def test_update_is_the_optimum_over_prior_and_reflectors(sigma):
         return np.concatenate([root @ (x - x0), innovation])
 
     best = least_squares(residual, x0, xtol=1e-14, ftol=1e-14, gtol=1e-14, x_scale='jac').x
-    use_reflectors(state.x, state.P, INDEX, z, noise)
+    use_reflectors(state.x, state.P, INDEX, z, noise, np.zeros(3), np.zeros(3), 1.0)
     np.testing.assert_allclose(state.x, best, atol=5e-3 * sigma)
     J = central_differences(residual, state.x)
     np.testing.assert_allclose(state.P, np.linalg.inv(J.T @ J), atol=0.01 * sigma**2)
     np.testing.assert_array_equal(state.P, state.P.T)
+
+
+def test_spread_and_huber_widen_the_noise():
+    noise = np.array([[[4e-4, 1e-4], [1e-4, 9e-4]]] * 3)
+    spread2, distance2, scale = np.array([0.0, 2e-4, 0.0]), np.array([1.0, 9.0, 16.0]), 2.0
+    state, wider = made(0.02), made(0.02)
+    z = seen(state.x) + 0.01
+    use_reflectors(state.x, state.P, INDEX, z, noise, spread2, distance2, scale)
+    # the weight of Huber's loss is scale / distance, here for squared distances
+    excess = np.maximum(distance2 / scale**2, 1.0)
+    noise = (noise + spread2[:, None, None] * np.eye(2)) * excess[:, None, None]
+    use_reflectors(wider.x, wider.P, INDEX, z, noise, np.zeros(3), np.zeros(3), scale)
+    np.testing.assert_allclose(state.x, wider.x, atol=1e-12)
+    np.testing.assert_allclose(state.P, wider.P, atol=1e-15)
 
 
 def seen(x):

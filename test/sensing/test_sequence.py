@@ -9,7 +9,8 @@ from rlml_slam import se2
 from rlml_slam.errors import InputError
 from rlml_slam.motion import SECOND, MotionBuffer
 from rlml_slam.params import Node, Parameters
-from rlml_slam.sensing.sequence import PAIRING, PERSISTENT, SIGMA, Sequencer
+from rlml_slam.sensing.placing import SIGMA
+from rlml_slam.sensing.sequence import PAIRING, PERSISTENT, Sequencer
 from rlml_slam.types import Detections, Imu, Odometry, Scan
 
 MS = SECOND // 1000
