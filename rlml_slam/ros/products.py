@@ -17,6 +17,7 @@ from rlml_slam.params import Node
 from rlml_slam.ros import build
 from rlml_slam.ros.associated import build_reflector_map
 from rlml_slam.ros.markers import graph_markers, reflector_markers
+from rlml_slam.ros.memory import give_back
 from rlml_slam.ros.messages import make_rclpy, rclpy_class
 from rlml_slam.ros.sensors import LATCHED
 from rlml_slam.ros.serialized_path import serialized_path
@@ -105,6 +106,7 @@ class MapProducts:
             graph = getattr(source, 'graph', None)
             if graph is not None:
                 self._send('graph', graph_markers(make, stamp, frame, graph))
+        give_back()
         self.stamp, self._next = stamp, stamp + int(self._p.map_update_interval * 1e9)
         now = time.monotonic()
         self._rested = now + (now - began) * (1.0 / MAX_SHARE - 1.0)
