@@ -72,10 +72,10 @@ def carve(
         sx, sy = x0 + starts[k] * (x1 - x0), y0 + starts[k] * (y1 - y0)
         n = touch_ray(flat, columns, sx, sy, x1, y1, touched, n)
     for row, first, end in spans_of(area, x0, y0, len(values)):
-        for at in range(np.uint64(row * columns + first), np.uint64(row * columns + end)):
-            v = flat[at]
+        for cell in range(np.uint64(row * columns + first), np.uint64(row * columns + end)):
+            v = flat[cell]
             if v < TOUCHED:
-                flat[at] = miss[np.uint64(v)]
+                flat[cell] = miss[np.uint64(v)]
     for m in range(hits):
         flat[np.uint64(touched[m])] &= ~TOUCHED
     for m in range(hits, n):

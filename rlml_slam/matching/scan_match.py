@@ -361,9 +361,9 @@ def match(
     ``prior_pose`` (3,), ``prior_information`` (3, 3) in raw coordinates of the submap frame.
     Points are in scan order, and thinned as scans are that are matched. With ``searched`` a
     correlative search in the window of the parameters gives the start, and where the fit is poor
-    another one in the wide window; else the prior does. A ``window`` [m, rad] replaces that of the parameters, and then
-    the prior is tried as well; a fit below ``usual`` counts as poor. With no points, or no submap,
-    the prior is returned with no information and score 0.
+    another one in the wide window; else the prior does. A ``window`` [m, rad] replaces that of the
+    parameters, and then the prior is tried as well; a fit below ``usual`` counts as poor. With no
+    points, or no submap, the prior is returned with no information and score 0.
     """
     p = parameters or params.ScanMatch()
     prior_pose = np.ascontiguousarray(prior_pose, dtype=np.float64)
