@@ -12,6 +12,7 @@ from rlml_slam import params, se2
 from rlml_slam.matching import scan_match
 from rlml_slam.matching.scan_match import linearize, match
 from rlml_slam.matching.submap import P_MAX, Submap
+from rlml_slam.matching.thinning import thin
 
 P = params.ScanMatch()
 WEAK = np.diag([1.0, 1.0, 1.0])
@@ -202,7 +203,8 @@ def test_corridor_has_no_information_along_itself(beams):
     poses = se2.compose(turn, np.stack([np.linspace(0, 3, 30)] + [np.zeros(30)] * 2, -1))
     submap = built(world, poses, sigma=0.01, beams=beams)
     true = se2.compose(turn, [1.53, 0.1, 0.03])
-    points = scan(world, true, beams, sigma=0.01, seed=99)
+    p = params.ScanMatch()
+    points = thin(scan(world, true, beams, sigma=0.01, seed=99), p.voxel, p.max_points)
     prior = se2.compose(true, [0.08, 0.0, 0.0])
     found = match(submap, points, prior, np.linalg.inv(np.diag([0.05, 0.05, 0.02]) ** 2))
     # the odometry's 8 cm along the corridor are left alone, across it is held to millimetres
