@@ -565,8 +565,9 @@ class Ekf(Group):
         choices=('reflectors', 'spikes', 'lines'),
     )  # fmt: skip
     association: str = param(
-        'nearest', 'nearest neighbour in Mahalanobis distance, or joint compatibility',
-        choices=('nearest', 'joint', 'deferred'),
+        'auto', 'the nearest in Mahalanobis distance, joint compatibility, or that and, in doubt, '
+        'what is seen later; auto: deferred for reflectors, nearest for spikes',
+        choices=('auto', 'nearest', 'joint', 'deferred'),
     )  # fmt: skip
     gate: float = param(0.997, 'probability inside the validation gate', '', 0.5, 0.999999)
     new_gate: float = param(

@@ -42,19 +42,23 @@ class Matcher:
         self._reflector = params.reflector
         self.gate, self._new_gate = gate(e.gate), gate(e.new_gate)
         self._joint: Associator | None = None
+        # what is extracted comes and goes with each scan, too much of it to wait for answers
+        auto = 'deferred' if e.extractor == 'reflectors' else 'nearest'
+        association = auto if e.association == 'auto' else e.association
         # a line has no place that could be jointly compatible
-        if e.association != 'nearest' and e.extractor != 'lines':
+        if association != 'nearest' and e.extractor != 'lines':
             self._joint = Associator(
                 dataclasses.replace(
                     params.reflector, gate=e.gate, new_gate=e.new_gate,
                     min_separation=e.min_separation,
                 )
             )  # fmt: skip
-        self.defers = e.association == 'deferred' and self._joint is not None
+        self.defers = association == 'deferred' and self._joint is not None
 
     def match(self, seen: Measured, filter_: Filter, tracks: Tracks, stamp: int) -> Matches:
         """The landmark of the filter's region that each measurement is of."""
-        if self._joint is None:
+        # where all tell their ids there is no question that others could help to answer
+        if self._joint is None or (seen.detections.ids != ANONYMOUS).all():
             return self._nearest(seen, filter_, tracks.ids[filter_.local])
         local = filter_.local
         recent = stamp - tracks.last_seen[local] < self._reflector.track_timeout * 1e9

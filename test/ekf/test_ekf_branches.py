@@ -10,6 +10,7 @@ from rlml.made_worlds import ROOM, drive, observations
 from rlml_slam import se2
 from rlml_slam.ekf.estimator import Estimator
 from rlml_slam.ekf.filter import Filter
+from rlml_slam.ekf.matching import Matcher
 from rlml_slam.ekf.models import POINT
 from rlml_slam.params import EkfParameters, from_mapping
 from rlml_slam.types import Detections, Motion, Observation
@@ -53,6 +54,21 @@ def test_landmarks_seen_again_after_a_blind_stretch_are_told_in_the_end(seed):
     assert gap.min(axis=1).max() < 0.1
     _, poses = estimator.trajectory()
     assert np.abs(poses[-1] - LOOP[-1])[:2].max() < 0.1
+
+
+def test_reflectors_are_told_so_by_default():
+    observed = blinded(0)
+    _, deferred, _ = run(observed, 'deferred')
+    _, frames, _ = run(observed, 'auto')
+    assert all((a.T_map_base == b.T_map_base).all() for a, b in zip(frames, deferred, strict=True))
+
+
+@pytest.mark.parametrize(
+    ('extractor', 'deferred'), [('reflectors', True), ('spikes', False), ('lines', False)]
+)
+def test_answers_are_deferred_for_reflectors_alone(extractor, deferred):
+    params = from_mapping({'ekf.extractor': extractor}, EkfParameters)
+    assert Matcher(params).defers is deferred
 
 
 def test_nearest_neighbour_takes_them_for_others():
