@@ -35,7 +35,7 @@ from rlml_slam.rlml.presence import Presence
 from rlml_slam.rlml.reflector_graph import ReflectorGraph
 from rlml_slam.rlml.reflector_states import ReflectorState, reflector_states
 from rlml_slam.rlml.sparsify import Sparsifier
-from rlml_slam.rlml.surest_way import SurestWay
+from rlml_slam.rlml.surest_way import SurestWay, held
 from rlml_slam.se2 import Array
 from rlml_slam.types import Belief, EdgeKind, Frame, Reflectors
 
@@ -286,14 +286,17 @@ class BackEnd:
 
         Nothing that was seen near it is in the graph yet: that is of the keyframe before, from
         which the front end's covariance has grown. What the graph and any way that leads there
-        have both seen neither judges better; of the survey the graph alone knows.
+        have both seen neither judges better; of the survey the graph alone knows, and of loops
+        where reflectors hold the pose.
         """
         before, last = self.keyframes[-2:]
         cov = self.live.joint([before.index])
         if self.plant is None or not self.plant.found:
             self.surest_way.close(self.scans.closures, self.keyframes, self.graph.edges)
-            heading = float(self.T_map_local[2] + before.T_local[2])
-            cov = either(cov, turned(self.surest_way.cov(before), heading))
+            looped = any(closure.accepted for closure in self.scans.closures)
+            if not (looped and held(self.graph.sightings, before.index)):
+                heading = float(self.T_map_local[2] + before.T_local[2])
+                cov = either(cov, turned(self.surest_way.cov(before), heading))
         since = Correction(self.T_map_local, Known(before.T_local, before.cov_local, cov))
         _, cov_map = since.apply(last.T_local, last.cov_local)
         return Known(last.T_local, last.cov_local, cov_map)

@@ -80,6 +80,15 @@ class SurestWay:
         self._known.insert(k, known)
 
 
+def held(sightings: FactorTable, pose: int) -> bool:
+    """Whether the reflectors seen at a pose of the graph hold it: two, in all three directions.
+
+    What they tell does not pass through the wheels, so no way by these need be asked then.
+    """
+    rows = (sightings.nodes[:, 0] == pose) & sightings.enabled
+    return len(np.unique(sightings.nodes[rows, 1])) >= 2
+
+
 def intersection(P: Array, Q: Array) -> Array:
     """(w P^-1 + (1 - w) Q^-1)^-1 of covariances (3, 3), with the w for which it is smallest."""
     # P may be singular, that of the pose where all began

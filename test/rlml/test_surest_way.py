@@ -19,7 +19,7 @@ from rlml_slam.rlml.closure import Closure
 from rlml_slam.rlml.correction import either, turned
 from rlml_slam.rlml.joint_state import JointState
 from rlml_slam.rlml.keyframes import Keyframe
-from rlml_slam.rlml.surest_way import SurestWay, intersection
+from rlml_slam.rlml.surest_way import SurestWay, held, intersection
 from rlml_slam.types import EdgeKind, Motion
 
 SHARES = (0.03, 0.05)
@@ -126,6 +126,17 @@ def test_place_found_anew_counts_for_what_comes_after_it_alone():
     assert_allclose(way.cov(keys[15]), found, atol=1e-12)
     way.forget()
     assert_allclose(way.cov(keys[15]), found, atol=1e-12)
+
+
+def test_two_reflectors_hold_a_pose_and_one_does_not():
+    graph = Graph()
+    for x in range(3):
+        graph.add_pose([x, 0.0, 0.0])
+    near, far = graph.add_landmark([1.0, 2.0]), graph.add_landmark([5.0, 2.0])
+    for pose, landmark in ((0, near), (0, near), (1, near), (1, far), (2, near), (2, far)):
+        graph.add_sighting(pose, landmark, [1.0, 2.0], np.eye(2))
+    graph.sightings.enabled[-1] = False
+    assert [held(graph.sightings, pose) for pose in range(3)] == [False, True, False]
 
 
 def test_intersection_is_no_surer_than_what_was_fused_whatever_the_two_have_in_common():
