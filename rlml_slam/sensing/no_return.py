@@ -14,6 +14,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rlml_slam.compiled import brief
+from rlml_slam.se2 import Array
 from rlml_slam.types import Scan
 
 ARC = 0.3  # [rad] of neighbouring beams of one and the same range, the longest of the scan
@@ -34,26 +36,41 @@ class NoReturns:
         """The scan with NaN where there is no return, zero being none; itself if there is all."""
         r = scan.ranges
         codes = self._codes.setdefault(scan.frame_id, [])
-        none = r == 0.0
-        for code in codes:
-            none |= r == code
-        valid = (r >= scan.range_min) & (r <= scan.range_max) & ~none
-        while valid.any():
-            longest = float(r[valid].max())
-            equal = r == longest
-            beams = longest_run(equal)
+        while True:
+            longest, beams, none = _farthest(r, np.array(codes), scan.range_min, scan.range_max)
             if beams < FEWEST or beams * abs(scan.angle_increment) < ARC:
-                codes[:] = [code for code in codes if code > longest]
                 break
             codes.append(longest)
-            none |= equal
-            valid &= ~equal
-        if not none.any():
+        codes[:] = [code for code in codes if code > longest]
+        if not none:
             return scan
-        return replace(scan, ranges=np.where(none, np.float32(np.nan), r))
+        return replace(scan, ranges=np.where(np.isin(r, [0.0, *codes]), np.float32(np.nan), r))
 
 
-def longest_run(flags: NDArray[np.bool_]) -> int:
-    """Length of the longest run of neighbours that are all true."""
-    ends = np.flatnonzero(np.diff(np.concatenate(([0], flags.view(np.int8), [0]))))
-    return int((ends[1::2] - ends[::2]).max(initial=0))
+@brief
+def _farthest(
+    ranges: NDArray[np.float32], codes: Array, least: float, most: float
+) -> tuple[float, int, int]:
+    """(Longest range in [least, most], longest run of neighbours that have it, beams left out).
+
+    Left out are 0 and the codes, which are no ranges.
+    """
+    longest, beams, run, none = -np.inf, 0, 0, 0
+    for r in ranges:
+        told = r == 0.0
+        for code in codes:
+            told |= r == code
+        none += told
+        if told or not least <= r <= most:
+            run = 0
+            continue
+        if r > longest:
+            longest, beams, run = r, 0, 0
+        run = run + 1 if r == longest else 0
+        beams = max(beams, run)
+    return float(longest), beams, none
+
+
+def warm_up() -> None:
+    """Compile the kernel with the signature that is used at run time."""
+    _farthest(np.zeros(1, dtype=np.float32), np.zeros(0), 0.0, 1.0)

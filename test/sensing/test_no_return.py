@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from rlml_slam.sensing.no_return import NoReturns, longest_run
+from rlml_slam.sensing.no_return import NoReturns
 from rlml_slam.types import Scan
 
 STEP = math.radians(1.0)
@@ -72,6 +72,7 @@ def test_zero_is_no_return_even_if_it_is_not_less_than_the_least_range():
     assert_array_equal(left, np.array([np.nan, 1.0, np.nan, np.inf], np.float32))
 
 
-def test_longest_run_counts_neighbours():
-    assert longest_run(np.array([True, True, False, True, True, True])) == 3
-    assert longest_run(np.zeros(4, dtype=bool)) == 0
+def test_equal_ranges_that_are_no_neighbours_are_kept():
+    ranges = np.tile(np.r_[np.full(7, 8.0), 7.9, np.full(7, 8.0), np.nan], 20)
+    scan = scan_of(ranges)
+    assert NoReturns().left_out(scan) is scan
