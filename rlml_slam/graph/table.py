@@ -38,6 +38,15 @@ class Column:
     def __len__(self) -> int:
         return len(self.view)
 
+    def __getstate__(self) -> NDArray[Any]:
+        """The rows: copied each on its own, the view would no longer be one of the buffer."""
+        return self.view
+
+    def __setstate__(self, rows: NDArray[Any]) -> None:
+        self._buffer = np.zeros((max(16, len(rows)), *rows.shape[1:]), dtype=rows.dtype)
+        self.view = self._buffer[: len(rows)]
+        self.view[:] = rows
+
     def read_only(self) -> NDArray[Any]:
         """The rows so far, not to be written to."""
         view = self.view[:]
