@@ -149,19 +149,25 @@ def start_of(source: Graph, key: Keyframe, poses: Array) -> Array:
 
 
 def compare(graph: Graph, with_rival: bool) -> dict[str, Any]:
-    """Drive both solvers through the graph."""
+    """Drive both solvers through the graph; the rival as far as it gets."""
     ours, rival = Ours(graph), Isam(graph) if with_rival else None
     times: list[float] = []
     theirs: list[float] = []
+    failed = None
     for key in keyframes(graph):
         times.append(ours.step(key))
         if rival is not None:
-            theirs.append(rival.step(key.index, key.edges, key.sightings))
+            try:
+                theirs.append(rival.step(key.index, key.edges, key.sightings))
+            except RuntimeError:  # what it raises where it finds the equations singular
+                rival, failed = None, key.index
     out: dict[str, Any] = {
         'poses': len(graph.poses), 'landmarks': len(graph.landmarks),
         'factors': len(graph.edges) + len(graph.sightings),
         'rlml': {**figures(times), 'chi2': ours.chi2()},
     }  # fmt: skip
+    if failed is not None:
+        out['isam2_failed_at'] = failed
     if rival is not None:
         rival.estimate()
         out['isam2'] = {**figures(theirs), 'chi2': graph.chi2()}
@@ -193,6 +199,8 @@ def _print(result: dict[str, Any]) -> None:
                 f'  {name:6} median {row["median_ms"]:7.3f}  p99 {row["p99_ms"]:7.2f}  '
                 f'total {row["total_ms"]:8.0f} ms  chi2 {row["chi2"]:.6g}'
             )
+    if 'isam2_failed_at' in result:
+        print(f'  isam2  finds the equations singular at pose {result["isam2_failed_at"]}')
     if 'ratio' in result:
         row = result['ratio']
         print(
