@@ -219,7 +219,7 @@ class Graph:
     def places(self) -> Places:
         """Where the buffers lie, of poses, landmarks and in the order of Tables.
 
-        They are looked up again only after one of them has changed its place or its length.
+        They are looked up again only where one of them has changed its place or its length.
         """
         last = self._places
         if last is not None:
@@ -228,7 +228,7 @@ class Graph:
                     break
             else:
                 return last
-        self._places = places_of(tuple(column.view for column in self._columns))
+        self._places = places_of(tuple(column.view for column in self._columns), last)
         return self._places
 
     def residuals(self) -> Residuals:

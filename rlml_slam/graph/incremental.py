@@ -21,7 +21,10 @@ from rlml_slam.graph.graph import Graph, Renumbering
 from rlml_slam.graph.increments import (
     CLIQUES,
     FACTORS,
+    FIXED_LANDMARKS,
+    FIXED_POSES,
     FREE_CLIQUE,
+    IN_ONE,
     IN_USE,
     LANDMARKS,
     LISTED,
@@ -39,15 +42,19 @@ from rlml_slam.graph.increments import (
     new_state,
 )
 from rlml_slam.graph.partial import take_out
+from rlml_slam.graph.places import nodes_at, tables_at
 from rlml_slam.graph.propagate import propagate
 from rlml_slam.graph.refactor import make_cliques, refactor, reserve
-from rlml_slam.graph.relinearize import judge, refer_all, take
+from rlml_slam.graph.relinearize import differ, is_robust, judge, refer_all, take
 from rlml_slam.graph.renumber import renumber
+from rlml_slam.graph.structure import Ints
 from rlml_slam.graph.system import Tables
 from rlml_slam.graph.tree_joint import tree_joint
 from rlml_slam.se2 import Array
 from rlml_slam.types import EdgeKind
 
+# What comes of a step; an unknown from 0 on is one at which the equations are singular.
+DONE, OTHER, NO_ROOM = -1, -2, -3
 # Beyond this many times the room of the blocks in use, the pool is made anew without gaps: from
 # 5/4 of it, as much has been factored by then as that takes to copy.
 SCATTERED = 2.5
@@ -89,14 +96,30 @@ class Step(NamedTuple):
 
 @kernel
 def advance(
-    state: State, pool: Array, tables: Tables, poses: Array, landmarks: Array,
-    whole: bool, due: float, turn: float, still: float,
+    state: State, pool: Array, places: Ints, losses: Array, whole: bool, due: float, turn: float,
+    still: float,
 ) -> tuple[Array, int, Step]:  # fmt: skip
-    """(pool, unknown at which the equations are singular or -1, what was done) of one step."""
-    count, losses = state.counts, tables.losses
+    """(pool, what came of it, what was done) of one step on a graph at ``places``.
+
+    What came of it is DONE, or the unknown at which the equations are singular, or why nothing
+    was done: OTHER nodes are fixed than before, or there is NO_ROOM for all that is in the graph.
+    """
+    nothing = Step(0, 0, 0, 0, 0, 0)
+    tables = tables_at(places, losses)
+    if not _fits(state, tables):
+        return pool, NO_ROOM, nothing
+    count = state.counts
+    if differ(state.on[FIXED_POSES], tables.fixed_poses, 0, count[POSES]) or differ(
+        state.on[FIXED_LANDMARKS], tables.fixed_landmarks, 0, count[LANDMARKS]
+    ):
+        return pool, OTHER, nothing
+    poses, landmarks = nodes_at(places)
     count[STEP] += 1
     count[SEEDS] = 0
     take(state, tables, poses, landmarks)
+    whole |= count[IN_USE] > FILLED * count[IN_ONE] + LITTLE
+    if not whole and len(pool) > SCATTERED * (count[IN_USE] + LITTLE):
+        pool = compacted(state, pool)
     relinearized = 0
     if whole:
         relinearized = _start_over(state, poses, landmarks)
@@ -107,21 +130,42 @@ def advance(
         relinearized += 1
     count[LISTED] = 0
     if count[SEEDS] == 0:
-        return pool, -1, Step(0, 0, 0, 0, 0, 0)
+        return pool, DONE, nothing
     anew = take_out(state, pool.view(np.int64))
     pool = reserve(state, pool, anew)
     numbers = pool.view(np.int64)
     of_front = make_cliques(state, numbers, anew)
-    failed, factors = refactor(state, pool, numbers, anew, of_front, losses, poses, landmarks)
+    failed, factors = refactor(
+        state, pool, numbers, anew, of_front, losses, poses, landmarks, due, turn
+    )
     for n in range(len(anew.unknowns)):
         state.unknowns[anew.unknowns[n]]['local'] = -1
+    if len(anew.unknowns) > 0 and len(anew.cliques) == 0:
+        count[IN_ONE] = count[IN_USE]
     moved, solved = 0, 0
-    if failed < 0:
+    if failed == DONE:
         who = np.empty(count[UNKNOWNS], np.int64)
-        moved, solved = propagate(state, pool, numbers, of_front, poses, landmarks, still, who)
-        judge(state, who[:moved], losses, poses, landmarks, due, turn)
+        solved, moved, restless = propagate(
+            state, pool, numbers, of_front, is_robust(losses), poses, landmarks, still, who
+        )
+        judge(state, who[:restless], losses, poses, landmarks, due, turn)
     work = Step(relinearized, factors, len(anew.unknowns), len(anew.cliques), solved, moved)
     return pool, failed, work
+
+
+@part
+def _fits(state: State, tables: Tables) -> bool:
+    """Whether there is room for all that is in the graph."""
+    most, total = 0, 0
+    for table in (tables.edges, tables.sightings, tables.pose_priors, tables.landmark_priors):
+        most = max(most, len(table.nodes))
+        total += len(table.nodes)
+    return (
+        len(tables.fixed_poses) <= len(state.of_pose)
+        and len(tables.fixed_landmarks) <= len(state.of_landmark)
+        and most <= state.of_row.shape[1]
+        and total <= len(state.factors)
+    )
 
 
 @part
@@ -155,8 +199,6 @@ class Incremental:
         self._state = new_state(64, 64, 64, 256)
         self._pool = np.empty(LITTLE)
         self._whole = False
-        self._in_one = 0  # elements of the tree when it was ordered as a whole
-        self._fixed = graph.fixed_poses.copy(), graph.fixed_landmarks.copy()
 
     @property
     def settled(self) -> bool:
@@ -173,9 +215,14 @@ class Incremental:
             not self._whole
             and graph.losses is self._losses
             and tuple(state.counts[: ROWS + 4].tolist()) == now
-            and np.array_equal(self._fixed[0], graph.fixed_poses)
-            and np.array_equal(self._fixed[1], graph.fixed_landmarks)
-            and all(np.array_equal(state.on[k, : len(t)], t.enabled) for k, t in enumerate(tables))
+            and all(
+                np.array_equal(known[: len(flags)], flags)
+                for known, flags in zip(
+                    state.on,
+                    (*(t.enabled for t in tables), graph.fixed_poses, graph.fixed_landmarks),
+                    strict=True,
+                )
+            )
         )
 
     def start_over(self) -> None:
@@ -191,19 +238,16 @@ class Incremental:
         graph, limits = self.graph, self.thresholds
         if graph.losses is not self._losses:
             self._losses, self._whole = graph.losses, True
-        self._mind_fixed()
-        self._reserve()
-        count = self._state.counts
-        filled = bool(count[IN_USE] > FILLED * self._in_one + LITTLE)
-        whole = whole or self._whole or filled
-        if not whole and len(self._pool) > SCATTERED * (count[IN_USE] + LITTLE):
-            self._pool = compacted(self._state, self._pool)
-        self._pool, failed, step = advance(
-            self._state, self._pool, graph.tables(), graph.poses, graph.landmarks,
-            whole, limits.due, limits.turn, limits.still,
-        )  # fmt: skip
-        if step.refactored and not step.kept:
-            self._in_one = int(count[IN_USE])
+        places, failed = graph.places().at, NO_ROOM
+        while failed in (NO_ROOM, OTHER):
+            self._pool, failed, step = advance(
+                self._state, self._pool, places, graph.losses.codes, whole or self._whole,
+                limits.due, limits.turn, limits.still,
+            )  # fmt: skip
+            if failed == OTHER:
+                self._forget()
+            elif failed == NO_ROOM:
+                self._make_room()
         self._whole = failed >= 0
         if self._whole:
             node = self._state.unknowns[failed]
@@ -246,37 +290,25 @@ class Incremental:
             self._state, new.poses, new.landmarks, new.edges, new.sightings, new.pose_priors,
             new.landmark_priors,
         )  # fmt: skip
-        if known:
-            self._fixed = self.graph.fixed_poses.copy(), self.graph.fixed_landmarks.copy()
-        else:
+        if not known:
             self._forget()
 
     def _forget(self) -> None:
         """Nothing is known of the graph."""
         self._state, self._whole = new_state(64, 64, 64, 256), True
-        self._fixed = self.graph.fixed_poses.copy(), self.graph.fixed_landmarks.copy()
 
-    def _mind_fixed(self) -> None:
-        """A node that is fixed or let go changes what is unknown."""
-        now = self.graph.fixed_poses, self.graph.fixed_landmarks
-        if any(not np.array_equal(a, b[: len(a)]) for a, b in zip(self._fixed, now, strict=True)):
-            self._forget()
-        elif any(len(a) < len(b) for a, b in zip(self._fixed, now, strict=True)):
-            self._fixed = now[0].copy(), now[1].copy()
-
-    def _reserve(self) -> None:
-        """Make room for all that is in the graph."""
+    def _make_room(self) -> None:
+        """Make room for all that is in the graph, and for as much again where there was none."""
         graph, state = self.graph, self._state
         tables = graph.edges, graph.sightings, graph.pose_priors, graph.landmark_priors
         need = (
             len(graph.poses), len(graph.landmarks), max(map(len, tables)), sum(map(len, tables)),
         )  # fmt: skip
         have = (
-            len(state.of_pose), len(state.of_landmark), state.on.shape[1], len(state.factors),
+            len(state.of_pose), len(state.of_landmark), state.of_row.shape[1], len(state.factors),
         )  # fmt: skip
-        if any(n > h for n, h in zip(need, have, strict=True)):
-            sizes = [h if n <= h else max(n, 2 * h) for n, h in zip(need, have, strict=True)]
-            self._state = grown(state, *sizes)
+        sizes = [h if n <= h else max(n, 2 * h) for n, h in zip(need, have, strict=True)]
+        self._state = grown(state, *sizes)
 
 
 def warm_up() -> None:
@@ -291,5 +323,4 @@ def warm_up() -> None:
         graph.add_sighting(k + 1, 0, [-k, 1.1], np.eye(2))
         solver.update()
     solver.joint([2], [0])
-    compacted(solver._state, solver._pool)
     solver.renumber(graph.keep(np.ones(3, dtype=np.bool_), np.ones(1, dtype=np.bool_)))

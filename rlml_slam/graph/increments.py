@@ -17,56 +17,63 @@ from rlml_slam.compiled import kernel, part
 from rlml_slam.graph.structure import Ints, Records
 from rlml_slam.se2 import Array
 
-# An unknown pose or landmark (``size`` 3 or 2) at ``index`` of its table. It is an own variable
-# of ``clique`` (-1: of none); ``head`` starts its chain of factor ends, 2 * factor + end, and
-# ``links`` counts them. ``local`` is its number in the part at work, -1 outside of it; ``seeded``
-# and ``late`` are the last steps that asked for it and that brought a factor to it; ``moved`` is
-# the last step that moved it. The estimate is x, y, theta + d; ``s`` is the d that the cliques
-# below know. ``stiff`` [1/m^2] and ``turn`` [1/rad^2] bound the information on it of all factors.
-# The factors from a pose were linearised at headings between ``low`` and ``high``, and have arms
-# up to ``reach``. In the chain of a landmark those factors come first that are on it alone.
+LINE = (
+    64  # bytes of a line of the cache; records are whole ones, so that few have to be waited for
+)
+
+# An unknown pose or landmark (``size`` 3 or 2) at ``index`` of its table. The estimate is x, y,
+# theta + d; ``s`` is the d that the cliques below know; ``moved`` is the last step that moved it.
+# ``stiff`` [1/m^2] and ``turn`` [1/rad^2] bound the information on it of all factors. While the
+# heading is between ``low`` and ``high`` the factors from a pose are modelled well. It is an own
+# variable of ``clique`` (-1: of none); ``head`` starts its chain of factor ends, 2 * factor + end,
+# and ``links`` counts them. ``local`` is its number in the part at work, -1 outside of it;
+# ``seeded`` and ``late`` are the last steps that asked for it and that brought a factor to it. In
+# the chain of a pose the factors from it come first, in that of a landmark those on it alone.
 UNKNOWN = np.dtype(
-    # what the back-substitution reads comes first, in one line of the cache
+    # two lines that the back-substitution reads, and one that it does not
     [('size', np.int64), ('moved', np.int64)]
     + [(k, np.float64) for k in ('dx', 'dy', 'dtheta', 'x', 'y', 'theta')]
-    + [(k, np.float64) for k in ('sx', 'sy', 'stheta', 'stiff', 'turn')]
+    + [(k, np.float64) for k in ('sx', 'sy', 'stheta', 'stiff', 'turn', 'low', 'high')]
     + [(k, np.int64) for k in ('index', 'head', 'clique', 'links', 'local', 'seeded', 'late')]
-    + [(k, np.float64) for k in ('low', 'high', 'reach')]
+    + [('unused', np.int64, 2)]
 )
 
 # A factor of any table, in the form of an edge from i to j with unknowns a and b (-1: none): a
-# sighting has no information on the angle, a prior has no i. c to I22 as in system.EDGE. Its
-# linearisation: ``from`` theta_i, ``C`` and ``S`` cosine and sine of theta_i + theta_delta, dx and
-# dy t_j - t_i, ``arm`` their length in sigmas, e the residual where all d are zero, the robust
-# weight. ``checked`` is the last step that judged it, ``after`` the next one to be assembled.
+# sighting has no information on the angle, a prior has no i. c to theta and I00 to I22 as in
+# system.EDGE. Its linearisation: ``from`` theta_i, ``C`` and ``S`` cosine and sine of theta_i +
+# theta_delta, dx and dy t_j - t_i, the robust weight; ``calm`` is the turn [rad] up to which it
+# needs no closer look. ``checked`` is the last step that judged it, ``after`` the next one to be
+# assembled.
 FACTOR = np.dtype(
-    [(k, np.int64) for k in ('table', 'i', 'j', 'a', 'b', 'next_a', 'next_b', 'kind')]
-    + [(k, np.int64) for k in ('checked', 'after')]
-    + [(k, np.float64) for k in ('from', 'arm', 'c', 's', 'x', 'y', 'theta')]
-    + [(k, np.float64) for k in ('I00', 'I01', 'I02', 'I11', 'I12', 'I22')]
-    + [(k, np.float64) for k in ('C', 'S', 'dx', 'dy', 'e0', 'e1', 'e2', 'weight')]
+    # what judging it takes comes first
+    [('next_a', np.int64), ('next_b', np.int64)]
+    + [(k, np.float64) for k in ('from', 'calm', 'weight')]
+    + [(k, np.int32) for k in ('a', 'b', 'i', 'j', 'table', 'kind')]
+    + [(k, np.float64) for k in ('C', 'S', 'dx', 'dy', 'I00', 'I01', 'I11')]
+    + [('checked', np.int32), ('after', np.int32)]
+    + [(k, np.float64) for k in ('c', 's', 'x', 'y', 'theta', 'I02', 'I12', 'I22')]
 )
+FACTOR_BYTES = FACTOR.itemsize
 EDGES, SIGHTINGS, POSE_PRIORS, LANDMARK_PRIORS = 0, 1, 2, 3
 
 # A clique: its place in the tree (-1: none), ``own`` of its ``members`` variables, ``width`` own
-# of ``height`` rows. At ``block`` of the pool lie the members, as integers; at ``panel`` ``width``
-# columns of ``height`` + 1 rows, of which the last is the right-hand side, then the update matrix
-# of ``height`` - ``width`` + 1 rows (refactor.py). ``room`` is the size class of the block.
+# of ``height`` rows. At ``block`` of the pool lie the members, as integers, then the panel, of
+# ``width`` columns of ``height`` + 1 rows, of which the last is the right-hand side, then the
+# update matrix of ``height`` - ``width`` + 1 rows (refactor.py). ``room`` is the size class of
+# the block, ``mark`` the step that made or dropped it.
 CLIQUE = np.dtype(
-    [
-        (k, np.int64)
-        for k in (
-            'mark', 'child', 'next', 'block', 'own', 'members', 'panel', 'width', 'height',
-            'parent', 'room',
-        )
-    ]
-)  # fmt: skip
+    [(k, np.int64) for k in ('block', 'room', 'own', 'members', 'width', 'height')]
+    + [(k, np.int32) for k in ('child', 'next', 'parent', 'mark')]
+)
 
 # places in State.counts: what is known of the graph's tables (poses, landmarks, rows of the four
-# tables), what is in use here, the number of the step, where the lists of free records start, and
-# the elements of the blocks in use
+# tables), what is in use here, the number of the step, where the lists of free records start, the
+# elements of the blocks in use, and of those when the tree was ordered as a whole
 POSES, LANDMARKS, ROWS, UNKNOWNS, FACTORS, CLIQUES = 0, 1, 2, 6, 7, 8
-FREE_CLIQUE, TOP, STEP, SEEDS, LISTED, FREE_UNKNOWN, FREE_FACTOR, IN_USE, COUNTS = range(9, 18)
+FIXED_POSES, FIXED_LANDMARKS = 4, 5  # places in State.on, after those of the tables
+FREE_CLIQUE, TOP, STEP, SEEDS, LISTED, FREE_UNKNOWN, FREE_FACTOR, IN_USE, IN_ONE, COUNTS = range(
+    9, 19
+)
 
 CLASSES = 256  # size classes of blocks: four to an octave
 LITTLE = 1 << 14  # elements that are not worth a thought
@@ -76,7 +83,8 @@ class State(NamedTuple):
     """All but the pool of numbers, which grows in the kernels.
 
     ``of_pose`` and ``of_landmark`` are the unknowns of the nodes (-1: fixed), ``of_row`` (4, k)
-    and ``on`` (4, k) the factor of each row of the tables and whether it takes part. ``seeds``
+    and ``on`` (6, k) the factor of each row of the tables and whether it takes part; the last two
+    of ``on`` tell which poses and landmarks are fixed. ``seeds``
     are the unknowns whose cliques have to be made anew, ``due`` the factors to be relinearised.
     ``free`` starts the list of free blocks of each class.
     """
@@ -100,11 +108,18 @@ def new_state(poses: int, landmarks: int, rows: int, factors: int) -> State:
     count = np.zeros(COUNTS, np.int64)
     count[FREE_CLIQUE] = count[FREE_UNKNOWN] = count[FREE_FACTOR] = -1
     return State(
-        np.zeros(nodes, UNKNOWN), np.zeros(factors, FACTOR), np.zeros(nodes + 1, CLIQUE),
+        _records(nodes, UNKNOWN), _records(factors, FACTOR), _records(nodes + 1, CLIQUE),
         np.full(poses, -1), np.full(landmarks, -1), np.full((4, rows), -1),
-        np.zeros((4, rows), np.bool_), np.zeros(nodes, np.int64), np.zeros(factors, np.int64),
-        np.full(CLASSES, -1), count,
+        np.zeros((6, max(rows, poses, landmarks)), np.bool_), np.zeros(nodes, np.int64),
+        np.zeros(factors, np.int64), np.full(CLASSES, -1), count,
     )  # fmt: skip
+
+
+def _records(num: int, kind: np.dtype[np.void]) -> Records:
+    """That many records of zeros that begin with a line of the cache."""
+    memory = np.zeros(num * kind.itemsize + LINE, np.uint8)
+    first = -memory.ctypes.data % LINE
+    return memory[first : first + num * kind.itemsize].view(kind)
 
 
 def grown(state: State, poses: int, landmarks: int, rows: int, factors: int) -> State:
@@ -171,7 +186,6 @@ def compacted(state: State, pool: Array) -> Array:
         for k in range(elements):
             more[top + k] = pool[first + k]
         cliques[c]['block'] = top
-        cliques[c]['panel'] += top - first
         top += elements
     state.counts[TOP] = top
     for k in range(len(state.free)):

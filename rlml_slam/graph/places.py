@@ -7,6 +7,7 @@ arrays, after other work has displaced it from the caches, than it takes to opti
 
 from __future__ import annotations
 
+import ctypes
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,9 +33,21 @@ class Places(NamedTuple):
     buffers: tuple[NDArray[Any], ...]
 
 
-def places_of(buffers: tuple[NDArray[Any], ...]) -> Places:
-    """The places of contiguous arrays."""
-    return Places(np.array([(b.ctypes.data, len(b)) for b in buffers]), buffers)
+def places_of(buffers: tuple[NDArray[Any], ...], last: Places | None = None) -> Places:
+    """The places of contiguous arrays, each the first rows of its base.
+
+    Only those are looked up that have another base than in ``last``, which are few where a graph
+    grows: it takes longer than to have a kernel take the array.
+    """
+    at = np.zeros((len(buffers), 2), np.int64) if last is None else last.at.copy()
+    for k, buffer in enumerate(buffers):
+        if last is not None and buffer is last.buffers[k]:
+            continue
+        base: Any = buffer.base
+        if last is None or base is not last.buffers[k].base:
+            at[k, 0] = ctypes.addressof(ctypes.c_char.from_buffer(base))
+        at[k, 1] = len(buffer)
+    return Places(at, buffers)
 
 
 def _to_pointer(_typing: Any, address: Any) -> Any:

@@ -16,78 +16,76 @@ from __future__ import annotations
 import numpy as np
 
 from rlml_slam.compiled import fetch, part
-from rlml_slam.graph.increments import STEP, State
+from rlml_slam.graph.increments import LINE, STEP, State
 from rlml_slam.graph.linearize import wrapped
+from rlml_slam.graph.relinearize import is_restless
 from rlml_slam.graph.structure import Ints, Records
 from rlml_slam.se2 import Array
 
 
 @part
 def propagate(
-    state: State, pool: Array, numbers: Ints, of_front: Ints, poses: Array, landmarks: Array,
-    still: float, moved: Ints,
-) -> tuple[int, int]:  # fmt: skip
-    """Solve the new cliques and those below that feel it; (moved, solved) numbers of unknowns.
+    state: State, pool: Array, numbers: Ints, of_front: Ints, robust: bool, poses: Array,
+    landmarks: Array, still: float, restless: Ints,
+) -> tuple[int, int, int]:  # fmt: skip
+    """Solve the new cliques and those below that feel it; numbers of unknowns.
 
-    ``moved`` is filled with the unknowns that moved by more than ``still`` sigmas.
+    These are of those solved, of those that moved by more than ``still`` sigmas, and of those of
+    the latter that have to be judged, with which ``restless`` is filled.
     """
     unknowns, cliques, step = state.unknowns, state.cliques, state.counts[STEP]
-    num, solved, most = 0, 0, 1
+    solved, moved, num, most = 0, 0, 0, 1
     for s in range(len(of_front)):
         if of_front[s] >= 0:
             most = max(most, cliques[of_front[s]]['height'])
     work = np.empty(2 * most + 64)
     stack = np.empty(64, np.int64)
-    depth = 0
     # the new ones, which bear this step's mark: parents come after their children
     for s in range(len(of_front) - 1, -1, -1):
         c = of_front[s]
-        if c < 0:
-            continue
-        num = _solve(
-            unknowns, cliques[c], step, pool, numbers, poses, landmarks, still, moved, num, work
-        )
-        solved += cliques[c]['own']
-        child = cliques[c]['child']
-        while True:
+        depth = 0
+        while c >= 0:
+            clique = cliques[c]
+            if clique['height'] > len(work):
+                work = np.empty(2 * clique['height'])
+            # what the child below takes is on its way meanwhile
+            child = clique['child']
+            if child >= 0:
+                _call(cliques[child], cliques, numbers)
+            some, num = _solve(
+                unknowns, clique, step, pool, numbers, poses, landmarks, still, robust, restless,
+                num, work,
+            )  # fmt: skip
+            moved += some
+            solved += clique['own']
             while child >= 0:
-                new = cliques[child]['mark'] == step
-                if not new and _feels(unknowns, cliques, numbers, child, step):
+                below = cliques[child]
+                if below['mark'] != step and _feels(unknowns, below, numbers, step):
                     if depth == len(stack):
                         more = np.empty(2 * depth, np.int64)
                         more[:depth] = stack
                         stack = more
                     stack[depth] = child
                     depth += 1
-                child = cliques[child]['next']
-            if depth == 0:
-                break
-            depth -= 1
-            c = stack[depth]
-            if cliques[c]['height'] > len(work):
-                work = np.empty(2 * cliques[c]['height'])
-            num = _solve(
-                unknowns,
-                cliques[c],
-                step,
-                pool,
-                numbers,
-                poses,
-                landmarks,
-                still,
-                moved,
-                num,
-                work,
-            )
-            solved += cliques[c]['own']
-            child = cliques[c]['child']
-    return num, solved
+                child = below['next']
+            c = -1
+            if depth > 0:
+                depth -= 1
+                c = stack[depth]
+    return solved, moved, num
 
 
 @part
-def _feels(unknowns: Records, cliques: Records, numbers: Ints, c: int, step: int) -> bool:
+def _call(clique: np.void, cliques: Records, numbers: Ints) -> None:
+    """Have a clique's block come near, where it is long the first lines, and the one below it."""
+    fetch(cliques, clique['child'], 0)
+    for k in range(0, 4 * LINE, LINE):
+        fetch(numbers, clique['block'], k)
+
+
+@part
+def _feels(unknowns: Records, clique: np.void, numbers: Ints, step: int) -> bool:
     """Whether a variable of the separator has moved in this step."""
-    clique = cliques[c]
     first = clique['block']
     for p in range(first + clique['own'], first + clique['members']):
         if unknowns[numbers[p]]['moved'] == step:
@@ -98,18 +96,18 @@ def _feels(unknowns: Records, cliques: Records, numbers: Ints, c: int, step: int
 @part
 def _solve(
     unknowns: Records, clique: np.void, step: int, pool: Array, numbers: Ints, poses: Array,
-    landmarks: Array, still: float, moved: Ints, num: int, x: Array,
-) -> int:  # fmt: skip
-    """Update the own variables of a clique; the number of moved unknowns so far."""
-    at, width, height = clique['panel'], clique['width'], clique['height']
-    tall = height + 1
+    landmarks: Array, still: float, robust: bool, restless: Ints, num: int, x: Array,
+) -> tuple[int, int]:  # fmt: skip
+    """Update the own variables of a clique; how many moved, and how many are restless so far."""
+    width, height = clique['width'], clique['height']
     first = clique['block']
+    at, tall = first + clique['members'], height + 1
     # a tree that is larger than the cache waits for memory longer than it computes
     for k in range(at, at + width * tall, 8):
         fetch(pool, k, 0)
     for p in range(first, first + clique['own']):
         fetch(unknowns, numbers[p], 0)
-        fetch(unknowns, numbers[p], 64)
+        fetch(unknowns, numbers[p], LINE)
     w = width
     for p in range(first + clique['own'], first + clique['members']):
         u = unknowns[numbers[p]]
@@ -132,7 +130,7 @@ def _solve(
             t0 -= pool[a + i] * x[i]
             i += 1
         x[j] = ((t0 + t1) + (t2 + t3)) / pool[a + j]
-    w = 0
+    w, moved = 0, 0
     for p in range(first, first + clique['own']):
         v = numbers[p]
         u = unknowns[v]
@@ -150,6 +148,8 @@ def _solve(
         if (sx * sx + sy * sy) * u['stiff'] + st * st * u['turn'] > still * still:
             u['sx'], u['sy'], u['stheta'] = u['dx'], u['dy'], u['dtheta']
             u['moved'] = step
-            moved[num] = v
-            num += 1
-    return num
+            moved += 1
+            if robust or is_restless(u):
+                restless[num] = v
+                num += 1
+    return moved, num

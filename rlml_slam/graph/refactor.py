@@ -15,7 +15,9 @@ from rlml_slam.compiled import fetch, part
 from rlml_slam.graph.dense import partial_cholesky, rank_update
 from rlml_slam.graph.fronts import SINGULAR, highest
 from rlml_slam.graph.increments import (
+    FACTOR_BYTES,
     IN_USE,
+    LINE,
     STEP,
     TOP,
     State,
@@ -101,14 +103,13 @@ def make_cliques(state: State, numbers: Ints, anew: Part) -> Ints:
             elif n > m and p < start + own:
                 hang(state.cliques, anew.cliques[n - m - 1], c)
         clique['members'] = w - first
-        clique['panel'] = w
     return of_front
 
 
 @part
 def refactor(
     state: State, pool: Array, numbers: Ints, anew: Part, of_front: Ints,
-    losses: Array, poses: Array, landmarks: Array,
+    losses: Array, poses: Array, landmarks: Array, due: float, turn: float,
 ) -> tuple[int, int]:  # fmt: skip
     """Factor the new cliques: (unknown where that is impossible or -1, factors assembled)."""
     fronts, entries = anew.fronts, anew.entries
@@ -124,7 +125,8 @@ def refactor(
         if c < 0:
             continue
         clique = state.cliques[c]
-        at, width, height = clique['panel'], clique['width'], clique['height']
+        at = clique['block'] + clique['members']
+        width, height = clique['width'], clique['height']
         tall, below = height + 1, height + 1 - width
         update = at + width * tall
         for j in range(height):
@@ -139,8 +141,9 @@ def refactor(
             n = anew.order[k]
             if n < len(anew.unknowns):
                 assembled += _assemble(
-                    state, pool, first[n], row_of, column, height, losses, poses, landmarks
-                )
+                    state, pool, first[n], row_of, column, height, losses, poses, landmarks,
+                    due, turn,
+                )  # fmt: skip
         child = clique['child']
         while child >= 0:
             _extend(state, pool, numbers, child, row_of, column, height, rows)
@@ -194,21 +197,21 @@ def _by_elimination(state: State, anew: Part) -> Ints:
 @part
 def _assemble(
     state: State, pool: Array, f: int, row_of: Ints, column: Ints, height: int,
-    losses: Array, poses: Array, landmarks: Array,
+    losses: Array, poses: Array, landmarks: Array, due: float, turn: float,
 ) -> int:  # fmt: skip
     """Add the chain of factors from f on; how many."""
     unknowns, num = state.unknowns, 0
     while f >= 0:
         z = state.factors[f]
-        for k in range(0, 256, 64):  # all of the next record
+        for k in range(0, FACTOR_BYTES, LINE):
             fetch(state.factors, z['after'], k)
-        linearize_factor(state, f, losses, poses, landmarks)
+        e = linearize_factor(state, f, losses, poses, landmarks, due, turn)
         a, b, size = -1, -1, 3
         if z['a'] >= 0:
             a = row_of[unknowns[z['a']]['local']]
         if z['b'] >= 0:
             b, size = row_of[unknowns[z['b']]['local']], unknowns[z['b']]['size']
-        _add_factor(z, pool, column, height, a, b, size)
+        _add_factor(z, e, pool, column, height, a, b, size)
         num += 1
         f = z['after']
     return num
@@ -216,13 +219,14 @@ def _assemble(
 
 @part
 def _add_factor(
-    z: np.void, v: Array, column: Ints, height: int, a: int, b: int, size: int
-) -> None:
+    z: np.void, e: tuple[float, float, float], v: Array, column: Ints, height: int, a: int, b: int,
+    size: int,
+) -> None:  # fmt: skip
     """Add a factor at rows a and b (-1: none) of a front, with the formulas of linearize.py."""
     c, s, dx, dy, w = z['C'], z['S'], z['dx'], z['dy'], z['weight']
     I00, I01, I02 = w * z['I00'], w * z['I01'], w * z['I02']
     I11, I12, I22 = w * z['I11'], w * z['I12'], w * z['I22']
-    e0, e1, e2 = z['e0'], z['e1'], z['e2']
+    e0, e1, e2 = e
     q0 = I00 * e0 + I01 * e1 + I02 * e2
     q1 = I01 * e0 + I11 * e1 + I12 * e2
     u0, u1, u2 = c * q0 - s * q1, s * q0 + c * q1, I02 * e0 + I12 * e1 + I22 * e2
@@ -309,7 +313,8 @@ def _extend(
             w += 1
     rows[w] = height
     below = w + 1
-    update = clique['panel'] + clique['width'] * (clique['height'] + 1)
+    panel = first + clique['members']
+    update = panel + clique['width'] * (clique['height'] + 1)
     for k in range(update, update + _triangle(below), 8):
         fetch(pool, k, 0)
     for j in range(w):

@@ -22,8 +22,11 @@ import numpy as np
 from rlml_slam.compiled import fetch, part
 from rlml_slam.graph.increments import (
     EDGES,
+    FIXED_LANDMARKS,
+    FIXED_POSES,
     LANDMARK_PRIORS,
     LANDMARKS,
+    LINE,
     LISTED,
     POSE_PRIORS,
     POSES,
@@ -54,12 +57,14 @@ def take(state: State, tables: Tables, poses: Array, landmarks: Array) -> None:
     count = state.counts
     for i in range(count[POSES], len(poses)):
         state.of_pose[i] = -1
+        state.on[FIXED_POSES, i] = tables.fixed_poses[i]
         if not tables.fixed_poses[i]:
             state.of_pose[i] = _new_unknown(state, 3, i)
             _refer(state, state.of_pose[i], poses[i, 0], poses[i, 1], poses[i, 2])
     count[POSES] = len(poses)
     for i in range(count[LANDMARKS], len(landmarks)):
         state.of_landmark[i] = -1
+        state.on[FIXED_LANDMARKS, i] = tables.fixed_landmarks[i]
         if not tables.fixed_landmarks[i]:
             state.of_landmark[i] = _new_unknown(state, 2, i)
             _refer(state, state.of_landmark[i], landmarks[i, 0], landmarks[i, 1], 0.0)
@@ -87,7 +92,7 @@ def _refer(state: State, v: int, x: float, y: float, theta: float) -> None:
     """Measure d from this estimate on."""
     u = state.unknowns[v]
     u['x'], u['y'], u['theta'] = x, y, theta
-    u['low'], u['high'], u['reach'] = theta, theta, 0.0
+    u['low'], u['high'] = -np.inf, np.inf
     u['dx'] = u['dy'] = u['dtheta'] = u['sx'] = u['sy'] = u['stheta'] = 0.0
 
 
@@ -110,7 +115,7 @@ def _take_factors(state: State, table: int, factors: Factors) -> None:
     # 64 flags at a time, which the compiler turns into one comparison
     for start in range(0, known, 64):
         end = min(start + 64, known)
-        if _differ(on, factors.enabled, start, end):
+        if differ(on, factors.enabled, start, end):
             for r in range(start, end):
                 if on[r] != factors.enabled[r]:
                     on[r] = not on[r]
@@ -126,7 +131,8 @@ def _take_factors(state: State, table: int, factors: Factors) -> None:
 
 
 @part
-def _differ(a: Flags, b: Flags, start: int, end: int) -> bool:
+def differ(a: Flags, b: Flags, start: int, end: int) -> bool:
+    """Whether flags between two places are not the same."""
     different = False
     for r in range(start, end):
         different |= a[r] != b[r]
@@ -188,6 +194,9 @@ def _link(state: State, v: int, link: int) -> None:
     """Put a factor's end into the chain of unknown v."""
     z, u = state.factors[link // 2], state.unknowns[v]
     before, after = -1, u['head']
+    if u['size'] == 3 and link % 2 == 1:
+        while after >= 0 and after % 2 == 0:
+            before, after = after, _next(state, after)
     if u['size'] == 2 and z['a'] >= 0:
         while after >= 0 and state.factors[after // 2]['a'] < 0:
             before, after = after, _next(state, after)
@@ -228,8 +237,10 @@ def _set_next(state: State, link: int, after: int) -> None:
 
 
 @part
-def linearize_factor(state: State, f: int, losses: Array, poses: Array, landmarks: Array) -> None:
-    """Linearise a factor at the estimate at hand."""
+def linearize_factor(
+    state: State, f: int, losses: Array, poses: Array, landmarks: Array, due: float, turn: float
+) -> tuple[float, float, float]:
+    """Linearise a factor at the estimate at hand; its residual where all d are zero."""
     z, unknowns = state.factors[f], state.unknowns
     i, j, a, b = z['i'], z['j'], z['a'], z['b']
     on_landmark = z['table'] in (SIGHTINGS, LANDMARK_PRIORS)
@@ -245,9 +256,9 @@ def linearize_factor(state: State, f: int, losses: Array, poses: Array, landmark
     e2 = 0.0 if on_landmark else wrapped(poses[j, 2] - theta - z['theta'])
     z['C'], z['S'], z['dx'], z['dy'] = c, s, dx, dy
     z['from'] = unknowns[a]['theta'] + unknowns[a]['dtheta'] if a >= 0 else theta
-    z['arm'] = math.sqrt((z['I00'] + z['I11']) * (dx * dx + dy * dy))
+    z['calm'] = _calm(z, losses, due, turn)
     if a >= 0:
-        _widen(unknowns[a], z)
+        _narrow(unknowns[a], z)
     z['weight'] = loss(losses[z['kind'], 0], losses[z['kind'], 1], _squared(z, e0, e1, e2))[1]
     # e + J d is linear, so where all d are zero it is e - J d
     x = y = t = 0.0
@@ -258,15 +269,37 @@ def linearize_factor(state: State, f: int, losses: Array, poses: Array, landmark
         x -= unknowns[a]['dx'] - dy * t_a
         y -= unknowns[a]['dy'] + dx * t_a
         t -= t_a
-    z['e0'], z['e1'] = e0 - (c * x + s * y), e1 - (c * y - s * x)
-    z['e2'] = 0.0 if on_landmark else e2 - t
+    return e0 - (c * x + s * y), e1 - (c * y - s * x), 0.0 if on_landmark else e2 - t
 
 
 @part
-def _widen(u: np.void, z: np.void) -> None:
-    """Have factor z from pose u within its bounds."""
-    u['low'], u['high'] = min(u['low'], z['from']), max(u['high'], z['from'])
-    u['reach'] = max(u['reach'], z['arm'])
+def _calm(z: np.void, losses: Array, due: float, turn: float) -> float:
+    """Turn of its pose up to which a factor is well modelled [rad], below zero for none.
+
+    That is phi (USUAL + phi arm / 2) < NEAR due, with its arm in sigmas.
+    """
+    if is_robust(losses):
+        return -1.0
+    arm = math.sqrt((z['I00'] + z['I11']) * (z['dx'] * z['dx'] + z['dy'] * z['dy']))
+    near = NEAR * due
+    phi = 2.0 * near / (USUAL + math.sqrt(USUAL * USUAL + 2.0 * arm * near))
+    return min(phi, NEAR * turn)
+
+
+@part
+def is_robust(losses: Array) -> bool:
+    """Whether any kind of factors has a loss that is not the square."""
+    robust = False
+    for k in range(len(losses)):
+        robust = robust or losses[k, 0] != 0
+    return robust
+
+
+@part
+def _narrow(u: np.void, z: np.void) -> None:
+    """Bound the headings at which pose u needs no closer look by those of factor z from it."""
+    u['low'] = max(u['low'], z['from'] - z['calm'])
+    u['high'] = min(u['high'], z['from'] + z['calm'])
 
 
 @part
@@ -279,50 +312,53 @@ def _squared(z: np.void, e0: float, e1: float, e2: float) -> float:
 
 
 @part
+def is_restless(u: np.void) -> bool:
+    """Whether an unknown that moved has to be judged.
+
+    Without robust losses a factor's linear model depends on the heading that it is from, and on
+    little else as long as the factors are stretched by some sigmas at most.
+    """
+    theta = u['theta'] + u['dtheta']
+    return not u['low'] < theta < u['high']
+
+
+@part
 def judge(
-    state: State, moved: Ints, losses: Array, poses: Array, landmarks: Array, due: float,
+    state: State, restless: Ints, losses: Array, poses: Array, landmarks: Array, due: float,
     turn: float,
 ) -> None:  # fmt: skip
-    """List the factors of the unknowns ``moved`` that have to be relinearised.
+    """List the factors of the unknowns ``restless`` that have to be relinearised.
 
     That is nothing unless a linear model is off by ``due`` sigmas or a pose has turned by
     ``turn``; then it is all that are a third as far: forces of factors that were linearised at
     different headings do not balance, so what turned together is relinearised together.
     """
     counts = state.counts
-    robust = False
-    for k in range(len(losses)):
-        robust = robust or losses[k, 0] != 0
+    robust = is_robust(losses)
     worst = 0.0
-    for n in range(len(moved)):
-        u = state.unknowns[moved[n]]
+    for n in range(len(restless)):
+        u = state.unknowns[restless[n]]
         # the factors of one a little further on are on their way meanwhile
-        soon = state.unknowns[moved[min(n + 4, len(moved) - 1)]]['head'] // 2
+        soon = state.unknowns[restless[min(n + 4, len(restless) - 1)]]['head'] // 2
         fetch(state.factors, soon, 0)
-        fetch(state.factors, soon, 64)
-        if not robust and u['size'] == 2:
-            continue
+        fetch(state.factors, soon, LINE)
         theta = u['theta'] + u['dtheta']
-        if not robust:
-            phi = max(theta - u['low'], u['high'] - theta)
-            if _harmless(phi, u['reach'], due, turn):
-                continue
-            u['low'], u['high'], u['reach'] = theta, theta, 0.0  # the true bounds are found below
+        u['low'], u['high'] = -np.inf, np.inf
         link = u['head']
         while link >= 0:
             f, end = link // 2, link % 2
             z = state.factors[f]
             link = z['next_a'] if end == 0 else z['next_b']
-            if not robust:
-                if end == 1:
-                    continue
-                _widen(u, z)
-                if _harmless(abs(theta - z['from']), z['arm'], due, turn):
+            if not robust and end == 1:  # and so are those that follow
+                break
+            if end == 0:
+                _narrow(u, z)
+                if abs(theta - z['from']) < z['calm']:
                     continue
             if z['checked'] == counts[STEP]:
                 continue
             z['checked'] = counts[STEP]
-            error = _error(z, losses, poses, landmarks, due, turn)
+            error = _error(z, robust, losses, poses, landmarks, due, turn)
             if error > NEAR * NEAR:
                 worst = max(worst, error)
                 state.due[counts[LISTED]] = f
@@ -332,23 +368,12 @@ def judge(
 
 
 @part
-def _harmless(phi: float, arm: float, due: float, turn: float) -> bool:
-    """Whether a pose that turned by phi leaves its factors with arms up to this well modelled.
-
-    They are stretched by some sigmas at most: most need no closer look.
-    """
-    return phi < NEAR * turn and phi * (USUAL + 0.5 * phi * arm) < NEAR * due
-
-
-@part
 def _error(
-    z: np.void, losses: Array, poses: Array, landmarks: Array, due: float, turn: float
-) -> float:
+    z: np.void, robust: bool, losses: Array, poses: Array, landmarks: Array, due: float,
+    turn: float,
+) -> float:  # fmt: skip
     """Squared error of a factor's linear model, 1 where it is due."""
     i, j, kind = z['i'], z['j'], z['kind']
-    robust = losses[kind, 0] != 0
-    if i < 0 and not robust:
-        return 0.0
     on_landmark = z['table'] in (SIGHTINGS, LANDMARK_PRIORS)
     dx, dy = (landmarks[j, 0], landmarks[j, 1]) if on_landmark else (poses[j, 0], poses[j, 1])
     theta = 0.0
@@ -365,7 +390,7 @@ def _error(
     d0, d1 = C * z['dx'] + S * z['dy'], C * z['dy'] - S * z['dx']
     r0, r1 = e0 - q0 - phi * d1, e1 - q1 + phi * d0
     w = z['weight']
-    error: float = w * _squared(z, r0, r1, 0.0)
+    error: float = w * (z['I00'] * r0 * r0 + 2.0 * z['I01'] * r0 * r1 + z['I11'] * r1 * r1)
     if robust:
         e2 = 0.0 if on_landmark else wrapped(poses[j, 2] - theta - z['theta'])
         squared = _squared(z, e0 - z['x'], e1 - z['y'], e2)

@@ -6,6 +6,8 @@ from __future__ import annotations
 from rlml_slam.compiled import kernel, part
 from rlml_slam.graph.increments import (
     EDGES,
+    FIXED_LANDMARKS,
+    FIXED_POSES,
     FREE_FACTOR,
     FREE_UNKNOWN,
     LANDMARK_PRIORS,
@@ -39,8 +41,8 @@ def renumber(
         and _off(state, LANDMARK_PRIORS, landmark_priors)
     ):
         return False
-    count[POSES] = _move_nodes(state, state.of_pose, poses)
-    count[LANDMARKS] = _move_nodes(state, state.of_landmark, landmarks)
+    count[POSES] = _move_nodes(state, state.of_pose, FIXED_POSES, poses)
+    count[LANDMARKS] = _move_nodes(state, state.of_landmark, FIXED_LANDMARKS, landmarks)
     _move_rows(state, EDGES, edges, poses, poses)
     _move_rows(state, SIGHTINGS, sightings, poses, landmarks)
     _move_rows(state, POSE_PRIORS, pose_priors, poses, poses)
@@ -73,13 +75,14 @@ def _off(state: State, table: int, new: Ints) -> bool:
 
 
 @part
-def _move_nodes(state: State, of: Ints, new: Ints) -> int:
-    """Unknowns of nodes, which only ever move up; how many nodes there are."""
+def _move_nodes(state: State, of: Ints, fixed: int, new: Ints) -> int:
+    """Unknowns of nodes and which are fixed; these only ever move up. How many nodes there are."""
     num = 0
     for i in range(len(new)):
         v = of[i]
         if new[i] >= 0:
             of[new[i]] = v
+            state.on[fixed, new[i]] = state.on[fixed, i]
             num += 1
             if v >= 0:
                 state.unknowns[v]['index'] = new[i]

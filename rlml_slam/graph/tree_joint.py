@@ -73,12 +73,13 @@ def _step(
     """Clique c's part in the forward solve; its own rows begin at ``first`` of x."""
     clique = state.cliques[c]
     width, height = clique['width'], clique['height']
+    panel = clique['block'] + clique['members']
     for j in range(width):
         work[j] = x[first + j]
     for i in range(width, height):
         work[i] = 0.0
     for j in range(width):
-        a = clique['panel'] + j * (height + 1)
+        a = panel + j * (height + 1)
         y = work[j] / pool[a + j]
         x[first + j] = y
         L, w = pool[a + j + 1 : a + height], work[j + 1 : height]

@@ -107,13 +107,27 @@ def test_column_goes_on_after_it_has_let_rows_go():
     np.testing.assert_array_equal(column.view, np.vstack([rows[kept], rows]))
 
 
+@pytest.mark.parametrize('copied', [copy.deepcopy, lambda c: pickle.loads(pickle.dumps(c))])
+@pytest.mark.parametrize('rows', [0, 3, 40])
+def test_a_copy_keeps_what_is_written_to_it_when_it_grows(copied, rows):
+    column = Column((2,))
+    column.append(np.ones((rows, 2)))
+    other = copied(column)
+    other.view[:] = 7.0
+    other.append(np.zeros((1, 2)))
+    np.testing.assert_array_equal(other.view, [[7.0, 7.0]] * rows + [[0.0, 0.0]])
+    np.testing.assert_array_equal(column.view, np.ones((rows, 2)))
+
+
 def test_places_are_those_of_the_buffers_whatever_becomes_of_them():
     """A graph that has grown, let go of nodes or is a copy has others."""
     graph = loop_graph(0)[0]
     first = graph.places()
     assert graph.places() is first
     copies = [copy.deepcopy(graph), pickle.loads(pickle.dumps(graph))]
-    graph.add_poses(np.zeros((100, 3)))
+    graph.add_pose([0.0, 0.0, 0.0])
+    assert graph.places().at[0].tolist() == [graph.poses.ctypes.data, 31]
+    graph.add_poses(np.zeros((99, 3)))
     kept = np.arange(130) < 20
     graph.keep(kept, np.ones(8, np.bool_))
     for one in (graph, *copies):
