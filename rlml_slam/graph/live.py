@@ -104,14 +104,23 @@ class Live:
         stays where it is: until the next solve if that has to be found first.
         """
         if not (self._at_rest and self._incremental.is_current):
-            graph = self.graph
-            shown = graph.poses.copy(), graph.landmarks.copy()
+            self._solve_aside()
+        return self._incremental.joint(poses, landmarks)
+
+    def _solve_aside(self) -> None:
+        """Find the optimum, but show it only with the next solve."""
+        graph = self.graph
+        shown = graph.poses.copy(), graph.landmarks.copy()
+        try:
             self.solve()
             if not self._at_rest:  # the batch solver left no tree
                 self._step()
             self._ahead = graph.poses.copy(), graph.landmarks.copy()
+        except SolverError:
+            self.start_over()
+            raise
+        finally:
             graph.poses[:], graph.landmarks[:] = shown
-        return self._incremental.joint(poses, landmarks)
 
     def keep(
         self,
@@ -129,6 +138,7 @@ class Live:
         try:
             self._step()
         except SolverError:
+            graph.poses[:], graph.landmarks[:] = shown
             self.start_over()
             return graph.keep(poses, landmarks, disabled)
         ahead = graph.poses[poses], graph.landmarks[landmarks]

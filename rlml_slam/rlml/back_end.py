@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import time
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -198,7 +199,7 @@ class BackEnd:
         points = o.points.astype(np.float32) if placed and o.points is not None else None
         key = Keyframe(
             index, frame.stamp, frame.T_local_base, frame.cov_local,
-            points, o.origin if placed else None, frame.stamp,
+            points, o.origin if placed else None, frame.stamp, jumped=frame.jumped,
         )  # fmt: skip
         self.keyframes.append(key)
         if frame.jumped:
@@ -293,13 +294,21 @@ class BackEnd:
         cov = self.live.joint([before.index])
         if self.plant is None or not self.plant.found:
             self.surest_way.close(self.scans.closures, self.keyframes, self.graph.edges)
-            looped = any(closure.accepted for closure in self.scans.closures)
-            if not (looped and held(self.graph.sightings, before.index)):
+            if not self._is_held(before):
                 heading = float(self.T_map_local[2] + before.T_local[2])
                 cov = either(cov, turned(self.surest_way.cov(before), heading))
         since = Correction(self.T_map_local, Known(before.T_local, before.cov_local, cov))
         _, cov_map = since.apply(last.T_local, last.cov_local)
         return Known(last.T_local, last.cov_local, cov_map)
+
+    def _is_held(self, key: Keyframe) -> bool:
+        """Whether reflectors that were in the map when it was last tied together hold a pose."""
+        enabled = self.graph.edges.enabled
+        if not any(c.accepted and enabled[c.edge] for c in self.scans.closures):
+            return False
+        stamps = [k.stamp for k in self.keyframes]
+        until = bisect_right(stamps, self.surest_way.newest) - 1
+        return held(self.graph.sightings, key.index, until)
 
     def revoke(self, number: int) -> Closure:
         """Take a loop closure out of the map for good; SolverError if there is no such one."""
@@ -342,7 +351,12 @@ class BackEnd:
             assert self.plant is not None
             self.plant.found = True
         last = keys[-1]
-        last.T_local = self.graph.poses[last.index].copy()
+        for key in keys:
+            if key.jumped:
+                self.surest_way.begin(key)
+        T_map = self.graph.poses[last.index].copy()
+        last.cov_local = turned(last.cov_local, float(T_map[2] - last.T_local[2]))
+        last.T_local = T_map
         self.keyframes = keys
         self.scans.restore(arrays, keys)
         self.reflector_graph.restore(arrays)

@@ -324,7 +324,7 @@ def measure_bias(x: Array, P: Array, bias: float, variance: float, turn: float) 
     PH = P[:, BIAS] + turn * P[:, TURN]
     S = PH[BIAS] + turn * PH[TURN] + variance
     error = bias - (x[BIAS] + turn * x[TURN])
-    if error * error >= GATE * S:
+    if not error * error < GATE * S:  # nor where it is NaN
         return
     for r in range(len(x)):
         gain = PH[r] / S

@@ -25,7 +25,7 @@ class Keyframe:
     """A pose of the graph; ``points`` (n, 2) and ``origin`` (2,) are its scan in base, or None.
 
     ``index`` changes when keyframes before it go; ``points`` may be replaced by those of a scan
-    that was taken later at the same place, at ``scan_stamp``.
+    that was taken later at the same place, at ``scan_stamp``. ``jumped``: no motion leads to it.
     """
 
     index: int
@@ -36,6 +36,7 @@ class Keyframe:
     origin: Array | None
     scan_stamp: int
     looked: bool = False  # for reflectors
+    jumped: bool = False
 
     def take_scan(self, other: Keyframe, T: Array) -> None:
         """Replace the scan by that of another keyframe, which stood at ``T`` (3,) from here."""

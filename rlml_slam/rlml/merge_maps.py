@@ -30,7 +30,10 @@ from rlml_slam.types import EdgeKind, Verdict
 # of a map that overlaps with another, most reflectors may be of places that the other lacks; that
 # what they have in common is no chance, the verdict still has to show
 APART = 0.95
-LATER = 'key_looked', 'reflector_gone', 'reflector_life', 'reflector_surveyed', 'reflector_view'
+LATER = (
+    'key_looked', 'key_jumped', 'reflector_gone', 'reflector_life', 'reflector_surveyed',
+    'reflector_view',
+)  # fmt: skip
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -109,11 +112,14 @@ def _moved(a: Arrays, T: Array) -> Arrays:
     R = se2.rotation(T[2])
     gone = a['reflector_gone'].copy()
     gone['place'] = se2.transform(T, gone['place'])
+    jumped = a['key_jumped'].copy()
+    jumped[:1] = True  # no motion leads there from the other map
     return a | {
         'pose': se2.compose(T, a['pose']),
         'landmark': se2.transform(T, a['landmark']),
         'landmark_prior_measured': se2.transform(T, a['landmark_prior_measured']),
         'landmark_prior_information': R @ a['landmark_prior_information'] @ R.T,
+        'key_jumped': jumped,
         'reflector_gone': gone,
         'reflector_view': a['reflector_view'][:0],  # cells of another floor
         'pose_fixed': np.zeros(len(a['pose']), dtype=np.bool_),

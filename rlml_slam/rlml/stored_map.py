@@ -108,6 +108,7 @@ def arrays_of(keys: list[Keyframe]) -> dict[str, NDArray[Any]]:
         'key_stamp': np.array([k.stamp for k in keys], dtype=np.int64),
         'key_scan_stamp': np.array([k.scan_stamp for k in keys], dtype=np.int64),
         'key_looked': np.array([k.looked for k in keys]),
+        'key_jumped': np.array([k.jumped for k in keys]),
         'key_local': np.array([k.T_local for k in keys]),
         'key_cov': np.array([k.cov_local for k in keys]),
         'key_origin': np.array([np.zeros(2) if k.origin is None else k.origin for k in keys]),
@@ -207,8 +208,13 @@ def _keyframes(a: Arrays) -> list[Keyframe]:
     for k, (_, count, end, stamp, T_local, cov, origin, scan_stamp) in enumerate(rows):
         points = a['points'][end - count : end].copy() if count >= 0 else None
         place = origin.copy() if count >= 0 else None
-        looked = bool(a['key_looked'][k]) if 'key_looked' in a else False
+        # files of older versions lack them
+        looked, jumped = (
+            bool(a[name][k]) if name in a else False for name in ('key_looked', 'key_jumped')
+        )
         out.append(
-            Keyframe(k, stamp, T_local.copy(), cov.copy(), points, place, scan_stamp, looked)
+            Keyframe(
+                k, stamp, T_local.copy(), cov.copy(), points, place, scan_stamp, looked, jumped
+            )
         )
     return out

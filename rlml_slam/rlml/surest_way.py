@@ -7,6 +7,10 @@ state knows what lasts, but no loop that scans have closed. Its covariance is th
 driven; a closure brings another one, by the place that was seen again. What errors the two share
 nobody knows, so they are fused by covariance intersection (Julier, Uhlmann 1997), which is right
 whatever these are.
+
+What a way grows by between two keyframes is taken to be what the front end's covariance does. It
+is less where a lasting error cancels, out and back by one way, and more where it adds to itself:
+a bound that is often near, and never the only one (:func:`correction.either`).
 """
 
 from __future__ import annotations
@@ -50,6 +54,11 @@ class SurestWay:
             cov = intersection(cov, carried(later.cov_map + grown, -way))
         return turned(cov, -key.T_local[2])
 
+    @property
+    def newest(self) -> int:
+        """Stamp of the last keyframe at which another way came in, -1 before the first."""
+        return self._stamps[-1] if self._stamps else -1
+
     def begin(self, key: Keyframe) -> None:
         """No way leads to a keyframe: the front end says how well it found its place."""
         self._begun.append(key.stamp)
@@ -80,13 +89,14 @@ class SurestWay:
         self._known.insert(k, known)
 
 
-def held(sightings: FactorTable, pose: int) -> bool:
-    """Whether the reflectors seen at a pose of the graph hold it: two, in all three directions.
+def held(sightings: FactorTable, pose: int, until: int) -> bool:
+    """Whether reflectors seen at a pose of the graph hold it: two, in all three directions.
 
-    What they tell does not pass through the wheels, so no way by these need be asked then.
+    Poses up to ``until`` have to have seen these as well, else they tie it to nothing else. What
+    they tell does not pass through the wheels, so no way by these need be asked then.
     """
-    rows = (sightings.nodes[:, 0] == pose) & sightings.enabled
-    return len(np.unique(sightings.nodes[rows, 1])) >= 2
+    poses, landmarks = sightings.nodes[sightings.enabled].T
+    return len(np.intersect1d(landmarks[poses == pose], landmarks[poses <= until])) >= 2
 
 
 def intersection(P: Array, Q: Array) -> Array:

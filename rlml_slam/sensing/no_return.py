@@ -9,6 +9,7 @@ ends than in the middle, and what is farthest of all that a scan sees is not rou
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -18,15 +19,15 @@ from rlml_slam.compiled import brief
 from rlml_slam.se2 import Array
 from rlml_slam.types import Scan
 
-ARC = 0.3  # [rad] of neighbouring beams of one and the same range, the longest of the scan
-FEWEST = 8  # beams of it: some may be equal by chance
+ARC = 0.3  # [rad] of neighbouring beams of one and the same range, farther than all others
+FEWEST = 8  # beams of it, some may be equal by chance; and fewer than these are stray ones
 
 
 class NoReturns:
     """What stands for "no return" in the scans of each lidar, by its frame.
 
     An arc shows it; from then on single beams of that range are none either, until the lidar
-    measures something farther away.
+    measures something farther away, with more beams than dust and crosstalk take.
     """
 
     def __init__(self) -> None:
@@ -36,26 +37,29 @@ class NoReturns:
         """The scan with NaN where there is no return, zero being none; itself if there is all."""
         r = scan.ranges
         codes = self._codes.setdefault(scan.frame_id, [])
+        enough = max(FEWEST, math.ceil(ARC / abs(scan.angle_increment)))
         while True:
-            longest, beams, none = _farthest(r, np.array(codes), scan.range_min, scan.range_max)
-            if beams < FEWEST or beams * abs(scan.angle_increment) < ARC:
+            arc, none, beyond = _arc(r, np.array(codes), scan.range_min, scan.range_max, enough)
+            codes[:] = [code for code, n in zip(codes, beyond.tolist(), strict=True) if n < FEWEST]
+            if arc < 0.0:
                 break
-            codes.append(longest)
-        codes[:] = [code for code in codes if code > longest]
+            codes.append(arc)
         if not none:
             return scan
         return replace(scan, ranges=np.where(np.isin(r, [0.0, *codes]), np.float32(np.nan), r))
 
 
 @brief
-def _farthest(
-    ranges: NDArray[np.float32], codes: Array, least: float, most: float
-) -> tuple[float, int, int]:
-    """(Longest range in [least, most], longest run of neighbours that have it, beams left out).
+def _arc(
+    ranges: NDArray[np.float32], codes: Array, least: float, most: float, enough: int
+) -> tuple[float, int, NDArray[np.int64]]:
+    """(Range that ``enough`` neighbours have and few beams exceed, or -1; left out; beyond).
 
-    Left out are 0 and the codes, which are no ranges.
+    Left out are 0 and the codes, which are no ranges; ``beyond`` each are so many beams.
     """
-    longest, beams, run, none = -np.inf, 0, 0, 0
+    arc, run, none = np.float32(-1.0), 0, 0
+    last = arc
+    beyond = np.zeros(len(codes), np.int64)
     for r in ranges:
         told = r == 0.0
         for code in codes:
@@ -64,13 +68,22 @@ def _farthest(
         if told or not least <= r <= most:
             run = 0
             continue
-        if r > longest:
-            longest, beams, run = r, 0, 0
-        run = run + 1 if r == longest else 0
-        beams = max(beams, run)
-    return float(longest), beams, none
+        for k in range(len(codes)):
+            beyond[k] += r > codes[k]
+        run = run + 1 if run and r == last else 1
+        last = r
+        if run >= enough and r > arc:
+            arc = r
+    farther = 0
+    if arc >= 0.0:
+        for r in ranges:
+            told = False
+            for code in codes:
+                told |= r == code
+            farther += not told and arc < r <= most
+    return float(arc) if farther < FEWEST else -1.0, none, beyond
 
 
 def warm_up() -> None:
     """Compile the kernel with the signature that is used at run time."""
-    _farthest(np.zeros(1, dtype=np.float32), np.zeros(0), 0.0, 1.0)
+    _arc(np.zeros(1, dtype=np.float32), np.zeros(0), 0.0, 1.0, 8)

@@ -9,6 +9,7 @@ import pytest
 from made_graphs import loop_graph
 
 from rlml_slam import se2
+from rlml_slam.errors import SolverError
 from rlml_slam.graph.cost import total_cost
 from rlml_slam.graph.eliminate import eliminate
 from rlml_slam.graph.graph import Graph
@@ -196,6 +197,23 @@ def test_joint_covariance_is_that_of_the_whole_graph(seed: int) -> None:
     assert (np.abs(found - expected) <= 1e-6 * np.outer(sigma, sigma)).all()
     assert (found[:3] == 0.0).all()  # fixed
     assert live.joint([], []).shape == (0, 0)
+
+
+def test_covariance_that_cannot_be_told_moves_nothing() -> None:
+    """A graph that cannot be solved: poses stay, and it is told once it can be."""
+    graph, truth, _ = loop_graph(1, poses=30, losses=ROBUST)
+    live = Live(graph)
+    live.solve()
+    drive_on(graph, list(truth), np.random.default_rng(1))
+    island = [graph.add_pose([x, 1.0, 0.0]) for x in (1.0, 2.0)]
+    graph.add_edge(EdgeKind.ODOMETRY, *island, [1.0, 0.0, 0.0], np.eye(3))
+    before = graph.poses.copy(), graph.landmarks.copy()
+    with pytest.raises(SolverError):
+        live.joint([30])
+    np.testing.assert_array_equal(graph.poses, before[0])
+    np.testing.assert_array_equal(graph.landmarks, before[1])
+    graph.edges.enabled[-1] = False
+    assert np.linalg.eigvalsh(live.joint([30])).min() > 0.0
 
 
 def test_what_is_at_rest_stays_there() -> None:

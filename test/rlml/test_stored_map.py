@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from made_worlds import ROOM, drive, errors, messages, observations
+from numpy.testing import assert_allclose
 
 from rlml_slam import se2
 from rlml_slam.errors import FileFormatError, MapError
@@ -15,6 +16,7 @@ from rlml_slam.params import Parameters
 from rlml_slam.rlml import stored_map
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.closure import Closure
+from rlml_slam.rlml.correction import turned
 from rlml_slam.rlml.front_end import FrontEnd
 from rlml_slam.rlml.slam import Slam
 from rlml_slam.tools import map_export, map_info
@@ -69,8 +71,33 @@ def test_map_is_read_as_it_was_saved(mapped, saved):
     twice = stored_map.content_of(b, PARAMS, b.occupancy_grid())
     assert json.loads(json.dumps(twice.description)) == content.description
     for name, array in content.arrays.items():
-        if name not in ('path', 'key_local', 'submap_cells', 'submap_corner', 'submap_shape'):
+        if name not in (
+            'path',
+            'key_local',
+            'key_cov',
+            'submap_cells',
+            'submap_corner',
+            'submap_shape',
+        ):
             np.testing.assert_array_equal(twice.arrays[name], array, err_msg=name)
+
+
+def test_a_jump_is_one_in_the_saved_map_as_well(saved):
+    """What is known of a keyframe does not come through a jump in the session after, either."""
+    content = stored_map.load(saved)
+    jumped = content.arrays['key_jumped'].copy()
+    jumped[6] = True
+    jumping = Content({**content.arrays, 'key_jumped': jumped}, content.description)
+    again, without = BackEnd(PARAMS), BackEnd(PARAMS)
+    stored_map.restore(jumping, again)
+    stored_map.restore(content, without)
+    same = stored_map.content_of(again, PARAMS, again.occupancy_grid())
+    np.testing.assert_array_equal(same.arrays['key_jumped'], jumped)
+    keys = again.keyframes
+    before, after = (again.surest_way.cov(keys[k]) for k in (5, 6))
+    assert_allclose(before, without.surest_way.cov(keys[5]), atol=1e-15)
+    assert_allclose(after, turned(keys[6].cov_local, -keys[6].T_local[2]), atol=1e-12)
+    assert again.surest_way.newest == keys[6].stamp
 
 
 def test_two_saves_are_equal_files(mapped, saved, tmp_path):

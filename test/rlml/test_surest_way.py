@@ -128,15 +128,21 @@ def test_place_found_anew_counts_for_what_comes_after_it_alone():
     assert_allclose(way.cov(keys[15]), found, atol=1e-12)
 
 
-def test_two_reflectors_hold_a_pose_and_one_does_not():
+def test_two_reflectors_hold_a_pose_to_those_that_saw_them_and_one_does_not():
     graph = Graph()
-    for x in range(3):
+    for x in range(5):
         graph.add_pose([x, 0.0, 0.0])
     near, far = graph.add_landmark([1.0, 2.0]), graph.add_landmark([5.0, 2.0])
-    for pose, landmark in ((0, near), (0, near), (1, near), (1, far), (2, near), (2, far)):
+    for pose, landmark in ((0, near), (0, near), (1, near), (2, far), (3, near), (3, far)):
         graph.add_sighting(pose, landmark, [1.0, 2.0], np.eye(2))
+    for landmark in (near, far):
+        graph.add_sighting(4, landmark, [1.0, 2.0], np.eye(2))
+    assert not held(graph.sightings, 1, 0)
+    assert not held(graph.sightings, 3, 1)  # ``far`` is new since then
+    assert held(graph.sightings, 3, 2)
+    assert held(graph.sightings, 4, 3)
     graph.sightings.enabled[-1] = False
-    assert [held(graph.sightings, pose) for pose in range(3)] == [False, True, False]
+    assert not held(graph.sightings, 4, 3)
 
 
 def test_intersection_is_no_surer_than_what_was_fused_whatever_the_two_have_in_common():

@@ -54,9 +54,23 @@ def test_single_beams_of_a_known_code_are_left_out_for_that_lidar_alone():
 def test_a_range_that_is_not_the_longest_is_no_code_any_more():
     none = NoReturns()
     none.left_out(scan_of(corridor(8.0, 5.0)))
-    farther = scan_of([1.0, 8.0, 9.0, 2.0])
-    assert none.left_out(farther).ranges[2] == 9.0
+    farther = scan_of([1.0, 8.0, *np.linspace(8.5, 9.5, 12), 2.0])
+    assert_array_equal(none.left_out(farther).ranges, farther.ranges)
     assert none.left_out(farther) is farther
+
+
+@pytest.mark.parametrize('known', [False, True])
+def test_stray_beam_beyond_a_code_does_not_make_a_wall_of_it(known):
+    ranges = corridor(8.183, 5.0)
+    none = NoReturns()
+    if known:
+        none.left_out(scan_of(ranges))
+    stray = ranges.copy()
+    stray[[3, 90] if known else [3, 170]] = 12.0
+    for _ in range(3):
+        left = none.left_out(scan_of(stray)).ranges
+        assert_array_equal(np.isnan(left), stray == 8.183)
+        assert left[3] == 12.0
 
 
 @pytest.mark.parametrize('distance', [1.0, 2.5, 5.0, 12.0])
