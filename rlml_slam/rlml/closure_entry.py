@@ -5,7 +5,8 @@ Where rooms are alike, a scan fits in a wrong one as well as in its own. What te
 where the graph, of all odometry, scans and closures so far, expects the keyframe: the evidence
 (graph/evidence.py) of that for the closure. What is far from there enters only with others that
 agree with it around a short loop (pairwise consistency, Mangelson et al. 2018), seen from places
-apart, for from one place a wrong room stays alike. The surer the graph, the more of them it takes.
+apart, for from one place a wrong room stays alike, and along a corridor or between racks for as
+far as one sees there. The surer the graph, the more of them it takes.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from rlml_slam.graph.live import Live
 from rlml_slam.se2 import Array
 
 Ints = NDArray[np.int64]
-APART = 1.0  # [m] between the places of two views that count as two
+APART = 1.0  # [m] between the places of two views that tell more than one
 # Chance that a wrong place, alike in one view, is alike in the next one as well. Of the wrong
 # matches of two real logs, fewer were.
 ALIKE = 0.1
@@ -31,13 +32,20 @@ RISK = 0.1  # chances that any of the closures that wait agrees with another by 
 
 
 def may_enter(
-    live: Live, nodes: Ints, deltas: Array, covs: Array, wrong: Array, odds: Array | float = 0.0
+    live: Live,
+    nodes: Ints,
+    deltas: Array,
+    covs: Array,
+    wrong: Array,
+    odds: Array | float = 0.0,
+    sight: Array | float = 0.0,
 ) -> NDArray[np.bool_]:
     """Which (k,) of the closures between poses (k, 2), none of them in a graph yet, may enter.
 
     ``deltas`` (k, 3) with ``covs`` (k, 3, 3) of their residuals; ``wrong`` (k,) is the log
-    density of wrong errors, ``odds`` (k,) the logarithm of what else speaks for each. The graph is
-    solved for it. Raises SolverError as Live.
+    density of wrong errors, ``odds`` (k,) the logarithm of what else speaks for each, ``sight``
+    (k,) [m] within which half of what each sees is. The graph is solved for it. Raises SolverError
+    as Live.
     """
     graph, between = live.graph, _Between(live, np.unique(nodes))
     wrong = np.broadcast_to(wrong, len(nodes))
@@ -45,7 +53,8 @@ def may_enter(
     e = factors.relative_pose(graph.poses[i], graph.poses[j], deltas)[0]
     alone = evidence(e, between.covs(i, j) + covs, 1.0, wrong)
     agree = _agreement(graph, between, nodes, deltas, covs, wrong)
-    views = np.array([_views(graph.poses[np.unique(j[row]), :2]) for row in agree])
+    sight, places = np.broadcast_to(sight, len(nodes)), graph.poses[:, :2]
+    views = np.array([_views(places, j[row], sight[row]) for row in agree])
     # likelier right than wrong, had half of them been wrong beforehand: of matches it is 1 %
     return np.asarray(odds + alone - (views - 1) * math.log(ALIKE) > 0.0)
 
@@ -92,10 +101,17 @@ def _agreement(
     return out
 
 
-def _views(places: Array) -> int:
-    """From how many places (n, 2), in the order of driving, each APART from the one before."""
-    count, last = 1, places[0]
-    for place in places[1:]:
-        if math.dist(place, last) >= APART:
-            count, last = count + 1, place
+def _views(places: Array, poses: Ints, sight: Array) -> float:
+    """How many views of their own the poses (k,) are, in the order of driving.
+
+    The places (n, 2) are those of all poses, ``sight`` (k,) [m] as above. Half of what one sees
+    lies behind as soon as one has gone as far as that is away: that is one view more. On the way
+    there, a view tells its share of it.
+    """
+    poses, first = np.unique(poses, return_index=True)
+    count, last = 1.0, places[poses[0]]
+    for place, gap in zip(places[poses], sight[first].tolist(), strict=True):
+        gone = math.dist(place, last)
+        if gone >= APART:
+            count, last = count + min(gone / max(gap, APART), 1.0), place
     return count

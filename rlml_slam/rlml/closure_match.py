@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,7 +37,8 @@ class Match:
 
     ``searched`` is the area [m²] of its candidate, ``odds`` the logarithm of how much likelier
     right than any match it is, ``source`` what proposed it, ``pairs`` keys of reflectors that are
-    one with it; the others as in Closure.
+    one with it, ``sight`` [m] within which half of what the scan sees is; the others as in
+    Closure.
     """
 
     m: KeySubmap
@@ -50,6 +52,7 @@ class Match:
     odds: float = 0.0
     source: str = ''
     pairs: tuple[tuple[int, int], ...] = ()
+    sight: float = 0.0
 
     def closure(self, why: str, edge: int = -1, number: int = -1) -> Closure:
         """Its record."""
@@ -59,6 +62,14 @@ class Match:
         )  # fmt: skip
 
 
+class Tried(NamedTuple):
+    """What came of a candidate, and the places (n, 3), grid's frame, that the scan fits alike."""
+
+    candidate: Candidate
+    result: Match | Closure
+    places: Array
+
+
 class Matcher:
     """Searches and verifies; keeps what the search needs of submaps from one time to the next."""
 
@@ -66,13 +77,14 @@ class Matcher:
         self._p = params
         self._pyramids: OrderedDict[KeySubmap, search.Pyramid] = OrderedDict()
 
-    def match(self, candidate: Candidate, key: Keyframe, points: Array) -> Match | Closure:
+    def match(self, candidate: Candidate, key: Keyframe, points: Array) -> Tried:
         """Search and verify ``points`` (n, 2) of a keyframe; the record of what failed."""
         p, m, guess = self._p.loop_closure, candidate.m, candidate.guess
         i, j = m.anchor.index, key.index
 
-        def rejected(why: str, score: float = 0.0) -> Closure:
-            return Closure(i, j, guess, score, -1, why)
+        def rejected(why: str, score: float = 0.0, *places: Array) -> Tried:
+            closure = Closure(i, j, guess, score, -1, why)
+            return Tried(candidate, closure, np.array(places).reshape(-1, 3))
 
         result = search.wide(
             self._pyramid(m), points, guess, candidate.window, candidate.angle, p.min_score,
@@ -81,20 +93,24 @@ class Matcher:
         if result.best is None:
             return rejected('no place in the window fits')
         if result.second is not None and result.second.score > p.max_second * result.best.score:
-            return rejected(SECOND, result.best.score)
+            return rejected(SECOND, result.best.score, result.best.pose, result.second.pose)
         weak = np.diag(1.0 / np.array([0.5, 0.5, 0.2]) ** 2)
         found = match(m.submap, points, result.best.pose, weak, self._p.scan_match, searched=False)
         if found.score < p.min_score:
             return rejected('the refined fit is too weak', found.score)
         information = observability.information(m.submap, points, found.pose, self._p.scan_match)
         if np.linalg.eigvalsh(np.linalg.inv(information + OPEN * np.eye(3))[:2, :2])[1] > HELD**2:
-            return rejected(OPEN_WAY, found.score)
+            return rejected(OPEN_WAY, found.score, found.pose)
         term = linearize(m.submap, points, found.pose)
         second = math.nan if result.second is None else result.second.score / result.best.score
         overlap = term.inliers / max(term.count, 1)
-        return Match(
-            m, key, found.pose, information, found.score, overlap, second, candidate.searched
-        )
+        assert key.origin is not None
+        sight = float(np.median(np.hypot(*(points - key.origin).T)))
+        fit = Match(
+            m, key, found.pose, information, found.score, overlap, second, candidate.searched,
+            sight=sight,
+        )  # fmt: skip
+        return Tried(candidate, fit, found.pose[None])
 
     def _pyramid(self, m: KeySubmap) -> search.Pyramid:
         if m not in self._pyramids:

@@ -33,6 +33,7 @@ from rlml_slam.rlml.closure_match import OPEN, UNDECIDED, Match, Matcher
 from rlml_slam.rlml.constellation_closure import Place
 from rlml_slam.rlml.key_submap import TURN, KeySubmap
 from rlml_slam.rlml.keyframes import Keyframe
+from rlml_slam.rlml.rivals import told_apart
 from rlml_slam.se2 import Array
 from rlml_slam.types import EdgeKind
 
@@ -291,7 +292,8 @@ class ScanGraph:
         """Try those ``among`` finished submaps that are near the keyframe."""
         near = candidates(self._graph, key, among, self._p.loop_closure)
         tried = [self._matcher.match(candidate, key, points) for candidate in near]
-        return self._record(tried)
+        share = self._p.loop_closure.max_second
+        return self._record(told_apart(self._graph, key, points, tried, share))
 
     def enter(self, place: Place) -> tuple[Closure, ...]:
         """Close the loop to a place that reflectors tell, unless the scan says otherwise."""
@@ -319,7 +321,7 @@ class ScanGraph:
                 key.points.astype(np.float64), p.scan_match.voxel, p.scan_match.max_points
             )
             candidate = Candidate(m, se2.between(self._grid(m), here), *CONFIRMED)
-            found = self._matcher.match(candidate, key, points)
+            found = self._matcher.match(candidate, key, points).result
             if isinstance(found, Match):
                 confirmed = replace(
                     found, searched=place.area, odds=place.odds, source=BY_REFLECTORS,
@@ -364,7 +366,8 @@ class ScanGraph:
         covs: Array = np.asarray(np.linalg.inv(informations), dtype=np.float64)
         wrong = uniform(np.array([c.searched for c in matches]))
         odds = np.array([c.odds for c in matches])
-        may = may_enter(self._live, nodes, deltas, covs, wrong, odds)
+        sight = np.array([c.sight for c in matches])
+        may = may_enter(self._live, nodes, deltas, covs, wrong, odds, sight)
         out, waited = [], len(self._waiting)
         for n, (c, enters) in enumerate(zip(matches, may.tolist(), strict=True)):
             if enters:

@@ -435,7 +435,8 @@ def test_loop_is_closed_only_by_a_scan_that_holds_its_place(open_):
     graph = Graph()
     pose = np.array([0.3, 0.1, 0.05])
     keys = [
-        Keyframe(graph.add_pose(p), FIRST, p, EYE, None, None, FIRST) for p in (np.zeros(3), pose)
+        Keyframe(graph.add_pose(p), FIRST, p, EYE, None, np.zeros(2), FIRST)
+        for p in (np.zeros(3), pose)
     ]
     along = np.arange(-6.0, 6.0, 0.04)
     sides = [np.column_stack([along, np.full(len(along), y)]) for y in (-1.0, 1.2)]
@@ -447,9 +448,8 @@ def test_loop_is_closed_only_by_a_scan_that_holds_its_place(open_):
         m.submap.insert(se2.transform(se2.inverse(m.T_anchor_grid), walls), np.zeros(2))
     m.submap.complete()
     (candidate,) = candidates(graph, keys[1], [m], LoopClosure())
-    found = Matcher(Parameters()).match(
-        candidate, keys[1], se2.transform(se2.inverse(pose), walls)
-    )
+    seen = se2.transform(se2.inverse(pose), walls)
+    found = Matcher(Parameters()).match(candidate, keys[1], seen).result
     if open_:
         assert found.why == 'the scan leaves a direction open'
     else:

@@ -40,12 +40,13 @@ def graph():
     return out
 
 
-def tried(graph, ends, shift=(0.0, 0.0, 0.0)):
+def tried(graph, ends, shift=(0.0, 0.0, 0.0), sight=0.0):
     """Whether closures (i, j) may enter which say that the true places are off by a shift."""
     nodes = np.array(ends)
     off = se2.compose(np.asarray(shift, dtype=np.float64), true(nodes[:, 1]))
     deltas = se2.between(true(nodes[:, 0]), off)
-    return may_enter(Live(graph), nodes, deltas, np.broadcast_to(COV, (len(nodes), 3, 3)), WRONG)
+    covs = np.broadcast_to(COV, (len(nodes), 3, 3))
+    return may_enter(Live(graph), nodes, deltas, covs, WRONG, sight=sight)
 
 
 def sure(graph):
@@ -104,6 +105,14 @@ def test_views_from_one_place_count_as_one(graph):
     far = (2.0, 0.0, 0.0)
     ends = [(i, j + LAP) for i in range(5, 9) for j in (5, 6, 7)]
     assert not tried(sure(graph), ends, far).any()
+
+
+def test_views_of_the_same_walls_count_as_one(graph):
+    """In a long corridor one sees the same for longer than between desks."""
+    far, sharp = (2.0, 0.0, 0.0), sure(graph)
+    ends = [(k, k + LAP) for k in range(5, 70, 5)]
+    assert tried(sharp, ends, far, sight=1.0).all()
+    assert not tried(sharp, ends, far, sight=5.0).any()
 
 
 def test_wrong_ones_that_disagree_help_no_one(graph):
