@@ -6,10 +6,11 @@
     ROBOTLASER1 <as RAWLASER1 up to i..> x y theta odom_x odom_y odom_theta tv rv <3> ipc_time ..
     ODOM x y theta tv rv accel ipc_time host logger_time
 
-The stamps are ipc_time. (x, y, theta) is the laser's pose and odom_… the robot's, so the two tell
-where the laser sits. Old lines do not say what angles their beams have: 180 or 181 of them step
-by 1 degree and 360 or 361 by half a degree from -90 on, 400 or 401 by a quarter from -50 on (a
-SICK set to 100 degrees), as CARMEN reads them; any other number spans 180 degrees.
+The stamps are ipc_time, or logger_time where no laser line tells the other. (x, y, theta) is the
+laser's pose and odom_… the robot's, so the two tell where the laser sits. Old lines do not say
+what angles their beams have: 180 or 181 of them step by 1 degree and 360 or 361 by half a degree
+from -90 on, 400 or 401 by a quarter from -50 on (a SICK set to 100 degrees), as CARMEN reads them;
+any other number spans 180 degrees.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class CarmenLog:
 
     ``T_base_laser`` (3,); ``odometry`` is from ODOM lines, else from the laser lines. ``counts``:
     lines by kind, ``broken``, ``out_of_order`` scans, ``invalid_stamp``; ``first_error`` tells
-    the first broken line.
+    the first broken line. ``set_back`` [ns] is by how much the scans' clock went back at most.
     """
 
     odometry: list[Odometry] = field(default_factory=list)
@@ -52,6 +53,7 @@ class CarmenLog:
     T_base_laser: Array = field(default_factory=lambda: np.zeros(3))
     counts: Counter[str] = field(default_factory=Counter)
     first_error: str = ''
+    set_back: int = 0
 
 
 @dataclass(frozen=True)
@@ -64,9 +66,12 @@ class _LaserLine:
 class _Reader:
     """Parses line by line; the laser's angles and ranges may be given instead of guessed."""
 
-    def __init__(self, max_range: float | None, field_of_view: float | None) -> None:
+    def __init__(
+        self, max_range: float | None, field_of_view: float | None, by_logger: bool = False
+    ) -> None:
         self._given_range = max_range
         self._fov = field_of_view
+        self._clock = 2 if by_logger else 0  # word of the stamp, from ipc_time on
         self.params: dict[str, str] = {}
 
     def max_range(self) -> float:
@@ -87,21 +92,22 @@ class _Reader:
 
     def odometry(self, words: Sequence[str]) -> Odometry:
         """ODOM x y theta tv rv accel ipc_time [host logger_time]."""
-        if len(words) < 8:
+        if len(words) < 8 + self._clock:
             raise ValueError('the line is cut short')
-        return Odometry(parse_stamp(words[7]), _pose(words[1:4]))
+        return Odometry(parse_stamp(words[7 + self._clock]), _pose(words[1:4]))
 
     def old_laser(self, words: Sequence[str]) -> _LaserLine:
         """FLASER or RAWLASER."""
         n, at = _count(words, 1), 2
         has_poses = words[0] == 'FLASER'
-        if len(words) < at + n + (7 if has_poses else 1):
-            raise ValueError(f'the line is too short for {n} beams')
+        if len(words) < at + n + (7 if has_poses else 1) + self._clock:
+            raise ValueError(f'the line is too short for {n} beams and a stamp')
         ranges, at = words[at : at + n], at + n
         laser = robot = None
         if has_poses:
             laser, robot, at = _pose(words[at : at + 3]), _pose(words[at + 3 : at + 6]), at + 6
-        scan = _scan(words[at], self._angles(n), ranges, (), self.max_range())
+        stamp = words[at + self._clock]
+        scan = _scan(stamp, self._angles(n), ranges, (), self.max_range())
         return _LaserLine(scan, laser, robot)
 
     def new_laser(self, words: Sequence[str]) -> _LaserLine:
@@ -117,8 +123,9 @@ class _Reader:
         if words[0] == 'ROBOTLASER1':
             laser, robot = _pose(words[at : at + 3]), _pose(words[at + 3 : at + 6])
             at += 11
+        at += self._clock
         if len(words) <= at:
-            raise ValueError(f'the line is too short for {n} beams and {m} remissions')
+            raise ValueError(f'the line is too short for {n} beams, {m} remissions and a stamp')
         longest = float(stated) if self._given_range is None else self._given_range
         if not (step > 0.0 and longest > 0.0):
             raise ValueError(f'angular resolution {step:g} or maximum range {longest:g} is wrong')
@@ -175,9 +182,18 @@ def read_carmen(
 
     Broken lines are left out and counted. Raises FileFormatError, with file and line, at the
     first one if ``strict``, if more than MAX_BROKEN of the lines are broken, and if there is no
-    scan at all.
+    scan at all, or none with a stamp.
     """
-    reader, log = _Reader(max_range, field_of_view), CarmenLog()
+    log = _read(path, _Reader(max_range, field_of_view), strict)
+    if not log.scans:
+        log = _read(path, _Reader(max_range, field_of_view, by_logger=True), strict)
+    if not log.scans:
+        raise FileFormatError(f'{path}: no scan in it has a stamp above zero')
+    return log
+
+
+def _read(path: str | Path, reader: _Reader, strict: bool) -> CarmenLog:
+    log = CarmenLog()
     laser_lines: list[_LaserLine] = []
     for number, line in read_lines(path):
         words = line.split()
@@ -220,6 +236,7 @@ def _finish(log: CarmenLog, lines: list[_LaserLine], reader: _Reader) -> None:
         items[:] = valid  # type: ignore[assignment]
     stamps = np.array([s.stamp for s in log.scans], dtype=np.int64)
     log.counts['out_of_order'] = int(np.sum(np.diff(stamps) <= 0))
+    log.set_back = int((np.maximum.accumulate(stamps) - stamps).max(initial=0))
     log.scans.sort(key=lambda s: s.stamp)
     log.odometry.sort(key=lambda o: o.stamp)
 

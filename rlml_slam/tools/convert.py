@@ -20,6 +20,7 @@ from rlml_slam.ros.messages import make_bag
 from rlml_slam.ros.simulated import TRUE_REFLECTORS
 from rlml_slam.se2 import Array
 from rlml_slam.tools import carmen, convert_lego, mrclam, victoria_park
+from rlml_slam.tools.text_file import SECOND
 from rlml_slam.tools.tum import Trajectory
 from rlml_slam.types import Detections, Odometry, Scan
 
@@ -110,6 +111,12 @@ def _read_carmen(args: argparse.Namespace) -> tuple[Recording, dict[str, int]]:
     if log.first_error:
         print(
             f'rlml: {log.counts["broken"]} broken lines left out, the first: {log.first_error}',
+            file=sys.stderr,
+        )
+    if log.set_back > SECOND:
+        print(
+            'rlml: the clock of the scans was set back, by '
+            f'{log.set_back / SECOND:.1f} s at most: what it calls the same time is mixed up',
             file=sys.stderr,
         )
     sensors = {carmen.LASER_FRAME: log.T_base_laser}

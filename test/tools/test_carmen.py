@@ -129,6 +129,28 @@ def test_lines_out_of_order_are_sorted_and_counted(tmp_path):
     assert log.odometry[0].stamp < log.odometry[1].stamp
 
 
+def test_clock_that_was_set_back_is_told(tmp_path):
+    ordered = read(tmp_path, *(flaser(4, t) for t in (1.0, 2.0, 3.0)))
+    assert ordered.set_back == 0
+    back = read(tmp_path, *(flaser(4, t) for t in (1.0, 31.0, 2.0, 3.0, 4.0)))
+    assert back.set_back == 29_000_000_000
+
+
+def test_time_of_the_logger_serves_where_there_is_no_other(tmp_path):
+    lines = [flaser(4, 0), odom(0), robotlaser([1.0], [], 0)]
+    log = read(tmp_path, *lines)
+    assert [scan.stamp for scan in log.scans] == [100_000_000, 500_000_000]
+    assert [sample.stamp for sample in log.odometry] == [100_000_000]
+    # one line that tells its time is not set beside another clock
+    assert [scan.stamp for scan in read(tmp_path, *lines, flaser(4, 7.0)).scans] == [7 * 10**9]
+
+
+def test_log_without_any_time_is_refused(tmp_path):
+    untimed = flaser(4, 0).removesuffix('0.1') + '0'
+    with pytest.raises(FileFormatError, match=r'x\.log: no scan in it has a stamp'):
+        read(tmp_path, untimed)
+
+
 def test_stamp_zero_is_left_out(tmp_path):
     log = read(tmp_path, odom(0), odom(1.0), flaser(4, 1.0))
     assert len(log.odometry) == 1

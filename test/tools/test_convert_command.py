@@ -60,6 +60,13 @@ def test_broken_line_is_told_and_costs_no_other(tmp_path, log, capsys):
     assert not (tmp_path / 'other').exists()
 
 
+def test_clock_that_was_set_back_is_told(tmp_path, log, capsys):
+    laser = 'FLASER 4 1.5 2.5 90.0 3.5 0.2 0 0 0 0 0 {} h 1\n'
+    log.write_text(LOG + laser.format(9.0) + laser.format(2.0))
+    assert main(['convert', 'carmen', str(log), str(tmp_path / 'bag')]) == 0
+    assert 'set back, by 7.0 s at most' in capsys.readouterr().err
+
+
 def test_bag_is_not_overwritten(tmp_path, log, capsys):
     (tmp_path / 'bag').mkdir()
     assert main(['convert', 'carmen', str(log), str(tmp_path / 'bag')]) == 1
