@@ -41,11 +41,12 @@ from rlml_slam.graph.increments import (
     grown,
     new_state,
 )
+from rlml_slam.graph.judge import is_robust, judge
 from rlml_slam.graph.partial import take_out
 from rlml_slam.graph.places import nodes_at, tables_at
 from rlml_slam.graph.propagate import propagate
 from rlml_slam.graph.refactor import make_cliques, refactor, reserve
-from rlml_slam.graph.relinearize import differ, is_robust, judge, refer_all, take
+from rlml_slam.graph.relinearize import differ, refer_all, take
 from rlml_slam.graph.renumber import renumber
 from rlml_slam.graph.structure import Ints
 from rlml_slam.graph.system import Tables

@@ -17,8 +17,8 @@ import numpy as np
 
 from rlml_slam.compiled import fetch, part
 from rlml_slam.graph.increments import LINE, STEP, State
+from rlml_slam.graph.judge import is_restless
 from rlml_slam.graph.linearize import wrapped
-from rlml_slam.graph.relinearize import is_restless
 from rlml_slam.graph.structure import Ints, Records
 from rlml_slam.se2 import Array
 

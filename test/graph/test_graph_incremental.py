@@ -11,7 +11,8 @@ from rlml_slam import se2
 from rlml_slam.errors import SolverError
 from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.incremental import FILLED, SCATTERED, Incremental, Step, Thresholds
-from rlml_slam.graph.increments import IN_USE, LITTLE, TOP, compacted
+from rlml_slam.graph.increments import FACTORS, IN_USE, LITTLE, TOP, compacted
+from rlml_slam.graph.judge import NEAR, USUAL
 from rlml_slam.graph.partial import WIDEST
 from rlml_slam.graph.robust import Loss, Losses, LossKind
 from rlml_slam.graph.solver import optimize
@@ -93,6 +94,29 @@ def test_a_step_that_relinearizes_all_solves_the_linear_equations(whole: bool) -
     ours.solver.update(whole=whole)
     np.testing.assert_allclose(se2.wrap((ours.graph.poses - expected)[:, 2]), 0.0, atol=1e-8)
     np.testing.assert_allclose(ours.graph.poses[:, :2], expected[:, :2], atol=1e-8)
+
+
+def test_a_pose_is_calm_for_as_long_as_its_factors_are_modelled_well() -> None:
+    """Turned by ``calm``, with residuals changed by USUAL sigmas, they are just off enough."""
+    solver = driven(loop_graph(3, poses=60, landmarks=12)[0]).solver
+    z = solver._state.factors[: solver._state.counts[FACTORS]]
+    z = z[z['a'] >= 0]
+    sigma, phi = 1.0 / np.sqrt(z['I00'] + z['I11']), z['calm']
+    t = np.stack([z['dx'], z['dy']], -1)  # in axes in which the pose heads along x
+    worst = np.zeros(len(z))
+    for angle in np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False):
+        change = USUAL * sigma[:, None] * [np.cos(angle), np.sin(angle)]
+        turned = np.stack([np.zeros_like(phi), np.zeros_like(phi), phi], -1)
+        now = se2.transform(turned, (t + change)[:, None])[:, 0]
+        model = now + phi[:, None] * np.stack([t[:, 1], -t[:, 0]], -1)
+        worst = np.maximum(worst, np.linalg.norm(t + change - model, axis=1) / sigma)
+    limits = solver.thresholds
+    by_turn = phi == NEAR * limits.turn
+    assert not by_turn.all()
+    # half phi^2 of the change itself is not in the bound
+    assert (worst <= 1.01 * NEAR * limits.due).all()
+    assert (worst[~by_turn] >= 0.99 * NEAR * limits.due).all()
+    assert (phi <= NEAR * limits.turn).all()
 
 
 def gauss_newton_step(graph: Graph) -> np.ndarray:
