@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Edges that go where there are more of them than a graph needs, those first that tell the least.
+"""Factors that go where there are more of them than a graph needs, first those that tell least.
 
 The leverage of an edge is the share of what is known of where its pose j is from its pose i that
 comes from itself, h = tr(Q W) / 3 with its information W and the covariance Q of its residual by
@@ -7,6 +7,7 @@ the whole graph (the effective resistance by which Spielman & Srivastava, "Graph
 effective resistances", 2011, tell which edges matter). Those of all edges sum up to the number of
 free poses at most, so of m edges to a pose the least has a leverage below 1 / m: most of what it
 tells is known without it. What is left is what was measured: nothing becomes surer than it was.
+The same holds of the sightings of a pose, h = tr(Q W) / 2.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.graph.factors import chi2, relative_pose
+from rlml_slam.graph.factors import chi2, pose_landmark, relative_pose
 from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.live import Live
 from rlml_slam.graph.marginals import Marginals
 from rlml_slam.graph.prediction import residual_covs
 from rlml_slam.graph.robust import loss
@@ -35,13 +37,30 @@ def prune(graph: Graph, may: NDArray[np.bool_], most: int) -> NDArray[np.int64]:
     use = np.flatnonzero(e.enabled)
     if len(use) <= most:
         return use[:0]
-    h = leverages(graph)
-    total, largest = np.trace(h, axis1=1, axis2=2) / 3.0, np.linalg.eigvals(h).real.max(axis=1)
-    order = np.argsort(total, kind='stable')
-    order = order[may[use][order] & (largest[order] < AT_ONCE)]
-    gone: NDArray[np.int64] = use[order[np.cumsum(total[order]) < AT_ONCE][: len(use) - most]]
+    gone = use[_least(leverages(graph), may[use], len(use) - most)]
     e.enabled[gone] = False
     return gone
+
+
+def prune_sightings(live: Live, pose: int, most: int) -> NDArray[np.int64]:
+    """The same of the sightings of one pose, from the tree of the live solver."""
+    s = live.graph.sightings
+    use = np.flatnonzero((s.nodes[:, 0] == pose) & s.enabled)
+    if len(use) <= most:
+        return use[:0]
+    h = sighting_leverages(live, pose, use)
+    gone = use[_least(h, np.ones(len(use), dtype=np.bool_), len(use) - most)]
+    s.enabled[gone] = False
+    return gone
+
+
+def _least(h: Array, may: NDArray[np.bool_], num: int) -> NDArray[np.int64]:
+    """Of the leverages (k, d, d), up to ``num`` that ``may`` go together, the least first."""
+    total, largest = np.trace(h, axis1=1, axis2=2), np.linalg.eigvals(h).real.max(axis=1)
+    order = np.argsort(total, kind='stable')
+    order = order[may[order] & (largest[order] < AT_ONCE)]
+    least: NDArray[np.int64] = order[np.cumsum(total[order]) < AT_ONCE * h.shape[1]][:num]
+    return least
 
 
 def leverages(graph: Graph) -> Array:
@@ -51,9 +70,34 @@ def leverages(graph: Graph) -> Array:
     i, j = e.nodes[use].T
     information = e.information[use]
     residual = relative_pose(graph.poses[i], graph.poses[j], e.measured[use])[0]
-    losses = graph.losses.in_order()
-    of = [losses[code] for code in e.kinds[use].tolist()]
-    s = chi2(residual, information).tolist()
-    w = np.array([loss(int(one.kind), one.scale, v)[1] for one, v in zip(of, s, strict=True)])
+    w = _weights(graph, e.kinds[use], chi2(residual, information))
     out: Array = residual_covs(graph, Marginals(graph)) @ information * w[:, None, None]
     return out
+
+
+def sighting_leverages(live: Live, pose: int, sightings: NDArray[np.int64]) -> Array:
+    """Q W (k, 2, 2) of enabled ``sightings`` (k,), all from one ``pose``; robust weights count."""
+    graph, s = live.graph, live.graph.sightings
+    seen, information = s.nodes[sightings, 1], s.information[sightings]
+    who, at = np.unique(seen, return_inverse=True)
+    joint = live.joint([pose], who)
+    residual, J_x, J_m = pose_landmark(
+        graph.poses[np.full(len(seen), pose)], graph.landmarks[seen], s.measured[sightings]
+    )
+    J = np.concatenate([J_x, J_m], axis=2)
+    rows = np.concatenate(
+        [np.tile(np.arange(3), (len(at), 1)), 3 + 2 * at[:, None] + np.arange(2)], axis=1
+    )
+    Q = J @ joint[rows[:, :, None], rows[:, None, :]] @ np.swapaxes(J, 1, 2)
+    w = _weights(graph, s.kinds[sightings], chi2(residual, information))
+    out: Array = Q @ information * w[:, None, None]
+    return out
+
+
+def _weights(graph: Graph, kinds: NDArray[np.int64], s: Array) -> Array:
+    """What the losses leave of factors (k,) with squared norms ``s`` (k,)."""
+    losses = graph.losses.in_order()
+    of = [losses[code] for code in kinds.tolist()]
+    return np.array(
+        [loss(int(one.kind), one.scale, v)[1] for one, v in zip(of, s.tolist(), strict=True)]
+    )

@@ -6,7 +6,8 @@ from __future__ import annotations
 import math
 import time
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -105,6 +106,9 @@ class BackEnd:
         self._optimized = False
         self._interval: Interval | None = None
         self._since_optimized = 0
+        # what keeps the graph small takes as long as a solve or a closure: each is put off until
+        # a keyframe that had neither, or until the next solve
+        self._chores: deque[Callable[[], None]] = deque()
 
     def _plant_frame(self, survey: Survey | None) -> PlantFrame | None:
         if survey is None:
@@ -153,7 +157,12 @@ class BackEnd:
         due = self._since_optimized >= self._p.back_end.optimize_every
         if due and self._is_behind:
             self.optimize()
-            self.sparsifier.sparsify(self.keyframes, self.path)
+            self.sparsifier.thin()
+            while self._chores:
+                self._chores.popleft()()
+            self._chores.extend((self._sparsify, self._prune))
+        elif self._chores and not closures:
+            self._chores.popleft()()
         return Update(
             key.index,
             self.T_map_local,
@@ -165,6 +174,13 @@ class BackEnd:
             self._gone,
             (time.thread_time() - began[1]) * 1e3,
         )
+
+    def _sparsify(self) -> None:
+        if self.sparsifier.sparsify(self.keyframes, self.path):
+            self.surest_way.keep(self.keyframes)
+
+    def _prune(self) -> None:
+        self.sparsifier.prune(len(self.keyframes))
 
     def _node(self, frame: Frame) -> Keyframe:
         """A new pose, tied to the last one by the relative motion (e^P of eq. 12)."""

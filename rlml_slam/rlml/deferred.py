@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 import numpy as np
 
 from rlml_slam.matching.hypotheses import Hypotheses, Sight
@@ -33,7 +31,6 @@ class DeferredMatches:
     def __init__(self, params: Reflector, reflectors: ReflectorGraph) -> None:
         self._p = params
         self._reflectors = reflectors
-        self._counts: Counter[int] = Counter()
         self._hypotheses: Hypotheses | None = None
 
     @property
@@ -47,7 +44,7 @@ class DeferredMatches:
             self._hypotheses is None
             and self._reflectors.found
             and any(
-                self._counts[key] + _count(groups) >= self._p.min_sightings
+                self._reflectors.count(key) + _count(groups) >= self._p.min_sightings
                 and not self._reflectors.is_mapped(key)
                 for key, groups in interval.sightings.items()
                 if key not in interval.ids
@@ -73,8 +70,8 @@ class DeferredMatches:
         sights = []
         for key, groups in interval.sightings.items():
             known = self._reflectors.resolve(key)
-            self._counts[known] += _count(groups)
-            if self._hypotheses is None or self._counts[known] < self._p.min_sightings:
+            seen = self._reflectors.count(known) + _count(groups)
+            if self._hypotheses is None or seen < self._p.min_sightings:
                 continue
             if known in self._hypotheses or key not in interval.ids:
                 most = max(groups, key=lambda g: g.count)

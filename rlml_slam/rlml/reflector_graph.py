@@ -15,6 +15,7 @@ from rlml_slam.graph.eliminate import Ties, limited
 from rlml_slam.graph.graph import Renumbering
 from rlml_slam.graph.live import Live
 from rlml_slam.graph.marginals import Marginals
+from rlml_slam.graph.prune import prune_sightings
 from rlml_slam.matching.association import gate
 from rlml_slam.params import Reflector
 from rlml_slam.rlml.gone import GoneList
@@ -42,6 +43,7 @@ class ReflectorGraph:
         self._alias: dict[int, int] = {}
         self.gone = GoneList()
         self._given_up: set[int] = set()  # keys that the front end may still have
+        self._most = 0  # sightings that a keyframe came with
         self.changed = False
 
     def resolve(self, key: int) -> int:
@@ -71,6 +73,7 @@ class ReflectorGraph:
                 point = transform(self._graph.poses[pose], s.z[None])[0]
                 landmark.index = self._graph.add_landmark(point)
             self._link_all(landmark)
+        self._most = max(self._most, sum(map(len, interval.sightings.values())))
 
     def _link_all(self, landmark: Landmark) -> None:
         """Give a landmark of the graph the factors that it still lacks."""
@@ -131,6 +134,11 @@ class ReflectorGraph:
         """Whether the reflector has entered the graph."""
         landmark = self._landmarks.get(self.resolve(key))
         return landmark is not None and landmark.index >= 0
+
+    def count(self, key: int) -> int:
+        """How often a reflector was detected, in the graph or not yet."""
+        landmark = self._landmarks.get(self.resolve(key))
+        return 0 if landmark is None else landmark.count
 
     def merge(self, pending: Collection[int] = ()) -> bool:
         """Make one of each pair that is close, statistically equal and never seen together.
@@ -258,6 +266,16 @@ class ReflectorGraph:
             landmark.sightings.keep(~moved & ~beside)
             landmark.sightings.append(_fused(np.concatenate([others, s])))
             self._link_all(landmark)
+
+    def thin(self, pose: int) -> None:
+        """Let go of what a keyframe has taken over beyond what any came with, the least first."""
+        gone = prune_sightings(self._live, pose, self._most)
+        if len(gone):
+            for landmark in self._landmarks.values():
+                rows = landmark.sightings.view
+                left = ~np.isin(rows['factor'], gone)
+                if not left.all():
+                    landmark.sightings.keep(left)
 
     def keep_alive(self) -> NDArray[np.bool_]:
         """Which landmarks of the graph (m,) are a reflector's, not one's that another became."""

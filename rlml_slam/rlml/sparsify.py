@@ -4,16 +4,19 @@
 What the new one knows of its neighbours goes on between these (graph/eliminate.py), its sightings
 are seen from the neighbour it was tied to best, and the place shows its scan instead of the oldest
 one, so that the map keeps up with a hall in which things are moved. Of the edges between those
-that stay, the least telling ones go where there are too many (graph/prune.py).
+that stay, and of the sightings that one of them has taken over, the least telling ones go where
+there are too many (graph/prune.py).
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from rlml_slam import se2
 from rlml_slam.graph.eliminate import Ties, eliminate
+from rlml_slam.graph.graph import Renumbering
 from rlml_slam.graph.live import Live
 from rlml_slam.graph.prune import prune
 from rlml_slam.graph.table import FactorKind
@@ -43,14 +46,13 @@ class Sparsifier:
         self._scans = scans
         self._reflectors = reflectors
         self._judged = 0
+        self._fed: list[Keyframe] = []  # took over sightings, the last time
 
     def sparsify(self, keys: list[Keyframe], path: Path) -> bool:
         """Let go of redundant keyframes, and number the others anew; whether there were any."""
         if not self._p.keyframes_per_place:
             return False
-        end = len(keys) - RECENT
-        needed = self._scans.oldest_active
-        end = end if needed is None else min(end, needed)
+        end = self._end(len(keys))
         poses = self._graph.poses
         covers = self._redundant(poses, [k.scan_stamp for k in keys], end)
         if not covers:
@@ -61,15 +63,10 @@ class Sparsifier:
         before = poses.copy()
         edges, ties = self._eliminate(list(covers))
         self._reflectors.move(ties)
-        self._prune(edges, end)
+        self._fed = [keys[k] for k in sorted({onto for onto, _ in ties.values()})]
         kept = np.ones(len(keys), dtype=np.bool_)
         kept[list(covers)] = False
-        recorded = np.zeros(len(self._graph.edges), dtype=np.bool_)
-        of = [edges.get(k, k) for k in self._scans.edges_of_closures()]
-        recorded[[k for k in of if k >= 0]] = True
-        new = self._live.keep(kept, self._reflectors.keep_alive(), recorded)
-        self._reflectors.renumber(new)
-        self._scans.renumber(new, edges, {k: onto for k, (onto, _) in ties.items()})
+        new = self._keep(kept, edges, {k: onto for k, (onto, _) in ties.items()})
         onto_of = np.full(len(keys), -1)
         onto_of[list(covers)] = list(covers.values())
         path.renumber(before, new.poses, onto_of)
@@ -77,6 +74,45 @@ class Sparsifier:
         for index, key in enumerate(keys):
             key.index = index
         return True
+
+    def thin(self) -> None:
+        """Let go of sightings of keyframes that have taken over more than any ever made itself.
+
+        The graph is to be solved: then the solver's tree tells what each of them is worth.
+        """
+        for key in self._fed:
+            self._reflectors.thin(key.index)
+        self._fed = []
+
+    def prune(self, num: int) -> None:
+        """Let go of edges between the ``num`` keyframes where there are too many."""
+        e = self._graph.edges
+        poses = len(np.unique(e.nodes[e.enabled]))
+        if not self._p.keyframes_per_place or e.enabled.sum() <= EDGES * poses + SPARE:
+            return
+        # odometry keeps the graph in one piece, and the newest ones are not weighed yet
+        may = (e.kinds != FactorKind.ODOMETRY) & (e.nodes < self._end(num)).all(-1)
+        gone = prune(self._graph, may, EDGES * poses)
+        if len(gone):
+            kept = np.ones(num, dtype=np.bool_)
+            self._keep(kept, dict.fromkeys(gone.tolist(), -1), {})
+
+    def _end(self, num: int) -> int:
+        """Index up to which nothing needs the ``num`` keyframes as they are."""
+        needed = self._scans.oldest_active
+        return num - RECENT if needed is None else min(num - RECENT, needed)
+
+    def _keep(
+        self, kept: NDArray[np.bool_], edges: dict[int, int], poses: dict[int, int]
+    ) -> Renumbering:
+        """Let go of all poses but those (n,); edges and poses that go, to what stands for them."""
+        recorded = np.zeros(len(self._graph.edges), dtype=np.bool_)
+        of = [edges.get(k, k) for k in self._scans.edges_of_closures()]
+        recorded[[k for k in of if k >= 0]] = True
+        new = self._live.keep(kept, self._reflectors.keep_alive(), recorded)
+        self._reflectors.renumber(new)
+        self._scans.renumber(new, edges, poses)
+        return new
 
     def _eliminate(self, poses: list[int]) -> tuple[dict[int, int], dict[int, tuple[int, Ties]]]:
         """What each edge of the poses went to, -1 if to none; and each pose, with its tie."""
@@ -100,16 +136,6 @@ class Sparsifier:
         for first, last in reversed(edges.items()):
             edges[first] = edges.get(last, last)
         return edges, ties
-
-    def _prune(self, edges: dict[int, int], end: int) -> None:
-        """Let go of edges before keyframe ``end`` where there are too many; not of odometry."""
-        e = self._graph.edges
-        poses = len(np.unique(e.nodes[e.enabled]))
-        if e.enabled.sum() <= EDGES * poses + SPARE:
-            return
-        may = (e.kinds != FactorKind.ODOMETRY) & (e.nodes < end).all(-1)
-        nothing = dict.fromkeys(prune(self._graph, may, EDGES * poses).tolist(), -1)
-        edges.update({first: nothing.get(last, last) for first, last in edges.items()} | nothing)
 
     def _redundant(self, poses: Array, scan_stamps: list[int], end: int) -> dict[int, int]:
         """Keyframes before ``end`` that are not needed, each with the one whose scan it renews."""

@@ -15,7 +15,7 @@ a bound that is often near, and never the only one (:func:`correction.either`).
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 
 import numpy as np
@@ -82,11 +82,35 @@ class SurestWay:
         self._stamps, self._known = list(self._begun), [self._known[k] for k in at]
         self._num = 0
 
+    def keep(self, keys: Sequence[Keyframe]) -> None:
+        """Let go of what tells nothing of the keyframes that are left, however long it goes on.
+
+        One of these is told of by the last entry up to it, and by the first one after it.
+        """
+        stamps = sorted(key.stamp for key in keys)
+        self._begun = [self._begun[k] for k in _ends(stamps, self._begun)]
+        begun = [self._stamps.index(stamp) for stamp in self._begun]
+        kept = sorted({*_ends(stamps, self._stamps), *begun})
+        self._stamps = [self._stamps[k] for k in kept]
+        self._known = [self._known[k] for k in kept]
+
     def _enter(self, key: Keyframe, cov: Array) -> None:
         known = Known(key.T_local, key.cov_local, turned(cov, key.T_local[2]))
         k = bisect_right(self._stamps, key.stamp)
         self._stamps.insert(k, key.stamp)
         self._known.insert(k, known)
+
+
+def _ends(stamps: Sequence[int], entries: Sequence[int]) -> list[int]:
+    """Of the ``entries`` between each two neighbours of ``stamps``, the first one and the last.
+
+    Both ascend; an entry at one of the ``stamps`` is before it.
+    """
+    gap = [bisect_left(stamps, entry) for entry in entries]
+    last = len(entries) - 1
+    return [
+        k for k, g in enumerate(gap) if k in (0, last) or g != gap[k - 1] or g != gap[k + 1]
+    ]  # fmt: skip
 
 
 def held(sightings: FactorTable, pose: int, until: int) -> bool:

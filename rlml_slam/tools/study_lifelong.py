@@ -9,8 +9,10 @@ how good the poses are.
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import os
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -46,6 +48,7 @@ COLUMNS: dict[str, tuple[str, str]] = {
     'p99_ms': ('p99 [ms]', '.2f'),
     'live_ate_rmse_m': ('live ATE [m]', '.4f'),
 }
+TITLES = ('hours', *(title for title, _ in COLUMNS.values()))
 
 
 def add_parser(subparsers: Any) -> None:
@@ -79,20 +82,36 @@ def run(args: argparse.Namespace) -> int:
          'duration': HOUR * args.hours},
         SimulatorParameters,
     )  # fmt: skip
-    figures = drive(params, simulator, args.seed, args.parts, args.json)
-    print(json.dumps(figures) if args.json else text(figures))
+    if args.json:
+        print(json.dumps(drive(params, simulator, args.seed, args.parts)))
+        return 0
+    print(line(TITLES), flush=True)
+
+    def tell(r: dict[str, Any]) -> None:
+        print(cells(r), flush=True)
+
+    figures = drive(params, simulator, args.seed, args.parts, tell)
+    print(verdict(figures['reflectors']))
     return 0
 
 
 def drive(
-    params: Parameters, simulator: SimulatorParameters, seed: int, parts: int, quiet: bool = True
+    params: Parameters,
+    simulator: SimulatorParameters,
+    seed: int,
+    parts: int,
+    tell: Callable[[dict[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
-    """The whole drive; a dictionary per part, and what became of the reflectors."""
+    """The whole drive; a dictionary per part, and what became of the reflectors.
+
+    Each part is told as soon as it is over, and how far the drive is.
+    """
     rng = np.random.default_rng(seed)
     world = loop_of(load_world(simulator.node.world), rng)
     simulation = Simulation(world, simulator, seed)
     slam = Slam(params)
     warm_up.compile_loaded()
+    gc.freeze()  # as the live nodes do, whose times these stand for
     slam.set_sensor_pose(simulator.node.laser_frame, np.array(simulator.node.laser_pose))
     moved = rng.choice(len(world.reflectors), MOVED, replace=False)
     duration = simulator.node.duration
@@ -100,7 +119,14 @@ def drive(
     errors: list[float] = []
     is_moved = False
     before = resident_mb()
-    with Progress('lifelong', duration, quiet) as progress:
+
+    def end_part(t: float) -> None:
+        rows.append(row(slam, errors, t, before))
+        errors.clear()
+        if tell is not None:
+            tell(rows[-1])
+
+    with Progress('lifelong', duration, tell is None) as progress:
         for event in simulation:
             t = simulation.progress * duration
             if not is_moved and t >= 0.5 * duration:
@@ -122,11 +148,11 @@ def drive(
                 errors.append(float(e[0] ** 2 + e[1] ** 2))
             due = duration * (len(rows) + 1) / parts
             if frames and len(rows) < parts - 1 and t >= due:
-                rows.append(row(slam, errors, t, before))
-                errors = []
-                progress.update(t, f'{rows[-1]["keyframes"]} keyframes')
+                end_part(t)
+            if frames:
+                progress.update(t, f'{len(slam.back_end.keyframes)} keyframes')
     slam.finish()
-    rows.append(row(slam, errors, duration, before))
+    end_part(duration)
     return {'parts': rows, 'reflectors': judge(slam, world, simulation.world, moved)}
 
 
@@ -244,22 +270,24 @@ def judge(slam: Slam, before: World, after: World, moved: NDArray[np.int64]) -> 
     }
 
 
-def text(figures: dict[str, Any]) -> str:
-    """The figures for people."""
-    names = ['hours', *(title for title, _ in COLUMNS.values())]
-    cells = [names]
-    for r in figures['parts']:
-        cells.append([f'{r["hours"]:.2f}', *(f'{r[k]:{f}}' for k, (_, f) in COLUMNS.items())])
-    widths = [max(len(c[k]) for c in cells) for k in range(len(names))]
-    lines = ['  '.join(f'{c:>{w}}' for c, w in zip(r, widths, strict=True)) for r in cells]
-    r = figures['reflectors']
+def line(words: Sequence[str]) -> str:
+    """A line of the table; no figure is wider than its title."""
+    return '  '.join(f'{w:>{len(t)}}' for w, t in zip(words, TITLES, strict=True))
+
+
+def cells(r: dict[str, Any]) -> str:
+    """A row of the table."""
+    return line([f'{r["hours"]:.2f}', *(f'{r[k]:{f}}' for k, (_, f) in COLUMNS.items())])
+
+
+def verdict(r: dict[str, Any]) -> str:
+    """What became of the reflectors, for people."""
     off = r['unmoved_rmse_m']
     by = '' if off is None else f', off by {100 * off:.1f} cm'
-    lines.append(
+    return (
         f'{r["unmoved_mapped"]} of {r["unmoved"]} reflectors that stayed are in the map{by}; '
         f'{r["moved_learned_anew"]} of {r["moved"]} that were '
         f'moved are there anew, {r["moved_told"]} told to be moved, '
         f'{r["moved_still_at_old_place"]} still where they were; {r["mapped"]} in all, '
         f'{r["unmoved_told_to_be_there"]} of those that stayed without a change'
     )
-    return '\n'.join(lines)

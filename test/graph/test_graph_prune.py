@@ -9,10 +9,17 @@ from made_graphs import loop_graph
 from scipy import sparse
 
 from rlml_slam import se2
-from rlml_slam.graph.factors import relative_pose
+from rlml_slam.graph.factors import pose_landmark, relative_pose
 from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.live import Live
 from rlml_slam.graph.marginals import Marginals
-from rlml_slam.graph.prune import AT_ONCE, leverages, prune
+from rlml_slam.graph.prune import (
+    AT_ONCE,
+    leverages,
+    prune,
+    prune_sightings,
+    sighting_leverages,
+)
 from rlml_slam.graph.robust import Loss, Losses, LossKind
 from rlml_slam.types import EdgeKind
 
@@ -131,3 +138,62 @@ def test_no_edge_goes_that_may_not_or_is_not_too_many():
     assert len(gone) == 5
     assert gone.max() < 100
     assert graph.edges.enabled.sum() == len(may) - 5
+
+
+def with_reflectors(rng, landmarks=12, sightings=30):
+    """A crowd whose pose 5 has seen a lot, some twice, by measurements of different worth."""
+    graph = crowd(rng, 20, 60)
+    graph.add_landmarks(rng.uniform(-5.0, 5.0, (landmarks, 2)))
+    for k in range(landmarks):
+        for pose in rng.choice(20, 3, replace=False):
+            see(graph, rng, pose, k)
+    for _ in range(sightings):
+        see(graph, rng, 5, rng.integers(landmarks))
+    return graph
+
+
+def see(graph, rng, pose, k):
+    z = pose_landmark(graph.poses[pose], graph.landmarks[k], np.zeros(2))[0]
+    graph.add_sighting(pose, k, z, 10.0 ** rng.uniform(0.0, 4.0) * np.eye(2))
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_leverage_of_a_sighting_is_the_share_that_it_has_in_what_is_known(seed):
+    graph = with_reflectors(np.random.default_rng(seed))
+    s = graph.sightings
+    use = np.flatnonzero(s.nodes[:, 0] == 5)
+    h = sighting_leverages(Live(graph), 5, use)
+    marginals = Marginals(graph)
+    for row, k in zip(use, s.nodes[use, 1], strict=True):
+        _, J_x, J_m = pose_landmark(graph.poses[5], graph.landmarks[k], s.measured[row])
+        J = np.hstack([J_x, J_m])
+        expected = J @ marginals.joint([5], [k]) @ J.T @ s.information[row]
+        np.testing.assert_allclose(h[row == use][0], expected, rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_sightings_that_go_make_nothing_surer_and_take_less_than_their_share(seed):
+    graph = with_reflectors(np.random.default_rng(seed))
+    live, s = Live(graph), graph.sightings
+    others = s.nodes[:, 0] != 5
+    num = int(np.sum(~others))
+    before = Marginals(graph).joint(np.arange(1, 20), np.arange(12))
+    gone = prune_sightings(live, 5, num - 6)
+    after = Marginals(graph).joint(np.arange(1, 20), np.arange(12))
+    assert 0 < len(gone) <= 6
+    assert s.enabled[others].all()
+    assert not s.enabled[gone].any()
+    scale = np.sqrt(np.diag(before))
+    assert np.linalg.eigvalsh((after - before) / np.outer(scale, scale)).min() > -1e-9
+    # what goes has less than AT_ONCE of a sighting together: det(1 - sum h) bounds the growth
+    assert np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1] < 2.0 * np.log(2.0)
+
+
+def test_the_only_sightings_of_a_reflector_stay():
+    graph = with_reflectors(np.random.default_rng(1))
+    live, alone = Live(graph), graph.add_landmark([3.0, 3.0])
+    see(graph, np.random.default_rng(0), 5, alone)
+    while len(prune_sightings(live, 5, 0)):
+        pass
+    s = graph.sightings
+    assert s.enabled[s.nodes[:, 1] == alone].all()

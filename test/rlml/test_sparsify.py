@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import copy
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -97,6 +98,36 @@ def test_what_closures_leave_behind_does_not_grow_with_the_laps():
     assert len(accepted) == len(set(accepted))
 
 
+def test_nothing_that_is_kept_grows_with_the_laps():
+    """Sightings, edges, records, and all there is together, once the place is mapped."""
+    laps = 15
+    path = drive(*ROUND * laps, start=START)
+    observed = observations(SQUARE, path, rng=np.random.default_rng(0))
+    parameters = replace(
+        params(path_frames=1000),
+        node=replace(Parameters().node, map_start_pose=START),
+        loop_closure=LoopClosure(max_distance=4.0),
+    )
+    front_end, back_end = FrontEnd(parameters), BackEnd(parameters)
+    sizes = []
+    for k, o in enumerate(observed):
+        update = back_end.add(front_end.process(o))
+        if update is not None and update.optimized:
+            front_end.correct(update.T_map_local)
+        if (k + 1) % (len(observed) // laps) == 0:
+            graph, way = back_end.graph, back_end.surest_way
+            sizes.append(
+                (len(back_end.keyframes), len(graph.edges), len(graph.sightings),
+                 len(back_end.scans.closures), len(way._stamps), len(pickle.dumps(back_end)))
+            )  # fmt: skip
+    assert back_end.scans.tried[True] > 20
+    early, late = np.array(sizes[8:11]), np.array(sizes[-4:])
+    # keyframes that wait to be judged, and columns that double, are a few more or less
+    assert (late.max(axis=0) <= 1.1 * early.max(axis=0)).all(), sizes
+    # as many sightings as keyframes come with, at the most
+    assert sizes[-1][2] <= len(SQUARE.reflectors) * sizes[-1][0]
+
+
 def test_every_frame_keeps_its_pose(runs):
     path, few, _, all_, _ = runs
     for back_end in (few, all_):
@@ -182,6 +213,35 @@ def test_frames_of_a_keyframe_that_goes_stay_where_they_are():
     np.testing.assert_allclose(
         path.poses(moved), se2.compose(np.array([1.0, -2.0, 0.7]), before), atol=1e-9
     )
+
+
+@pytest.mark.parametrize('limit', [60, 1000])
+def test_path_is_the_same_however_late_anyone_asks_for_it(limit):
+    """Frames hang on keyframes that have gone, one after the other, until they are looked for."""
+    rng = np.random.default_rng(5)
+    lazy, eager = Path(limit), Path(limit)
+    keys, local = np.zeros((0, 3)), np.zeros(3)
+    for k in range(40):
+        if k:
+            motion = rng.uniform(-0.5, 0.5, 3)
+            local = se2.compose(local, motion)
+            for path in (lazy, eager):
+                path.begin_keyframe(motion)
+        keys = np.vstack([keys, local + 0.05 * rng.standard_normal(3)])
+        for n in range(4):
+            for path in (lazy, eager):
+                path.add(10 * k + n, 0.1 * n * np.ones(3))
+        if k % 4 == 3:
+            gone = rng.choice(np.arange(1, len(keys) - 1), min(3, len(keys) - 3), replace=False)
+            left = np.setdiff1d(np.arange(len(keys)), gone)
+            new, onto = np.full(len(keys), -1), np.full(len(keys), -1)
+            new[left], onto[gone] = np.arange(len(left)), rng.choice(left, len(gone))
+            for path in (lazy, eager):
+                path.renumber(keys, new, onto)
+            keys = keys[left]
+            eager.poses(keys)
+    np.testing.assert_array_equal(lazy.stamps(), eager.stamps())
+    np.testing.assert_allclose(lazy.poses(keys), eager.poses(keys), atol=1e-9)
 
 
 def test_room_is_mapped_the_same_where_no_place_is_full():

@@ -128,6 +128,30 @@ def test_place_found_anew_counts_for_what_comes_after_it_alone():
     assert_allclose(way.cov(keys[15]), found, atol=1e-12)
 
 
+def test_letting_go_of_keyframes_changes_nothing_for_those_that_stay():
+    rng = np.random.default_rng(3)
+    keys = chain(8 * STEPS)
+    graph, way = graph_of(keys), SurestWay()
+    way.begin(keys[40])
+    pairs = [np.sort(rng.choice(len(keys), 2, replace=False)) for _ in range(150)]
+    pairs.sort(key=lambda pair: pair[1])
+    delta = [se2.between(keys[i].T_local, keys[j].T_local) for i, j in pairs]
+    closures = [closure(graph, n, *pairs[n], delta[n], MATCH) for n in range(150)]
+    way.close(closures, keys, graph.edges)
+    kept = [key for key in keys if key.index % 25 == 0]
+    before = [way.cov(key) for key in kept]
+    way.keep(kept)
+    for key, cov in zip(kept, before, strict=True):
+        np.testing.assert_array_equal(way.cov(key), cov)
+    # two between each two that stay, and what began there
+    assert len(way._stamps) <= 2 * len(kept) + 1
+    way.forget()
+    again = SurestWay()
+    again.begin(keys[40])
+    for key in kept:
+        np.testing.assert_array_equal(way.cov(key), again.cov(key))
+
+
 def test_two_reflectors_hold_a_pose_to_those_that_saw_them_and_one_does_not():
     graph = Graph()
     for x in range(5):

@@ -32,7 +32,14 @@ def test_short_drive_has_a_row_per_part(capsys):
     assert last['live_ate_rmse_m'] < 0.05
     assert figures['reflectors']['mapped'] > 0
     assert figures['reflectors']['unmoved_rmse_m'] < 0.05
-    assert len(study.text(figures).splitlines()) == 4
+
+
+def test_each_part_is_told_when_it_is_over(capsys):
+    assert main(['study', 'lifelong', '--hours', '0.006', '--parts', '2']) == 0
+    title, first, last, end = capsys.readouterr().out.splitlines()
+    assert len(first) == len(last) == len(title)
+    assert float(first.split()[0]) < float(last.split()[0])
+    assert 'reflectors that stayed' in end
 
 
 def test_no_time_is_refused(capsys):
