@@ -14,6 +14,7 @@ from rclpy.exceptions import InvalidNodeNameException, NameValidationException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
 from rlml_slam.errors import RlmlError
+from rlml_slam.ros.memory import keep_large_apart
 
 
 def run(*factories: Callable[[], Any]) -> int:
@@ -21,6 +22,7 @@ def run(*factories: Callable[[], Any]) -> int:
 
     A node ends the run by raising SystemExit in a callback. SIGINT and SIGTERM end it with 0.
     """
+    keep_large_apart()
     try:
         rclpy.init(args=sys.argv)
     except RCLError as e:

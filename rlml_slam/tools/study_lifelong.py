@@ -23,6 +23,7 @@ from rlml_slam import se2, warm_up
 from rlml_slam.errors import ParameterError
 from rlml_slam.params import Parameters, SimulatorParameters, from_mapping
 from rlml_slam.rlml.slam import Slam
+from rlml_slam.ros.memory import keep_large_apart
 from rlml_slam.se2 import Array
 from rlml_slam.simulation.ray_cast import cast
 from rlml_slam.simulation.simulation import GroundTruth, Simulation
@@ -106,12 +107,13 @@ def drive(
 
     Each part is told as soon as it is over, and how far the drive is.
     """
+    keep_large_apart()
     rng = np.random.default_rng(seed)
     world = loop_of(load_world(simulator.node.world), rng)
     simulation = Simulation(world, simulator, seed)
     slam = Slam(params)
     warm_up.compile_loaded()
-    gc.freeze()  # as the live nodes do, whose times these stand for
+    gc.freeze()  # as the live nodes do (ros/run.py), for which these figures stand
     slam.set_sensor_pose(simulator.node.laser_frame, np.array(simulator.node.laser_pose))
     moved = rng.choice(len(world.reflectors), MOVED, replace=False)
     duration = simulator.node.duration

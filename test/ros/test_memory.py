@@ -23,12 +23,41 @@ print(before - resident())
 """
 
 
-@pytest.mark.skipif(memory._TRIM is None, reason='no glibc')
+# large blocks between small ones that stay, after one that lets glibc raise its limits
+BETWEEN = """
+import os
+from rlml_slam.ros.memory import keep_large_apart
+def resident():
+    with open('/proc/self/statm') as f:
+        return int(f.read().split()[1]) * os.sysconf('SC_PAGESIZE')
+if {apart}:
+    keep_large_apart()
+bytes([1]) * 30_000_000
+pairs = [(bytes([1]) * 1_000_000, bytes([1]) * 60_000) for _ in range(100)]
+before = resident()
+small = [b for _, b in pairs]
+del pairs
+print(before - resident())
+"""
+
+
+def given_back(program):
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, check=True)
+    return int(done.stdout)
+
+
+@pytest.mark.skipif(memory._GLIBC is None, reason='no glibc')
 def test_free_memory_is_given_back():
-    done = subprocess.run([sys.executable, '-c', PROGRAM], capture_output=True, check=True)
-    assert int(done.stdout) > 50_000_000  # of 120 MB
+    assert given_back(PROGRAM) > 50_000_000  # of 120 MB
+
+
+@pytest.mark.skipif(memory._GLIBC is None, reason='no glibc')
+def test_large_arrays_are_given_back_whatever_stays_between_them():
+    assert given_back(BETWEEN.format(apart=True)) > 90_000_000  # of 100 MB
+    assert given_back(BETWEEN.format(apart=False)) < 50_000_000
 
 
 def test_without_glibc_nothing_happens(monkeypatch):
-    monkeypatch.setattr(memory, '_TRIM', None)
+    monkeypatch.setattr(memory, '_GLIBC', None)
     memory.give_back()
+    memory.keep_large_apart()
