@@ -18,6 +18,7 @@ MAX_GAP = 0.6  # [m] wider gaps between neighbours are not filled
 BEND = 0.1  # slope of the next neighbour off the line, up to which it is one surface
 ROUGHNESS = 0.03  # [m] scatter of end points across a surface
 REACH = 3  # neighbours on each side that tell the surface
+WIDE = 9  # as many where the former are too close together to tell
 MAX_STEP = 1.0  # [m] neighbours farther apart are not of one surface
 FLAT = 0.02  # variance across per variance along, below which neighbours are a line
 
@@ -77,25 +78,31 @@ def constraints(points: Array) -> Array:
         joined[k] = dx * dx + dy * dy < MAX_STEP * MAX_STEP
     for k in range(n):
         first = last = k
-        while first > 0 and k - first < REACH and joined[first - 1]:
-            first -= 1
-        while last - k < REACH and joined[last]:
-            last += 1
-        m = last - first + 1
+        for reach in (REACH, WIDE):
+            while first > 0 and k - first < reach and joined[first - 1]:
+                first -= 1
+            while last < n - 1 and last - k < reach and joined[last]:
+                last += 1
+            m = last - first + 1
+            sx = sy = sxx = sxy = syy = 0.0
+            for q in range(first, last + 1):
+                x, y = points[q, 0] - points[k, 0], points[q, 1] - points[k, 1]
+                sx += x
+                sy += y
+                sxx += x * x
+                sxy += x * y
+                syy += y * y
+            sxx, sxy, syy = (
+                (sxx - sx * sx / m) / m, (sxy - sx * sy / m) / m, (syy - sy * sy / m) / m
+            )  # fmt: skip
+            mean, half = 0.5 * (sxx + syy), 0.5 * (sxx - syy)
+            root = np.sqrt(half * half + sxy * sxy)
+            across, along = mean - root, mean + root
+            # close together, points on a wall scatter across it as much as along
+            if across >= ROUGHNESS * ROUGHNESS or across < FLAT * along:
+                break
         if m < 4:
             continue
-        sx = sy = sxx = sxy = syy = 0.0
-        for q in range(first, last + 1):
-            x, y = points[q, 0] - points[k, 0], points[q, 1] - points[k, 1]
-            sx += x
-            sy += y
-            sxx += x * x
-            sxy += x * y
-            syy += y * y
-        sxx, sxy, syy = (sxx - sx * sx / m) / m, (sxy - sx * sy / m) / m, (syy - sy * sy / m) / m
-        mean, half = 0.5 * (sxx + syy), 0.5 * (sxx - syy)
-        root = np.sqrt(half * half + sxy * sxy)
-        across, along = mean - root, mean + root
         if across < ROUGHNESS * ROUGHNESS and across < FLAT * along:
             # the normal's outer product, from the double angle of the surface
             c, s = half / root, sxy / root

@@ -17,6 +17,7 @@ from rlml_slam.rlml.doubt import Doubt
 from rlml_slam.rlml.free_sweep import Sweep, deskewed
 from rlml_slam.rlml.health import Evidence, ends_of, weak_direction
 from rlml_slam.rlml.joint_state import JointState
+from rlml_slam.rlml.open_direction import OpenDirection
 from rlml_slam.rlml.scan_update import fuse, prior_of
 from rlml_slam.rlml.second_look import AS_USUAL, TURN, second_look
 from rlml_slam.rlml.submaps import Submaps
@@ -43,6 +44,7 @@ class ScanTerm:
         """Forget the submaps: the robot is somewhere else."""
         self.submaps = Submaps(self._p.submap)
         self.doubt = Doubt(self._p.health)
+        self._open = OpenDirection()
         self._last_fit = 0
 
     def deskewed(self, observation: Observation) -> tuple[Observation, Sweep]:
@@ -70,8 +72,10 @@ class ScanTerm:
 
     def _information(self, submap: Submap, points: Array, found: ScanMatchResult) -> Array:
         """What a match is worth (3, 3)."""
-        alone = None if self.has_odometry else found.information
-        return observability.information(submap, points, found.pose, self._p.scan_match, alone)
+        alone = not self.has_odometry
+        p = self._p.scan_match
+        information = observability.information(submap, points, found.pose, p, alone)
+        return self._open.cleared(information, float(self._state.anchor(0)[2]))
 
     def _fuse(
         self, state: JointState, found: ScanMatchResult, information: Array, sweep: Sweep

@@ -110,3 +110,25 @@ def test_patch_that_faces_the_laser_does_not_tell_the_heading():
     assert np.linalg.eigvalsh(info).min() > -1e-9 * np.trace(info)
     assert info[0, 0] > 0.0
     assert info[2, 2] < 0.01 * info[0, 0]
+
+
+def test_bare_walls_tell_a_robot_alone_with_its_scans_nothing_along_them():
+    submap = Submap()
+    rng = np.random.default_rng(3)
+    for _ in range(12):
+        submap.insert(CORRIDOR + 0.01 * rng.standard_normal(CORRIDOR.shape), np.zeros(2))
+    for _ in range(50):
+        seen = CORRIDOR + 0.01 * rng.standard_normal(CORRIDOR.shape)
+        info = information(submap, seen, np.zeros(3), PARAMS, alone=True)
+        assert np.linalg.eigvalsh(info)[0] < 1e-6
+
+
+def test_few_beams_on_the_end_of_a_corridor_hold_a_robot_alone_with_its_scans():
+    end = wall((8.0, -1.0), (8.0, 1.0), spacing=0.25)
+    scan = np.vstack([CORRIDOR[len(CORRIDOR) // 2 :], end, CORRIDOR[: len(CORRIDOR) // 2]])
+    submap = Submap()
+    for _ in range(12):
+        submap.insert(scan, np.zeros(2))
+    alone = information(submap, scan, np.zeros(3), PARAMS, alone=True)
+    assert alone[0, 0] > 1.0 / 0.03**2
+    assert np.linalg.eigvalsh(information(submap, scan, np.zeros(3), PARAMS))[0] < 1e-6

@@ -51,3 +51,11 @@ def test_gap_is_filled_at_the_spacing():
 )
 def test_what_is_no_gap_in_a_wall_is_not_filled(points):
     np.testing.assert_array_equal(fill(points, 0.05), points)
+
+
+def test_noise_of_points_close_together_makes_no_clutter_of_a_wall():
+    rng = np.random.default_rng(0)
+    wall = np.stack([0.05 * np.arange(400), 1.2 + 0.01 * rng.standard_normal(400)], -1)
+    held = constraints(wall)[10:-10]
+    assert (held[:, 0] < 0.1).all()
+    np.testing.assert_allclose(held[:, 0] + held[:, 2], 1.0, atol=1e-12)
