@@ -70,9 +70,7 @@ class Sparsifier:
         onto_of = np.full(len(keys), -1)
         onto_of[list(covers)] = list(covers.values())
         path.renumber(before, new.poses, onto_of)
-        keys[:] = [k for k in keys if kept[k.index]]
-        for index, key in enumerate(keys):
-            key.index = index
+        keys[:] = remaining(keys, kept)
         return True
 
     def thin(self) -> None:
@@ -159,3 +157,18 @@ class Sparsifier:
                 scan_stamps[out[k]] = scan_stamps[k]
             self._judged += k not in out  # by the number that it will have
         return out
+
+
+def remaining(keys: list[Keyframe], kept: NDArray[np.bool_]) -> list[Keyframe]:
+    """The keyframes that are ``kept`` (n,), with their new numbers.
+
+    No motion leads over one that jumped to the next one, either.
+    """
+    out: list[Keyframe] = []
+    jumped = False
+    for key, stays in zip(keys, kept.tolist(), strict=True):
+        jumped |= key.jumped
+        if stays:
+            key.index, key.jumped, jumped = len(out), jumped, False
+            out.append(key)
+    return out

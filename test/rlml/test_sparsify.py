@@ -14,8 +14,9 @@ from rlml_slam.params import BackEnd as BackEndParameters
 from rlml_slam.params import LoopClosure, Parameters
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.front_end import FrontEnd
+from rlml_slam.rlml.keyframes import Keyframe
 from rlml_slam.rlml.path import Path
-from rlml_slam.rlml.sparsify import EDGES, SPARE
+from rlml_slam.rlml.sparsify import EDGES, SPARE, remaining
 
 LAPS = 5
 ROUND = [(0.8, 0.0, 3.0), (0.8, np.pi / 2, 1.0)] * 4
@@ -287,3 +288,14 @@ def test_estimate_is_that_of_the_batch_solver_all_along_a_drive(seed):
     assert solved > 10
     assert sparsified > 3
     assert any(c.accepted for c in back_end.scans.closures)
+
+
+def test_jump_is_not_forgotten_with_the_keyframe_that_it_led_to():
+    jumped = np.array([0, 0, 1, 0, 1, 0, 0], dtype=bool)
+    kept = np.array([1, 1, 0, 0, 0, 1, 1], dtype=bool)
+    zero = np.zeros(3)
+    keys = [Keyframe(k, k, zero, np.eye(3), None, None, k, jumped=j) for k, j in enumerate(jumped)]
+    left = remaining(keys, kept)
+    assert [k.stamp for k in left] == [0, 1, 5, 6]
+    assert [k.index for k in left] == [0, 1, 2, 3]
+    assert [k.jumped for k in left] == [False, False, True, False]
