@@ -293,7 +293,8 @@ class BackEnd:
         self.live.solve()
         self._optimized = True
         self._since_optimized = 0
-        self.scans.changed = self.reflector_graph.changed = False
+        self.scans.solved()
+        self.reflector_graph.changed = False
         last = self.keyframes[-1]
         self.T_map_local = se2.compose(self.graph.poses[last.index], se2.inverse(last.T_local))
         self.known = self._known()

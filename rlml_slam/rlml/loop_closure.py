@@ -68,6 +68,7 @@ class ScanGraph:
         self.closures: list[Closure] = []
         self.tried = {True: 0, False: 0}
         self.changed = False
+        self._solved = 0  # closures below this number are in the estimate
 
     def add(self, key: Keyframe) -> tuple[Closure, ...]:
         """Tie a keyframe to the submaps being built, insert it, look for closures."""
@@ -178,6 +179,14 @@ class ScanGraph:
         """Of those that were accepted."""
         return [c.edge for c in self.closures if c.accepted]
 
+    def solved(self) -> None:
+        """The estimate has all that is in the graph now."""
+        self.changed, self._solved = False, self._accepted
+
+    def unsolved(self) -> list[int]:
+        """Edges of the closures that came since: where the estimate is, they count for little."""
+        return [c.edge for c in self.closures if c.accepted and c.number >= self._solved]
+
     def take_over(self, pose: int, onto: Keyframe) -> None:
         """Keyframe ``pose`` goes: let submaps that stand on it stand on another one."""
         for m in self._finished:
@@ -283,6 +292,7 @@ class ScanGraph:
         ]  # fmt: skip
         self._note_failed()
         self._accepted = max((c.number for c in self.closures), default=-1) + 1
+        self._solved = self._accepted
         rejected, accepted = a['closures_tried'].tolist()
         self.tried = {True: accepted, False: rejected}
 

@@ -340,6 +340,8 @@ class ReflectorGraph:
         for key, x, y, hits, misses in a.get('reflector_view', np.zeros(0, VIEW)).tolist():
             self._landmarks[key].views[x, y] = hits, misses
         self._alias = dict(a['reflector_alias'].tolist())
+        # those that took over more than they came with were thinned to what one came with
+        self._most = int(np.bincount(a['sighting']['pose'], minlength=1).max())
 
     @property
     def next_key(self) -> int:

@@ -63,7 +63,7 @@ class Sparsifier:
         before = poses.copy()
         edges, ties = self._eliminate(list(covers))
         self._reflectors.move(ties)
-        self._fed = [keys[k] for k in sorted({onto for onto, _ in ties.values()})]
+        fed = [*self._fed, *(keys[k] for k in sorted({onto for onto, _ in ties.values()}))]
         kept = np.ones(len(keys), dtype=np.bool_)
         kept[list(covers)] = False
         new = self._keep(kept, edges, {k: onto for k, (onto, _) in ties.items()})
@@ -71,6 +71,8 @@ class Sparsifier:
         onto_of[list(covers)] = list(covers.values())
         path.renumber(before, new.poses, onto_of)
         keys[:] = remaining(keys, kept)
+        here = set(keys)
+        self._fed = [key for key in dict.fromkeys(fed) if key in here]
         return True
 
     def thin(self) -> None:
@@ -90,6 +92,7 @@ class Sparsifier:
             return
         # odometry keeps the graph in one piece, and the newest ones are not weighed yet
         may = (e.kinds != FactorKind.ODOMETRY) & (e.nodes < self._end(num)).all(-1)
+        may[self._scans.unsolved()] = False
         gone = prune(self._graph, may, EDGES * poses)
         if len(gone):
             kept = np.ones(num, dtype=np.bool_)
@@ -141,11 +144,14 @@ class Sparsifier:
         out: dict[int, int] = {}
         if end <= self._judged:
             return out
+        fresh = set(self._graph.edges.nodes[self._scans.unsolved()].ravel().tolist())
         near = cKDTree(poses[:end, :2]).query_ball_point(
             poses[self._judged : end, :2], p.place_distance
         )
         for k, others in enumerate(near, self._judged):
             if len(out) > p.optimize_every:  # more than come meanwhile, so that none waits long
+                break
+            if k in fresh:  # its neighbours are to be told of those closures as the solve has them
                 break
             turns = np.abs(se2.wrap(poses[others, 2] - poses[k, 2]))
             same = [

@@ -116,9 +116,10 @@ def _ends(stamps: Sequence[int], entries: Sequence[int]) -> list[int]:
 def held(sightings: FactorTable, pose: int, until: int) -> bool:
     """Whether reflectors seen at a pose of the graph hold it: two, in all three directions.
 
-    Poses up to ``until`` have to have seen these as well, else they tie it to nothing else. What
-    they tell does not pass through the wheels, so no way by these need be asked then.
+    Poses before it, up to ``until``, have to have seen these as well, else they tie it to nothing
+    else. What they tell does not pass through the wheels, so no way by these need be asked then.
     """
+    until = min(until, pose - 1)
     poses, landmarks = sightings.nodes[sightings.enabled].T
     return len(np.intersect1d(landmarks[poses == pose], landmarks[poses <= until])) >= 2
 

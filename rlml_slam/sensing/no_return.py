@@ -37,7 +37,7 @@ class NoReturns:
         """The scan with NaN where there is no return, zero being none; itself if there is all."""
         r = scan.ranges
         codes = self._codes.setdefault(scan.frame_id, [])
-        enough = max(FEWEST, math.ceil(ARC / abs(scan.angle_increment)))
+        enough = max(FEWEST, math.ceil(ARC / max(abs(scan.angle_increment), 1e-9)))
         while True:
             arc, none, beyond = _arc(r, np.array(codes), scan.range_min, scan.range_max, enough)
             codes[:] = [code for code, n in zip(codes, beyond.tolist(), strict=True) if n < FEWEST]

@@ -100,6 +100,17 @@ def test_a_jump_is_one_in_the_saved_map_as_well(saved):
     assert again.surest_way.newest == keys[6].stamp
 
 
+def test_saved_map_keeps_its_sightings_whatever_comes_after(saved):
+    """A session that sees fewer reflectors does not thin what the one before saw."""
+    again = BackEnd(PARAMS)
+    stored_map.restore(stored_map.load(saved), again)
+    again.live.solve()
+    before = int(again.graph.sightings.enabled.sum())
+    for key in again.keyframes:
+        again.reflector_graph.thin(key.index)
+    assert int(again.graph.sightings.enabled.sum()) == before > 0
+
+
 def test_two_saves_are_equal_files(mapped, saved, tmp_path):
     other = stored_map.save(tmp_path / 'other.rlml', mapped.back_end, PARAMS)
     assert other.read_bytes() == saved.read_bytes()

@@ -164,8 +164,11 @@ def test_two_reflectors_hold_a_pose_to_those_that_saw_them_and_one_does_not():
     assert not held(graph.sightings, 1, 0)
     assert not held(graph.sightings, 3, 1)  # ``far`` is new since then
     assert held(graph.sightings, 3, 2)
+    assert held(graph.sightings, 3, 3)
+    graph.add_sighting(2, near, [1.0, 2.0], np.eye(2))
+    assert not held(graph.sightings, 2, 2)  # which saw ``far`` first
     assert held(graph.sightings, 4, 3)
-    graph.sightings.enabled[-1] = False
+    graph.sightings.enabled[graph.sightings.nodes[:, 0] == 4] = False
     assert not held(graph.sightings, 4, 3)
 
 
