@@ -17,9 +17,8 @@ from rlml_slam.compiled import kernel, part
 from rlml_slam.graph.structure import Ints, Records
 from rlml_slam.se2 import Array
 
-LINE = (
-    64  # bytes of a line of the cache; records are whole ones, so that few have to be waited for
-)
+# bytes of a line of the cache; records are whole ones, so that few have to be waited for
+LINE = 64
 
 # An unknown pose or landmark (``size`` 3 or 2) at ``index`` of its table. The estimate is x, y,
 # theta + d; ``s`` is the d that the cliques below know; ``moved`` is the last step that moved it.

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.compiled import kernel, part
-from rlml_slam.matching.scan_match import INLIER, downward, sample_curved
+from rlml_slam.matching.scan_match import INLIER, downward, sample, sample_curved
 from rlml_slam.matching.submap import Submap
 from rlml_slam.matching.surfaces import MAX_STEP
 from rlml_slam.params import ScanMatch
@@ -54,10 +54,8 @@ def _accumulate(
     for k in range(n):
         px, py = points[k, 0], points[k, 1]
         rx, ry = c * px - s * py, s * px + c * py
-        m, m_u, m_v, m_uu, m_uv, m_vv = sample_curved(
-            values, (pose[0] + rx) * scale - corner_j, (pose[1] + ry) * scale - corner_i
-        )
-        if m < INLIER:
+        column, row = (pose[0] + rx) * scale - corner_j, (pose[1] + ry) * scale - corner_i
+        if sample(values, column, row)[0] < INLIER:
             continue
         first, last = max(0, k - WINDOW), min(n, k + WINDOW + 1)
         count, sxx, sxy, syy = _scatter(points, k, first, last, REACH)
@@ -85,7 +83,7 @@ def _accumulate(
         is_round, ux, uy = True, 1.0, 0.0
         if sparse and not flat:
             # as a match has it: across a wall of the submap, whatever stands before it
-            is_round, ux, uy = _grip(1.0 - m, m_u, m_v, m_uu, m_uv, m_vv)
+            is_round, ux, uy = _grip(values, column, row)
         for axis in range(2):
             if axis == 0 and flat:
                 ax, ay, weight = c * nx - s * ny, s * nx + c * ny, 1.0
@@ -125,11 +123,11 @@ def _scatter(
 
 
 @part
-def _grip(
-    e: float, m_u: float, m_v: float, m_uu: float, m_uv: float, m_vv: float
-) -> tuple[bool, float, float]:
+def _grip(values: NDArray[np.uint16], column: float, row: float) -> tuple[bool, float, float]:
     """Whether the submap holds an end point in all directions, and in which (2,) most of all."""
+    m, m_u, m_v, m_uu, m_uv, m_vv = sample_curved(values, column, row)
     a, b, d = downward(m_uu, m_uv, m_vv)
+    e = 1.0 - m
     a, b, d = m_u * m_u + e * a, m_u * m_v + e * b, m_v * m_v + e * d
     mean, half = 0.5 * (a + d), 0.5 * (a - d)
     root = math.sqrt(half * half + b * b)

@@ -323,8 +323,8 @@ class BackEnd:
         enabled = self.graph.edges.enabled
         if not any(c.accepted and enabled[c.edge] for c in self.scans.closures):
             return False
-        stamps = [k.stamp for k in self.keyframes]
-        until = bisect_right(stamps, self.surest_way.newest) - 1
+        newest = self.surest_way.newest
+        until = bisect_right(self.keyframes, newest, key=lambda k: k.stamp) - 1
         return held(self.graph.sightings, key.index, until)
 
     def revoke(self, number: int) -> Closure:

@@ -34,14 +34,20 @@ def params(**values):
     return Parameters(back_end=BackEndParameters(**few))
 
 
-def mapped(observed, parameters):
-    """A front end and a back end, and the number of keyframes at the end of each lap."""
+def driven(observed, parameters):
+    """After each observation: its number, the back end, and the update where there was one."""
     front_end, back_end = FrontEnd(parameters), BackEnd(parameters)
-    counts = []
     for k, o in enumerate(observed):
         update = back_end.add(front_end.process(o))
         if update is not None and update.optimized:
             front_end.correct(update.T_map_local)
+        yield k, back_end, update
+
+
+def mapped(observed, parameters):
+    """A back end, and the number of keyframes at the end of each lap."""
+    counts = []
+    for k, back_end, _ in driven(observed, parameters):
         if (k + 1) % (len(observed) // LAPS) == 0:
             counts.append(len(back_end.keyframes))
     back_end.finish()
@@ -77,15 +83,12 @@ def test_what_closures_leave_behind_does_not_grow_with_the_laps():
     parameters = replace(
         params(), node=replace(Parameters().node, map_start_pose=START), loop_closure=closes
     )
-    front_end, back_end = FrontEnd(parameters), BackEnd(parameters)
     keys, rows, records, tried = [], [], [], []
     fresh = set()
-    for k, o in enumerate(observed):
-        update = back_end.add(front_end.process(o))
+    for k, back_end, update in driven(observed, parameters):
         if update is not None:
             fresh |= {c.number for c in update.closures if c.accepted}
         if update is not None and update.optimized:
-            front_end.correct(update.T_map_local)
             fresh = set()
         # none is let go of by an estimate that it is not in yet
         enabled, closures = back_end.graph.edges.enabled, back_end.scans.closures
@@ -116,12 +119,8 @@ def test_nothing_that_is_kept_grows_with_the_laps():
         node=replace(Parameters().node, map_start_pose=START),
         loop_closure=LoopClosure(max_distance=4.0),
     )
-    front_end, back_end = FrontEnd(parameters), BackEnd(parameters)
     sizes = []
-    for k, o in enumerate(observed):
-        update = back_end.add(front_end.process(o))
-        if update is not None and update.optimized:
-            front_end.correct(update.T_map_local)
+    for k, back_end, _ in driven(observed, parameters):
         if (k + 1) % (len(observed) // laps) == 0:
             graph, way = back_end.graph, back_end.surest_way
             sizes.append(
