@@ -2,7 +2,7 @@
 """Every parameter, declared once: default, unit, bounds and meaning.
 
 A group is a frozen dataclass of param() fields; Parameters holds one of each. The ROS
-declaration (``ros/declare.py``), ``config/*.yaml`` and the tables of the README are derived from
+declaration (``ros/declare.py``), ``config/*.yaml`` and the tables of docs are derived from
 here and tested against it. A wrong value raises ParameterError that names class, field, value and
 meaning. An unknown name is refused by the commands, and told in the log by the nodes.
 """
@@ -1015,7 +1015,7 @@ def _nearest(name: str, known: Mapping[str, Any]) -> str:
     import difflib
 
     near = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
-    return ', '.join(near) if near else 'listed in the README'
+    return ', '.join(near) if near else 'listed in docs/parameters.md'
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``rlml docs``: the README's tables of topics, services and parameters, made from the code."""
+"""``rlml docs``: the tables of topics, services and parameters in docs, made from the code."""
 
 from __future__ import annotations
 
@@ -29,11 +29,13 @@ def add_parser(subparsers: Any) -> None:
     """Declare ``rlml docs``."""
     parser = subparsers.add_parser(
         'docs',
-        help="the README's tables from the declarations in the code",
-        description='Prints the tables, or puts them between the marks of a file: '
+        help='the tables of topics, services and parameters, from the declarations in the code',
+        description='Prints the tables, or puts each between its marks in one of the files: '
         '<!-- begin NAME --> and <!-- end NAME -->.',
     )
-    parser.add_argument('--write', type=Path, metavar='README', help='bring a file up to date')
+    parser.add_argument(
+        '--write', type=Path, nargs='+', metavar='FILE', help='bring files up to date'
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -41,24 +43,35 @@ def run(args: argparse.Namespace) -> int:
     if args.write is None:
         print('\n\n'.join(make() for make in TABLES.values()))
         return 0
-    try:
-        text = args.write.read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError) as e:
-        raise FileFormatError(f'{args.write}: cannot be read: {e}') from e
-    write_atomically(args.write, filled(text, str(args.write)).encode())
+    texts = {path: _read(path) for path in args.write}
+    for path, text in filled(texts).items():
+        write_atomically(path, text.encode())
     return 0
 
 
-def filled(text: str, name: str = 'text') -> str:
-    """The text with every table between its marks made anew; FileFormatError without marks."""
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding='utf-8')
+    except (OSError, UnicodeDecodeError) as e:
+        raise FileFormatError(f'{path}: cannot be read: {e}') from e
+
+
+def filled(texts: Mapping[Path, str]) -> dict[Path, str]:
+    """The texts with every table between its marks made anew.
+
+    FileFormatError where the marks of a table are not there exactly once among them all.
+    """
+    made = dict(texts)
     for table, make in TABLES.items():
         begin, end = f'<!-- begin {table} -->', f'<!-- end {table} -->'
         marks = re.compile(f'{re.escape(begin)}.*?{re.escape(end)}', re.DOTALL)
-        if len(marks.findall(text)) != 1:
-            raise FileFormatError(f'{name}: {begin} … {end} is not there exactly once')
-        before, after = marks.split(text)
-        text = f'{before}{begin}\n{make()}\n{end}{after}'
-    return text
+        found = [path for path, text in made.items() for _ in marks.findall(text)]
+        if len(found) != 1:
+            names = ', '.join(map(str, texts))
+            raise FileFormatError(f'{names}: {begin} … {end} is not there exactly once')
+        before, after = marks.split(made[found[0]])
+        made[found[0]] = f'{before}{begin}\n{make()}\n{end}{after}'
+    return made
 
 
 def topic_table() -> str:

@@ -125,7 +125,9 @@ COMMANDS: Table = {
     'doctor': Command(
         'doctor', 'what the scans of a bag are like, and a threshold for its reflectors'
     ),
-    'docs': Command('docs', "the README's tables from the declarations in the code"),
+    'docs': Command(
+        'docs', 'the tables of topics, services and parameters, from the declarations in the code'
+    ),
 }
 
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of the README are those of the code, and the code is what the nodes do."""
+"""The tables of docs are those of the code, and the code is what the nodes do."""
 
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -12,20 +13,41 @@ from rlml_slam.errors import FileFormatError
 from rlml_slam.params import CarrierParameters, Parameters, SimulatorParameters, declarations
 from rlml_slam.tools.docs import TABLES, filled, parameter_table
 from rlml_slam.tools.interface import SERVICES, TOPICS
-from rlml_slam.tools.main import main
+from rlml_slam.tools.main import COMMANDS, Group, main
 
 NODES = (
     'front_end', 'back_end', 'simulator', 'deformable_slam', 'carrier_simulator',
     'reflector_detector',
 )  # fmt: skip
-README = Path(__file__).resolve().parents[2] / 'README.md'
+ROOT = Path(__file__).resolve().parents[2]
+TABLED = (ROOT / 'docs' / 'nodes.md', ROOT / 'docs' / 'parameters.md')
 # what every node of rclpy has
 OF_EVERY_NODE = {'/rosout', '/parameter_events'}
 
 
-def test_readme_is_up_to_date():
-    text = README.read_text(encoding='utf-8')
-    assert filled(text) == text, 'run: rlml docs --write README.md'
+def test_docs_are_up_to_date():
+    texts = {path: path.read_text(encoding='utf-8') for path in TABLED}
+    wanted = f'run: rlml docs --write {" ".join(str(p.relative_to(ROOT)) for p in TABLED)}'
+    assert filled(texts) == texts, wanted
+    assert wanted.removeprefix('run: ') in (ROOT / 'README.md').read_text(encoding='utf-8')
+
+
+def test_every_command_has_its_row():
+    names = set()
+    for name, entry in COMMANDS.items():
+        within = entry.commands if isinstance(entry, Group) else ('',)
+        names |= {f'{name} {sub}'.strip() for sub in within}
+    page = (ROOT / 'docs' / 'command.md').read_text(encoding='utf-8')
+    # written by those who work on the project alone
+    assert [name for name in sorted(names) if f'`rlml {name}' not in page] == ['docs']
+    for text in (page, (ROOT / 'README.md').read_text(encoding='utf-8')):
+        assert set(re.findall(r'`rlml ([a-z]+)', text)) <= set(COMMANDS)
+
+
+def test_links_of_the_docs_lead_to_files():
+    for page in [ROOT / 'README.md', *(ROOT / 'docs').glob('*.md')]:
+        links = re.findall(r'\]\((?!https?:)([^)#]+)', page.read_text(encoding='utf-8'))
+        assert not [link for link in links if not (page.parent / link).exists()], page
 
 
 @pytest.mark.parametrize('of', [Parameters, SimulatorParameters, CarrierParameters])
@@ -36,24 +58,29 @@ def test_every_parameter_has_its_row(of):
 
 def test_tables_are_put_between_the_marks(tmp_path, capsys):
     marks = [f'<!-- begin {t} -->\nold {t}\n<!-- end {t} -->\n' for t in TABLES]
-    path = tmp_path / 'README.md'
-    path.write_text('# Title\n' + 'text\n'.join(marks) + 'the end\n')
-    assert main(['docs', '--write', str(path)]) == 0
-    text = path.read_text()
-    assert text.startswith('# Title\n')
-    assert text.endswith('the end\n')
-    assert '\nold ' not in text
-    assert filled(text) == text
+    paths = [tmp_path / 'one.md', tmp_path / 'other.md']
+    for path, part in zip(paths, (marks[:2], marks[2:]), strict=True):
+        path.write_text('# Title\n' + 'text\n'.join(part) + 'the end\n')
+    assert main(['docs', '--write', *map(str, paths)]) == 0
+    texts = {path: path.read_text() for path in paths}
+    for text in texts.values():
+        assert text.startswith('# Title\n')
+        assert text.endswith('the end\n')
+        assert '\nold ' not in text
+    assert filled(texts) == texts
     assert main(['docs']) == 0
     printed = capsys.readouterr().out
-    assert all(make() in text and make() in printed for make in TABLES.values())
+    assert all(make() in ''.join(texts.values()) and make() in printed for make in TABLES.values())
 
 
-def test_missing_marks_are_named():
+@pytest.mark.parametrize('times', [0, 2])
+def test_marks_that_are_not_there_once_are_named(times):
+    marks = '<!-- begin topics --><!-- end topics -->'
+    texts = {Path('nodes.md'): marks, Path('other.md'): marks} if times else {Path('nodes.md'): ''}
     with pytest.raises(
-        FileFormatError, match=r'<!-- begin topics --> … .* not there exactly once'
+        FileFormatError, match=r'nodes.md.*: <!-- begin topics --> … .* not there exactly once'
     ):
-        filled('nothing', 'README.md')
+        filled(texts)
 
 
 @pytest.fixture(scope='module')
