@@ -8,6 +8,9 @@ Antonante, Tzoumas & Carlone, RA-L 5 (2020), eq. 14)
         c / sqrt(s) sqrt(mu (mu + 1)) - mu    between
         0                               s >= (mu + 1) / mu c^2.
 
+Every round starts where the first one did: it would not leave again what closures that were still
+weighed bent the estimate into, and Gauss-Newton may not find its way down from there.
+
 It needs no odometry to trust, but settles in whatever all closures together bend the map into:
 selection.py does better wherever there is odometry.
 """
@@ -34,6 +37,7 @@ SCALE = 3.368  # truncation in sigmas: 99 % of a chi-square with 3 degrees of fr
 FACTOR = 1.4  # of mu per round, of the paper
 ROUNDS = 100
 NEARLY = 1e-3  # weights this near to 0 or 1 are there
+ROUGHLY = 1e-5  # relative tolerance of a round: only the last estimate has to be exact
 LEAST = 1e-9  # weight of a closure that counts nothing, which keeps the graph in one piece
 INFORMATION = ('I00', 'I01', 'I02', 'I11', 'I12', 'I22')
 
@@ -80,6 +84,7 @@ def graduate(
 def _anneal(
     graph: Graph, parameters: params.Solver, edges: NDArray[np.int64], scale: float
 ) -> tuple[Array, int]:
+    start = graph.poses.copy(), graph.landmarks.copy()
     system = system_of(graph)
     row = np.searchsorted(np.flatnonzero(graph.edges.enabled), edges)
     full = {name: system.edges[name][row].copy() for name in INFORMATION}
@@ -88,10 +93,11 @@ def _anneal(
     for rounds in range(1, ROUNDS + 1):
         for name in INFORMATION:
             system.edges[name][row] = np.maximum(weights, LEAST) * full[name]
+        graph.poses[:], graph.landmarks[:] = start
         cost, chi2 = linearize(system, graph.poses, graph.landmarks, True)
         gauss_newton(
             system, graph.poses, graph.landmarks, cost, chi2, parameters.max_iterations,
-            parameters.relative_tolerance, floor,
+            max(parameters.relative_tolerance, ROUGHLY), floor,
         )  # fmt: skip
         s = graph.residuals().edges[edges]
         worst = float(s.max(initial=0.0))

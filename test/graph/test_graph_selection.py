@@ -10,12 +10,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
 from rlml_slam import params, se2
-from rlml_slam.graph import factors
+from rlml_slam.graph import factors, gnc
 from rlml_slam.graph.agreement import group
 from rlml_slam.graph.backbone import Backbone
 from rlml_slam.graph.evidence import NU, evidence, fit_scale, uniform
 from rlml_slam.graph.gnc import graduate, truncated_weights
 from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.iterate import gauss_newton
 from rlml_slam.graph.marginals import Marginals
 from rlml_slam.graph.robust import Loss, Losses, LossKind
 from rlml_slam.graph.selection import ROUNDS, _Selector, select_closures
@@ -259,6 +260,23 @@ def test_graduated_non_convexity_disables_a_few_wrong_closures():
     # the truncation at 99 % costs some of the right ones as well
     assert len(refused) - len(wrong) <= 2
     assert_array_equal(np.flatnonzero(~graph.edges.enabled), refused)
+
+
+def test_every_round_of_graduated_non_convexity_starts_where_the_first_did(monkeypatch):
+    starts = []
+
+    def spy(system, poses, *rest):
+        starts.append(poses.copy())
+        return gauss_newton(system, poses, *rest)
+
+    monkeypatch.setattr(gnc, 'gauss_newton', spy)
+    graph = laps()
+    spoil(graph, WRONG)
+    graph.poses[1:, 0] += 0.1
+    before = graph.poses.copy()
+    assert graduate(graph, EXACT).rounds == len(starts) > 1
+    for start in starts:
+        assert_array_equal(start, before)
 
 
 def test_closures_that_take_turns_are_judged_a_bounded_number_of_times(monkeypatch):
