@@ -3,7 +3,7 @@
 
 A group is a frozen dataclass of param() fields; Parameters holds one of each. The ROS
 declaration (``ros/declare.py``), ``config/*.yaml`` and the tables of docs are derived from
-here and tested against it. A wrong value raises ParameterError that names class, field, value and
+here and tested against it. A wrong value raises ParameterError that names parameter, value and
 meaning. An unknown name is refused by the commands, and told in the log by the nodes.
 """
 
@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import yaml
 
@@ -42,22 +43,32 @@ def param(
 
 @dataclass(frozen=True)
 class Group:
-    """A set of parameters; construction checks every value."""
+    """A set of parameters; construction checks every value.
+
+    ``prefix`` is what their names begin with, of the class's name where nothing else is said.
+    """
+
+    _prefix: ClassVar[str]
+
+    def __init_subclass__(cls, prefix: str | None = None) -> None:
+        """Keep the prefix, for errors that name a parameter as its user does."""
+        of_class = re.sub('(?<=[a-z])(?=[A-Z])', '_', cls.__name__).lower() + '.'
+        cls._prefix = of_class if prefix is None else prefix
 
     def __post_init__(self) -> None:
         """Check each field against its declared type, bounds and choices."""
         for f in dataclasses.fields(self):
             object.__setattr__(
-                self, f.name, _checked(type(self).__name__, f, getattr(self, f.name))
+                self, f.name, _checked(self._prefix, f, getattr(self, f.name))
             )
 
 
-def _checked(group: str, f: dataclasses.Field[Any], value: Any) -> Any:
+def _checked(prefix: str, f: dataclasses.Field[Any], value: Any) -> Any:
     """The value in the type of the field's default, or a ParameterError."""
     m = f.metadata
 
     def refuse(why: str) -> ParameterError:
-        return ParameterError(f'{group}.{f.name} = {value!r} {why} ({m["meaning"]})')
+        return ParameterError(f'{prefix}{f.name} = {value!r} {why} ({m["meaning"]})')
 
     if isinstance(f.default, bool):
         if not isinstance(value, bool):
@@ -101,7 +112,7 @@ def _is_number(value: Any) -> bool:
 
 
 @dataclass(frozen=True)
-class Node(Group):
+class Node(Group, prefix=''):
     """Frames, topics and files; the names are slam_toolbox's where the thing is the same."""
 
     map_frame: str = param('map', 'frame of the map')
@@ -162,7 +173,7 @@ class Node(Group):
 
 
 @dataclass(frozen=True)
-class MotionNoise(Group):
+class MotionNoise(Group, prefix='motion.'):
     """Noise of odometry and IMU (eq. 6): sigma_v = a |v| + b, sigma_omega = c |omega| + d.
 
     The figures hold for a control interval of ``interval``; other intervals are scaled so that
@@ -342,7 +353,7 @@ class ScanMatch(Group):
 
 
 @dataclass(frozen=True)
-class HealthLimits(Group):
+class HealthLimits(Group, prefix='health.'):
     """When the estimate counts as DEGRADED or LOST."""
 
     patience: float = param(1.0, 'an input may fail for this long', 's', 0.0, 60.0)
@@ -755,7 +766,7 @@ class DetectorParameters:
 
 
 @dataclass(frozen=True)
-class Simulator(Group):
+class Simulator(Group, prefix=''):
     """The synthetic world, the robot in it and how it runs; a seed fixes all of it."""
 
     world: str = param('hall', 'name of a world of the package, or path of a world file')
@@ -884,7 +895,7 @@ class SimulatorParameters:
 
 
 @dataclass(frozen=True)
-class CarrierRun(Group):
+class CarrierRun(Group, prefix=''):
     """How carrier_simulator runs; a seed fixes all of it."""
 
     seed: int = param(0, 'seed of all noise', '', 0, 2**31 - 1)
@@ -933,7 +944,7 @@ class CarrierParameters:
 
 
 @dataclass(frozen=True)
-class Player(Group):
+class Player(Group, prefix=''):
     """The bag that bag_player publishes, and how."""
 
     bag: str = param('', 'rosbag2 folder (sqlite3 or mcap), .mcap, .db3 or ROS 1 .bag')

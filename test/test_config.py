@@ -109,6 +109,13 @@ def test_file_without_parameters_of_the_nodes_is_refused(text, why, tmp_path):
         read_yaml(path)
 
 
+@pytest.mark.parametrize('of', NODES)
+def test_wrong_value_is_told_by_the_name_of_its_parameter(of):
+    for d in declarations(of):
+        with pytest.raises(ParameterError, match=f'^{re.escape(d.name)} = None is '):
+            from_mapping({d.name: None}, of)
+
+
 def test_misspelt_parameter_is_refused(tmp_path):
     path = tmp_path / 'robot.yaml'
     path.write_text('front_end: {ros__parameters: {use_odon: false}}')
@@ -119,7 +126,7 @@ def test_misspelt_parameter_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ('name', 'value', 'why'),
     [
-        ('map_start_pose', [1.0], r'Node.map_start_pose = \[1.0\] is not a list of 3 numbers'),
+        ('map_start_pose', [1.0], r'map_start_pose = \[1.0\] is not a list of 3 numbers'),
         ('laser_pose', [], 'is not a list of 3 numbers'),
         ('laser_pose', [0.0, 0.0, 0.0, 0.0], 'is not a list of 3 numbers'),
         ('submap.bias2', [-1.0, 0.0, 0.0], r'has a number outside \[0, 100\]'),

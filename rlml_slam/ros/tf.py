@@ -115,6 +115,10 @@ def subscribe_static(node: Any, extrinsics: Extrinsics) -> bool:
 
     kind = rclpy_class(TF_MESSAGE)
     if kind is None:
+        node.get_logger().warning(
+            'tf2_msgs is not installed: /tf_static is not read, and every sensor is taken to sit '
+            'where the parameter laser_pose says'
+        )
         return False
     latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 

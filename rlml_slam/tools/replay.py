@@ -59,7 +59,7 @@ def add_parser(subparsers: Any) -> None:
         '--truth', metavar='TUM', type=Path, help='ground truth, aligned before it is compared'
     )
     parser.add_argument(
-        '--map', metavar='DIR', type=Path,
+        '--map', metavar='MAP', type=Path,
         help='localize in this map: a .rlml file, or a folder that a replay wrote or save_map as '
         '`map`',
     )  # fmt: skip

@@ -406,7 +406,7 @@ def test_parameter_serves_where_nobody_tells_the_place_of_the_laser(live):
 
 
 def test_wrong_value_refuses_to_start(live):
-    with pytest.raises(ParameterError, match=r'Submap.resolution = -1.0 is outside \[0.01, 1\]'):
+    with pytest.raises(ParameterError, match=r'submap.resolution = -1.0 is outside \[0.01, 1\]'):
         live.start(FrontEndNode, submap__resolution=-1.0)
 
 

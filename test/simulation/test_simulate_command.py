@@ -102,7 +102,7 @@ def test_odometry_carries_the_twist_of_its_steps(tmp_path):
     [
         (['nowhere', 'bag'], FileFormatError, 'no such world'),
         (['room', 'bag', '--set', 'laser.beam=3'], ParameterError, r"'laser.beam'.*laser.beams"),
-        (['room', 'bag', '--set', 'laser.beams=1'], ParameterError, r'Laser.beams = 1 is outside'),
+        (['room', 'bag', '--set', 'laser.beams=1'], ParameterError, r'laser.beams = 1 is outside'),
         (['room', 'bag', '--set', 'laser.beams'], ParameterError, 'is not NAME=VALUE'),
         (['room', 'bag', '--set', 'world={'], ParameterError, 'is not YAML'),
         (['room', 'bag', '--set', 'repeat=true'], ParameterError, 'needs --duration'),

@@ -33,7 +33,7 @@ def test_every_scan_that_is_sent_gets_its_pose(capsys):
     ('arguments', 'why'),
     [
         (['--minutes', '0.1'], 'gives less than 10 s'),
-        (['--hz', '-1'], 'Laser.rate = -1.0 is outside'),
+        (['--hz', '-1'], 'laser.rate = -1.0 is outside'),
         (['--world', 'nowhere'], 'nowhere'),
     ],
 )

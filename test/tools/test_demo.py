@@ -123,7 +123,7 @@ def test_dead_process_is_reported(tmp_path, monkeypatch, capsys):
     ('arguments', 'why'),
     [
         (['--world', 'no_such_world'], 'no_such_world'),
-        (['--rate', '-1'], 'Simulator.rate = -1.0 is outside'),
+        (['--rate', '-1'], 'rate = -1.0 is outside'),
     ],
 )
 def test_wrong_argument_is_one_line(tmp_path, capsys, arguments, why):
