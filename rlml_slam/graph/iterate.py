@@ -7,8 +7,9 @@ descend get stuck.
 When to stop costs no further factorisation. With q the error of the linear model r + J d, a step
 leaves the cost at |r + J d + q|^2 where |r + J d|^2 was promised, and what the next step can gain
 is the part of |q|^2 that its model reaches: as long as the cost is what was promised, nothing is
-left to gain. Robust losses bring more than is promised; then the old factor, at the price of half
-a solve, bounds the gain of a further step.
+left to gain. Where that does not tell, and with robust losses, which bring more than is promised,
+the old factor, at the price of half a solve, bounds the gain of a further step. It is not good for
+the step itself: lines of sight that turn by little couple what is stiff with what is soft.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from rlml_slam.se2 import Array
 
 # Gauss-Newton gives up after this many steps in a row without a new lowest cost
 PATIENCE = 4
+# a step that promises more than this share of the cost is not taken for the last one
+FAR = 0.5
 
 
 class Progress(NamedTuple):
@@ -94,8 +97,9 @@ def gauss_newton(
         move(system.variables, system.step, poses, landmarks)
         iterations += 1
         model = cost - promised
-        # the panels hold the old factor until it has been asked
-        cost, chi2 = linearize(system, poses, landmarks, not robust)
+        # near the minimum the panels hold the old factor until it has been asked
+        far = not robust and promised > FAR * cost
+        cost, chi2 = linearize(system, poses, landmarks, far)
         if cost < best:
             best, best_chi2, misses = cost, chi2, 0
             copy(poses, kept)
@@ -103,10 +107,12 @@ def gauss_newton(
         else:
             misses += 1
         small = tolerance * cost + floor
-        converged = _promise(system) <= small if robust else abs(cost - model) <= small
+        converged = not robust and abs(cost - model) <= small
+        if not (converged or far):
+            converged = _promise(system) <= small
         if converged:
             break
-        if robust:
+        if not far:
             linearize(system, poses, landmarks, True)
     if not cost <= best:
         copy(kept, poses)
