@@ -8,6 +8,11 @@ effective resistances", 2011, tell which edges matter). Those of all edges sum u
 free poses at most, so of m edges to a pose the least has a leverage below 1 / m: most of what it
 tells is known without it. What is left is what was measured: nothing becomes surer than it was.
 The same holds of the sightings of a pose, h = tr(Q W) / 2.
+
+By leverage alone, the edges that stay would lie the more at random the longer new ones come in,
+and the factor of such a graph is nearly full. There, an edge to a pose with many costs little,
+for that pose separates the others anyway: so what an edge tells counts times the number of those
+at the busier one of its poses.
 """
 
 from __future__ import annotations
@@ -37,7 +42,9 @@ def prune(graph: Graph, may: NDArray[np.bool_], most: int) -> NDArray[np.int64]:
     use = np.flatnonzero(e.enabled)
     if len(use) <= most:
         return use[:0]
-    gone = use[_least(leverages(graph), may[use], len(use) - most)]
+    nodes = e.nodes[use]
+    busier = np.bincount(nodes.ravel())[nodes].max(axis=1)
+    gone = use[_least(leverages(graph), may[use], len(use) - most, busier)]
     e.enabled[gone] = False
     return gone
 
@@ -54,10 +61,15 @@ def prune_sightings(live: Live, pose: int, most: int) -> NDArray[np.int64]:
     return gone
 
 
-def _least(h: Array, may: NDArray[np.bool_], num: int) -> NDArray[np.int64]:
-    """Of the leverages (k, d, d), up to ``num`` that ``may`` go together, the least first."""
+def _least(
+    h: Array, may: NDArray[np.bool_], num: int, times: NDArray[np.int64] | int = 1
+) -> NDArray[np.int64]:
+    """Of the leverages (k, d, d), up to ``num`` that ``may`` go together, the least first.
+
+    Each counts so many ``times`` (k,).
+    """
     total, largest = np.trace(h, axis1=1, axis2=2), np.linalg.eigvals(h).real.max(axis=1)
-    order = np.argsort(total, kind='stable')
+    order = np.argsort(total * times, kind='stable')
     order = order[may[order] & (largest[order] < AT_ONCE)]
     least: NDArray[np.int64] = order[np.cumsum(total[order]) < AT_ONCE * h.shape[1]][:num]
     return least

@@ -43,7 +43,7 @@ class ReflectorGraph:
         self._alias: dict[int, int] = {}
         self.gone = GoneList()
         self._given_up: set[int] = set()  # keys that the front end may still have
-        self._most = 0  # sightings that a keyframe came with
+        self._came = np.zeros(2, dtype=np.int64)  # keyframes with sightings, and how many of these
         self.changed = False
 
     def resolve(self, key: int) -> int:
@@ -73,7 +73,8 @@ class ReflectorGraph:
                 point = transform(self._graph.poses[pose], s.z[None])[0]
                 landmark.index = self._graph.add_landmark(point)
             self._link_all(landmark)
-        self._most = max(self._most, sum(map(len, interval.sightings.values())))
+        num = sum(map(len, interval.sightings.values()))
+        self._came += np.array([num > 0, num])
 
     def _link_all(self, landmark: Landmark) -> None:
         """Give a landmark of the graph the factors that it still lacks."""
@@ -268,8 +269,13 @@ class ReflectorGraph:
             self._link_all(landmark)
 
     def thin(self, pose: int) -> None:
-        """Let go of what a keyframe has taken over beyond what any came with, the least first."""
-        gone = prune_sightings(self._live, pose, self._most)
+        """Let go of what a keyframe has taken over beyond what one comes with, the least first.
+
+        That is the mean: were it the most that any came with, nearly all would take over more
+        than they came with, by and by, and tie ever more places to one another.
+        """
+        keys, sightings = self._came.tolist()
+        gone = prune_sightings(self._live, pose, -(-sightings // max(keys, 1)))
         if len(gone):
             for landmark in self._landmarks.values():
                 rows = landmark.sightings.view
@@ -341,7 +347,7 @@ class ReflectorGraph:
             self._landmarks[key].views[x, y] = hits, misses
         self._alias = dict(a['reflector_alias'].tolist())
         # those that took over more than they came with were thinned to what one came with
-        self._most = int(np.bincount(a['sighting']['pose'], minlength=1).max())
+        self._came[:] = len(np.unique(a['sighting']['pose'])), len(a['sighting'])
 
     @property
     def next_key(self) -> int:

@@ -76,7 +76,7 @@ class Sparsifier:
         return True
 
     def thin(self) -> None:
-        """Let go of sightings of keyframes that have taken over more than any ever made itself.
+        """Let go of sightings of keyframes that have taken over more than one comes with.
 
         The graph is to be solved: then the solver's tree tells what each of them is worth.
         """

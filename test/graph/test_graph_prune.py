@@ -11,6 +11,8 @@ from scipy import sparse
 from rlml_slam import se2
 from rlml_slam.graph.factors import pose_landmark, relative_pose
 from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.incremental import Incremental
+from rlml_slam.graph.increments import IN_USE
 from rlml_slam.graph.live import Live
 from rlml_slam.graph.marginals import Marginals
 from rlml_slam.graph.prune import (
@@ -127,6 +129,31 @@ def test_number_of_edges_is_held_where_others_come_all_the_time():
         add(graph, rng, 2)
         prune(graph, everything(graph), 160)
     assert graph.edges.enabled.sum() == 160
+
+
+def test_factor_does_not_fill_however_long_edges_come_and_go():
+    """Submaps tie many poses to one, in each lap to another one."""
+    rng = np.random.default_rng(0)
+    graph = crowd(rng, 100, 0)
+    filled = []
+    for lap in range(9):
+        for hub in rng.choice(100, 4, replace=False):
+            for other in rng.choice(100, 30, replace=False):
+                if hub != other:
+                    tie(graph, hub, other)
+        while len(prune(graph, everything(graph), 300)):
+            pass
+        if lap:  # the first one leaves fewer edges than that
+            filled.append(room(graph))
+    # by leverage alone it doubles
+    assert max(filled) < 1.3 * filled[0], filled
+
+
+def room(graph):
+    """Elements of the factor, ordered as a whole."""
+    solver = Incremental(graph)
+    solver.update(whole=True)
+    return int(solver._state.counts[IN_USE])
 
 
 def test_no_edge_goes_that_may_not_or_is_not_too_many():
