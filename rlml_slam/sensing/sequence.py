@@ -29,6 +29,7 @@ from rlml_slam.se2 import Array
 from rlml_slam.sensing.deskew import project, sweep_time
 from rlml_slam.sensing.no_return import NoReturns
 from rlml_slam.sensing.placing import placed
+from rlml_slam.sensing.repeats import Repeats
 from rlml_slam.sensing.steady_clock import SteadyClock
 from rlml_slam.types import Detections, Imu, Motion, Observation, Odometry, Scan
 
@@ -48,7 +49,8 @@ Waiting: TypeAlias = tuple[int, str, Scan | Detections, int]
 class Inputs:
     """What became of the inputs, by stream: used, late, duplicate, future, invalid, waited_out.
 
-    Of those used, ``no_returns`` are scans in which no beam came back.
+    Of those used, ``no_returns`` are scans in which no beam came back; ``repeated`` ones, which
+    the robot has moved on from, are left out.
     """
 
     counts: dict[str, Counter[str]] = field(default_factory=dict)
@@ -93,6 +95,7 @@ class Sequencer:
         self._newest_of: dict[tuple[str, str], int] = {}
         self._lidars: dict[str, tuple[int, int]] = {}  # by frame: newest stamp and period
         self._no_returns = NoReturns()
+        self._repeats = Repeats()
         self._newest_any = -(2**62)
         self._first_any: int | None = None
         self._step: dict[str, int] = {}  # by stream: between its last two stamps
@@ -385,7 +388,12 @@ class Sequencer:
     def _observe(self, stamp: int, group: list[Waiting]) -> Observation:
         scan: Scan | None = None
         points = origin = detections = T = delta = None
+        odom_pose = self.buffer.pose_at(stamp)
+        stale = self._stale(group, odom_pose)
         for _, stream, item, later in group:
+            if item.frame_id in stale:
+                self.inputs.count(stream, 'repeated')
+                continue
             self.inputs.count(stream, 'used')
             # from the base at the stamp to the base when it was measured
             moved = self._moved(item.stamp, item.stamp + later)
@@ -417,11 +425,16 @@ class Sequencer:
             origin,
             detections,
             scan,
-            self.buffer.pose_at(stamp),
+            odom_pose,
             T,
             delta,
             stamp_sigma,
         )
+
+    def _stale(self, group: list[Waiting], odometry: Array | None) -> set[str]:
+        """Frames of lidars that sent an old scan; what was detected in it is as old."""
+        scans = [item for _, _, item, _ in group if isinstance(item, Scan)]
+        return {scan.frame_id for scan in scans if self._repeats.is_stale(scan, odometry)}
 
     def _errors_of(self, group: list[Waiting]) -> tuple[float, float]:
         """Errors [s] of when it was measured, against odometry, where stamps jitter.

@@ -510,3 +510,25 @@ def test_sigma_that_nobody_can_mean_is_bounded_and_counted(sigma):
     values = np.sqrt(np.linalg.eigvalsh(observation.detections.cov))
     assert 0.99 * SIGMA[0] <= values.min() <= values.max() <= 1.01 * SIGMA[1]
     assert sequencer.inputs.totals()['reflectors']['sigma_bounded'] == 1
+
+
+def test_scan_that_is_sent_again_while_the_robot_drives_is_left_out():
+    ranges = np.random.default_rng(0).uniform(1.0, 9.0, 100)
+    sequencer, _ = running(until=T0)
+    stamps = [T0 + k * 100 * MS for k in range(8)]
+    inputs = []
+    for k, stamp in enumerate(stamps):
+        sent = ranges if k < 5 else ranges + 0.01 * k  # then the driver is well again
+        inputs += [scan(stamp, sent), detections(stamp)]
+        inputs += [odometry(stamp + j * 20 * MS) for j in range(1, 6)]
+    out = feed(sequencer, inputs) + sequencer.flush()
+    assert [o.stamp for o in out] == stamps
+    # 8 cm in each interval
+    assert [o.points is not None for o in out] == [True, *[False] * 4, True, True, True]
+    assert [o.detections is not None for o in out] == [o.points is not None for o in out]
+    assert sequencer.inputs.counts['scan']['repeated'] == 4
+    moved = se2.between(pose_at(stamps[0]), pose_at(stamps[5]))
+    way = np.zeros(3)
+    for o in out[1:6]:
+        way = se2.compose(way, o.motion.delta)
+    np.testing.assert_allclose(way, moved, atol=1e-6)
