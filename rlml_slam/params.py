@@ -58,9 +58,7 @@ class Group:
     def __post_init__(self) -> None:
         """Check each field against its declared type, bounds and choices."""
         for f in dataclasses.fields(self):
-            object.__setattr__(
-                self, f.name, _checked(self._prefix, f, getattr(self, f.name))
-            )
+            object.__setattr__(self, f.name, _checked(self._prefix, f, getattr(self, f.name)))
 
 
 def _checked(prefix: str, f: dataclasses.Field[Any], value: Any) -> Any:
@@ -197,7 +195,7 @@ class MotionNoise(Group, prefix='motion.'):
         1.0,
     )
     wheels_time: float = param(
-        600.0, 'time in which that is another one: load, floor, tyres', 's', 1.0, 1e6
+        600.0, 'correlation time of that error: load, floor, tyres', 's', 1.0, 1e6
     )
     interval: float = param(0.1, 'control interval that a, b, c, d are given for', 's', 1e-3, 10.0)
     guess: float = param(
@@ -217,7 +215,7 @@ class MotionNoise(Group, prefix='motion.'):
         'speed forward, sideways and of turning of a robot without odometry, 1 sigma',
         'm/s, m/s, rad/s',
     )
-    free_time: float = param(4.0, 'time in which that is another one', 's', 0.01, 60.0)
+    free_time: float = param(4.0, 'correlation time of these speeds', 's', 0.01, 60.0)
     free_jitter: float = param(0.02, 'error of the stamps that it is told by', 's', 0.0, 1.0)
 
 

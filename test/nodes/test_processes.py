@@ -101,7 +101,7 @@ def test_wrong_parameter_is_one_line_and_exit_code_1(start, node):
     assert code == 1
     lines = [line for line in out.splitlines() if line]
     assert len(lines) == 1, out
-    assert f'.{name} = ' in lines[0]
+    assert f': {name} = ' in lines[0]
 
 
 @pytest.mark.parametrize(

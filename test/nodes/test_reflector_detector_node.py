@@ -119,5 +119,5 @@ def test_a_wrong_parameter_is_one_line_and_exit_code_1(start):
     process = start('reflector_detector', '--ros-args', '-p', 'detector.threshold:=magic')
     code, out = process.finish()
     assert code == 1
-    assert 'Detector.threshold' in out
+    assert 'detector.threshold' in out
     assert 'Traceback' not in out

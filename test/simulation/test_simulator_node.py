@@ -239,7 +239,7 @@ def test_true_reflectors_are_there_for_who_comes_late(context):
 
 
 def test_a_wrong_parameter_refuses_to_start(context):
-    with pytest.raises(ParameterError, match=r'Laser\.beams = 0 is outside \[2, 20000\]'):
+    with pytest.raises(ParameterError, match=r'^laser\.beams = 0 is outside \[2, 20000\]'):
         make_node(context, Wall(), **{'laser.beams': 0})
     with pytest.raises(FileFormatError, match='no such world'):
         make_node(context, Wall(), world='atlantis')

@@ -44,6 +44,17 @@ def test_every_command_has_its_row():
         assert set(re.findall(r'`rlml ([a-z]+)', text)) <= set(COMMANDS)
 
 
+def test_messages_that_the_docs_explain_are_those_of_the_code():
+    page = (ROOT / 'docs' / 'nodes.md').read_text(encoding='utf-8')
+    rows = page.split('| what you see |')[1].split('\n\n')[0].splitlines()[2:]
+    code = '\n'.join(p.read_text(encoding='utf-8') for p in (ROOT / 'rlml_slam').rglob('*.py'))
+    messages = [m[1] for row in rows if (m := re.match(r'\| `([^`]*)` +\|', row))]
+    assert len(messages) > 4
+    for message in messages:
+        parts = [part.strip() for part in message.split('…') if part.strip(' :')]
+        assert all(part in code for part in parts), message
+
+
 def test_links_of_the_docs_lead_to_files():
     for page in [ROOT / 'README.md', *(ROOT / 'docs').glob('*.md')]:
         links = re.findall(r'\]\((?!https?:)([^)#]+)', page.read_text(encoding='utf-8'))
