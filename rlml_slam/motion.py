@@ -164,6 +164,9 @@ def _drive(
         dt = (cuts[k + 1] - cuts[k]) / SECOND
         middle = (cuts[k] + cuts[k + 1]) // 2
         at = np.searchsorted(stamps, middle)
+        # a robot goes within a control interval before its first odometry as at its beginning
+        if at == 0 and len(stamps) > 1 and stamps[0] - start <= n.interval * SECOND:
+            at = 1
         known = 0 < at < len(stamps) and not math.isnan(v[at])
         gap = (stamps[at] - stamps[at - 1]) / SECOND if known else 0.0
         known = known and gap <= n.max_gap
@@ -350,7 +353,8 @@ class MotionBuffer:
         """Relative motion of base from stamp ``start`` to ``end`` (eq. 5-9).
 
         Parts without odometry, across a gap or a jump, count as standing still with the noise of
-        an unknown speed, and make the result ``known=False``.
+        an unknown speed, and make the result ``known=False``. A control interval before the first
+        odometry is none of them: its first speed holds there too.
         """
         if end <= start:
             return STILL

@@ -398,6 +398,22 @@ def test_end_of_odometry_is_extrapolated_for_a_moment_only():
     assert math.sqrt(np.linalg.eigvalsh(m.cov[:2, :2])[-1]) > NOISE.max_speed / 5.0
 
 
+@pytest.mark.parametrize('speed', [0.0, 1.0])
+def test_first_speed_holds_a_moment_before_the_odometry_begins(speed):
+    moment = round(0.5 * NOISE.interval * SECOND)
+    buffer = filled(line(speed, 0.5 * speed), duration=2.0)
+    m = buffer.motion(T0 - moment, T0 + moment)
+    assert m.known
+    np.testing.assert_allclose(m.delta, line(speed, 0.5 * speed)(NOISE.interval), atol=1e-4)
+    later = buffer.motion(T0, T0 + 2 * moment)
+    np.testing.assert_allclose(m.cov, later.cov, rtol=1e-2, atol=1e-7)
+    # how it went long before nobody knows: it counts as standing, within a wide covariance
+    m = buffer.motion(T0 - SECOND, T0)
+    assert not m.known
+    np.testing.assert_array_equal(m.delta, 0.0)
+    assert math.sqrt(m.cov[0, 0]) > 0.05 * NOISE.max_speed
+
+
 def test_without_any_odometry_motion_is_unknown():
     buffer = MotionBuffer(NOISE, 10.0)
     assert buffer.newest is None
