@@ -107,3 +107,8 @@ def weights(kind: int, scale: float, s: Array) -> Array:
     for i in range(len(s)):
         out[i] = loss(kind, scale, s[i])[1]
     return out
+
+
+def warm_up() -> None:
+    """Compile the kernels."""
+    weights(0, 1.0, np.zeros(1))

@@ -103,3 +103,8 @@ def warm_up() -> None:
     """Compile the kernels with the signatures that are used at run time."""
     known = Known(np.zeros(3), np.eye(3), np.eye(3))
     Correction(np.zeros(3), known).apply(np.zeros(3), np.eye(3))
+    positive(np.eye(3))
+    measured = np.zeros(2)
+    carried(np.eye(3), measured)
+    measured.setflags(write=False)  # as an edge's is, which Numba takes for another type
+    carried(np.eye(3), measured)
