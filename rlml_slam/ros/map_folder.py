@@ -74,6 +74,8 @@ class MapFolder:
         path = self.path(name)
         if name.endswith('.rlml') or (not name.endswith(SUFFIXES) and self.whole(name).exists()):
             return stored_map.saved_map(stored_map.load(self.whole(name)))
+        if not name.endswith(SUFFIXES) and not path.with_name(path.name + '.csv').exists():
+            raise MapError(f'{path}.rlml: no such map, nor {path.name}.csv')
         reflectors = reflector_file.load(path.with_name(path.name + '.csv'))
         meta = path.with_name(path.name + '.yaml')
         return SavedMap(reflectors, occupancy.load(meta) if meta.exists() else None)

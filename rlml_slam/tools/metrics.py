@@ -83,6 +83,7 @@ def metrics(run: Run, judged: Judged | None = None) -> dict[str, Any]:
         'reflector_states': dict(Counter(s.state for s in run.reflector_states)),
         'peak_rss_mb': round(peak_rss_mb(), 1),
         'inputs': {stream: dict(counts) for stream, counts in run.inputs.items()},
+        'topics': dict(run.topics),
         'health': {k: round(v, 4) for k, v in run.health_share().items()},
         'problem': run.problem,
     }

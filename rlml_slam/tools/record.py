@@ -79,7 +79,8 @@ class Run:
     ``trajectory`` is the optimised one; ``keyframes`` (k, 3) are poses in the map and
     ``closures`` (c, 2, 2) the ends of the accepted loop closures there, of which
     ``closure_table`` tells all, empty where nothing is known of them. ``back_end_ms`` (k,)
-    has the cost per keyframe, ``reflector_states`` what has become of the reflectors.
+    has the cost per keyframe, ``reflector_states`` what has become of the reflectors. ``inputs``
+    counts what became of the messages of each stream, ``topics`` says where in a bag they are.
     ``problem`` says in one line what ended the run early or what of it is missing, empty without
     either. ``stored`` is the whole map. ``extra`` goes into metrics.json as it is.
     """
@@ -94,6 +95,7 @@ class Run:
     rejected: int = 0
     back_end_ms: Array = field(default_factory=lambda: np.zeros(0))
     inputs: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    topics: dict[str, str] = field(default_factory=dict)
     truth: Truth | None = None
     wall_s: float = 0.0
     problem: str = ''

@@ -160,6 +160,9 @@ def replay(
             result.stored = stored_map.content_of(slam.back_end, params, result.grid)
             result.extra = survey_figures(slam.back_end)
         result.inputs = fates(slam.counts, bag.skipped, inputs.topics)
+        result.topics = {_counted_as(stream): topic for stream, topic in inputs.topics.items()}
+        if inputs.more_scans:
+            result.topics['scan'] = ', '.join([inputs.topics['scan'], *inputs.more_scans])
     result.wall_s = wall
     ended = f'{problem}; the results hold what came before' if problem else ''
     result.problem = '; '.join(filter(None, (ended, result.problem)))

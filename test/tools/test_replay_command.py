@@ -49,6 +49,7 @@ def test_room_is_mapped(replayed):
     assert f['reflectors_found'] == f['reflectors_true']
     assert f['reflectors_spurious'] == 0
     assert f['inputs']['scan']['invalid'] == 0
+    assert f['topics']['scan'] == '/scan'
     assert len(read_tum(replayed / 'a' / 'trajectory.tum')) == f['scans']
 
 
@@ -86,6 +87,16 @@ def test_given_truth_is_aligned(replayed, tmp_path, capsys):
     f = json.loads(capsys.readouterr().out)
     assert f['alignment'] == 'se2'
     assert f['ate_rmse_m'] < 1e-6
+
+
+def test_summary_says_which_topic_was_taken(tmp_path, capsys):
+    config = tmp_path / 'c.yaml'
+    config.write_text('/**:\n  ros__parameters:\n    scan_topic: front/scan\n')
+    arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out')]
+    assert main([*arguments, '--config', str(config)]) == 0
+    (row,) = re.findall(r'input scan +(.*)', capsys.readouterr().out)
+    # not the one that was asked for, but the only scans there are
+    assert row.endswith('used of /scan')
 
 
 def test_configuration_is_used(tmp_path, capsys):
