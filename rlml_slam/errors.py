@@ -26,5 +26,9 @@ class MapError(RlmlError):
     """A map cannot be saved, loaded or used."""
 
 
+class NoMapError(MapError):
+    """There is no map of that name."""
+
+
 class SolverError(RlmlError):
     """A graph is malformed, or its normal equations cannot be solved."""

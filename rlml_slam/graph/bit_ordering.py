@@ -7,7 +7,8 @@ faster than approximate minimum degree on lists, most of all around landmarks, w
 are walked anew at every pose that is eliminated.
 
 As there, indistinguishable nodes are merged, and the degree is the external one: a node's own
-twins do not count (Amestoy, Davis & Duff 1996).
+twins do not count (Amestoy, Davis & Duff 1996). They are noticed among the neighbours of a pivot,
+and of those with rows of one length, by the last one alone.
 """
 
 from __future__ import annotations

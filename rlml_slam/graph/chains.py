@@ -23,7 +23,10 @@ FEW = 2560
 
 @part
 def elimination_order(start: Ints, neighbours: Ints, weight: Ints) -> Ints:
-    """Elimination order (n,) as of ordering.minimum_degree, all nodes having a weight."""
+    """Elimination order (n,) of a graph as ordering.minimum_degree takes it, all with a weight.
+
+    The weights count beyond ``FEW`` nodes; below, that of all nodes is one.
+    """
     n = len(start) - 1
     neighbours = neighbours[: start[n]].copy()
     length = np.empty(n, np.int64)

@@ -174,13 +174,15 @@ def elements_of(room: int) -> int:
 @kernel
 def compacted(state: State, pool: Array) -> Array:
     """A pool of the blocks in use, one after the other, and a quarter more."""
-    numbers, cliques = pool.view(np.int64), state.cliques
+    cliques = state.cliques
     more = np.empty(state.counts[IN_USE] * 5 // 4 + LITTLE)
+    moved = np.zeros(state.counts[CLIQUES], np.bool_)
     top = 0
     for v in range(state.counts[UNKNOWNS]):
         c = state.unknowns[v]['clique']
-        if c < 0 or numbers[cliques[c]['block']] != v:  # each clique with its first own unknown
+        if c < 0 or moved[c]:
             continue
+        moved[c] = True
         first, elements = cliques[c]['block'], elements_of(cliques[c]['room'])
         for k in range(elements):
             more[top + k] = pool[first + k]

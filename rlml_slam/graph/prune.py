@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Factors that go where there are more of them than a graph needs, first those that tell least.
+"""Factors that go where there are more of them than a graph needs, rather those that tell little.
 
 The leverage of an edge is the share of what is known of where its pose j is from its pose i that
 comes from itself, h = tr(Q W) / 3 with its information W and the covariance Q of its residual by
 the whole graph (the effective resistance by which Spielman & Srivastava, "Graph sparsification by
 effective resistances", 2011, tell which edges matter). Those of all edges sum up to the number of
-free poses at most, so of m edges to a pose the least has a leverage below 1 / m: most of what it
-tells is known without it. What is left is what was measured: nothing becomes surer than it was.
-The same holds of the sightings of a pose, h = tr(Q W) / 2.
+free poses at most, so that of m edges per pose they have 1 / m in the mean: most of what such a
+one tells is known without it. What is left is what was measured: nothing becomes surer than it
+was. The same holds of the sightings of a pose, h = tr(Q W) / 2, of which the least go.
 
-By leverage alone, the edges that stay would lie the more at random the longer new ones come in,
-and the factor of such a graph is nearly full. There, an edge to a pose with many costs little,
-for that pose separates the others anyway: so what an edge tells counts times the number of those
-at the busier one of its poses.
+Were it for leverage alone, the edges that stay would lie the more at random the longer new ones
+come in, and the factor of such a graph is nearly full. There, an edge to a pose with many
+neighbours costs little, for that pose separates the others anyway: so what an edge tells counts
+times the number of neighbours of the busier one of its poses. Some that go tell more than the
+mean for that; none tells more than it leaves to the others, AT_ONCE.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ def prune(graph: Graph, may: NDArray[np.bool_], most: int) -> NDArray[np.int64]:
     if len(use) <= most:
         return use[:0]
     nodes = e.nodes[use]
-    busier = np.bincount(nodes.ravel())[nodes].max(axis=1)
+    neighbours = np.bincount(np.unique(np.sort(nodes), axis=0).ravel())
+    busier = neighbours[nodes].max(axis=1)
     gone = use[_least(leverages(graph), may[use], len(use) - most, busier)]
     e.enabled[gone] = False
     return gone

@@ -156,7 +156,7 @@ def _joined(a: Arrays, b: Arrays, keys: int) -> Arrays:
         'reflector_gone': gone,
         'sighting': sighting,
     }  # fmt: skip
-    skipped = ('grid', 'path', 'path_motion', 'closures_tried')
+    skipped = ('grid', 'path', 'path_motion', 'closures_tried', 'reflector_came')
     out: Arrays = {
         name: np.concatenate([array, shifted.get(name, b[name])])
         for name, array in a.items()

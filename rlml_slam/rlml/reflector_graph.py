@@ -269,10 +269,11 @@ class ReflectorGraph:
             self._link_all(landmark)
 
     def thin(self, pose: int) -> None:
-        """Let go of what a keyframe has taken over beyond what one comes with, the least first.
+        """Let go of sightings of a keyframe that took over others: as many as one comes with stay.
 
-        That is the mean: were it the most that any came with, nearly all would take over more
-        than they came with, by and by, and tie ever more places to one another.
+        That is the mean, whatever it came with itself: were it the most that any came with,
+        nearly all would take over more than they came with, by and by, and tie ever more places
+        to one another. Those that tell least go first.
         """
         keys, sightings = self._came.tolist()
         gone = prune_sightings(self._live, pose, -(-sightings // max(keys, 1)))
@@ -318,6 +319,7 @@ class ReflectorGraph:
             **self.gone.arrays(),
             'reflector_surveyed': np.array([m.surveyed for m in marks], dtype=np.int64),
             'reflector_sightings': np.array([len(r) for r in rows], dtype=np.int64),
+            'reflector_came': self._came.copy(),
             'reflector_beside': np.array(beside, dtype=np.int64).reshape(-1, 2),
             'reflector_alias': np.array(list(self._alias.items()), dtype=np.int64).reshape(-1, 2),
             'sighting': np.concatenate([np.zeros(0, dtype=SIGHTING), *rows]),
@@ -346,8 +348,9 @@ class ReflectorGraph:
         for key, x, y, hits, misses in a.get('reflector_view', np.zeros(0, VIEW)).tolist():
             self._landmarks[key].views[x, y] = hits, misses
         self._alias = dict(a['reflector_alias'].tolist())
-        # those that took over more than they came with were thinned to what one came with
-        self._came[:] = len(np.unique(a['sighting']['pose'])), len(a['sighting'])
+        # of a map without, as a merged one: those that are left
+        left = len(np.unique(a['sighting']['pose'])), len(a['sighting'])
+        self._came[:] = a.get('reflector_came', left)
 
     @property
     def next_key(self) -> int:

@@ -28,7 +28,7 @@ from rlml_slam.rlml.reflector_graph import ReflectorGraph
 from rlml_slam.se2 import Array
 
 # Edges per keyframe, as many as one comes with: odometry, two submaps, and a closure. Their mean
-# leverage is a quarter, so that those which go have less.
+# leverage is a quarter.
 EDGES = 4
 SPARE = 20  # more of them are let go together, for judging them takes as long as a solve
 RECENT = 10  # keyframes that stay in any case: the next ones may be matched to them

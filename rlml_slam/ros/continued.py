@@ -17,8 +17,8 @@ from rlml_slam.params import Parameters
 from rlml_slam.rlml import stored_map
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.find_place import find_place
-from rlml_slam.rlml.recovery import PERIOD
 from rlml_slam.rlml.relocalize import Relocation, scan_fits
+from rlml_slam.rlml.search_pace import SearchPace
 from rlml_slam.types import Belief, Frame, Verdict
 
 FOREIGN = -2  # keys from here down are of no reflector of the session
@@ -44,7 +44,7 @@ class Continued:
             back_end.reset()
             raise
         self._first = back_end.reflector_graph.next_key
-        self._next = 0
+        self._pace: SearchPace | None = None
         self._offered = self._begun = self._jumped = False
         self.entered = False
         self.why = 'the place in the map is looked for'
@@ -71,10 +71,11 @@ class Continued:
         return score >= self._p.loop_closure.min_score
 
     def _look(self, frame: Frame) -> Relocation | None:
-        """Where a frame was taken, if the map tells; looked for a few times a second."""
-        if self._next <= frame.stamp + PERIOD and frame.stamp < self._next:
+        """Where a frame was taken, if the map tells."""
+        if self._pace is None or frame.stamp < self._pace.since:
+            self._pace = SearchPace(frame.stamp)
+        if not self._pace.is_due(frame):
             return None
-        self._next = frame.stamp + PERIOD
         found = find_place(self._saved.grid, self._saved.reflectors, frame.observation, self._p)
         self.why = found.why
         return found if found.verdict is Verdict.UNIQUE else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rlml_slam.errors import MapError
+from rlml_slam.errors import MapError, NoMapError
 from rlml_slam.maps import occupancy, reflector_file, survey
 from rlml_slam.maps.saved import SavedMap
 from rlml_slam.maps.survey import Survey
@@ -69,13 +69,21 @@ class MapFolder:
     def load(self, name: str) -> SavedMap:
         """Read name.rlml where it is there, else name.csv and name.yaml; a suffix says which.
 
-        MapError or FileFormatError says what is wrong with which file.
+        NoMapError names the files that are not there; MapError or FileFormatError says what is
+        wrong with which file.
         """
-        path = self.path(name)
-        if name.endswith('.rlml') or (not name.endswith(SUFFIXES) and self.whole(name).exists()):
-            return stored_map.saved_map(stored_map.load(self.whole(name)))
-        if not name.endswith(SUFFIXES) and not path.with_name(path.name + '.csv').exists():
-            raise MapError(f'{path}.rlml: no such map, nor {path.name}.csv')
-        reflectors = reflector_file.load(path.with_name(path.name + '.csv'))
+        path, whole = self.path(name), self.whole(name)
+        table = path.with_name(path.name + '.csv')
+        files = [whole, table]
+        if name.endswith(SUFFIXES):
+            files = [whole] if name.endswith('.rlml') else [table]
+        found = next((file for file in files if file.exists()), None)
+        if found is None:
+            raise NoMapError(
+                f'{path.parent}: there is no {" and no ".join(f.name for f in files)}'
+            )
+        if found == whole:
+            return stored_map.saved_map(stored_map.load(whole))
+        reflectors = reflector_file.load(table)
         meta = path.with_name(path.name + '.yaml')
         return SavedMap(reflectors, occupancy.load(meta) if meta.exists() else None)

@@ -13,7 +13,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.task import Future
 from std_srvs.srv import Empty, SetBool, Trigger
 
-from rlml_slam.errors import RlmlError
+from rlml_slam.errors import NoMapError, RlmlError
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.closure_table import closure_table
@@ -144,9 +144,8 @@ class MapServices:
 def refuse_map(node: Any, response: Any, why: RlmlError) -> None:
     """Answer load_map where a map cannot be had; the answer has no text, so the log tells."""
     node.get_logger().warning(f'load_map: {why}')
-    missing = 'cannot be read' in str(why)
     response.result = (
         LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
-        if missing
+        if isinstance(why, NoMapError) or isinstance(why.__cause__, FileNotFoundError)
         else LoadMap.Response.RESULT_UNDEFINED_FAILURE
     )

@@ -33,10 +33,11 @@ class Repeats:
         """
         ranges = scan.ranges.tobytes()
         before, there = self._new.get(scan.frame_id, (b'', None))
-        if ranges != before or np.count_nonzero(np.isfinite(scan.ranges)) < FEWEST:
+        few = np.count_nonzero(np.isfinite(scan.ranges)) < FEWEST
+        if ranges != before or there is None or few:
             self._new[scan.frame_id] = (ranges, odometry)
             return False
-        if odometry is None or there is None:
+        if odometry is None:
             return False
         x, y, turn = se2.between(there, odometry)
         return math.hypot(x, y) > MOVED or abs(turn) > MOVED

@@ -433,7 +433,8 @@ class Sequencer:
 
     def _stale(self, group: list[Waiting], odometry: Array | None) -> set[str]:
         """Frames of lidars that sent an old scan; what was detected in it is as old."""
-        scans = [item for _, _, item, _ in group if isinstance(item, Scan)]
+        # one that is there for its stamp alone may be empty, or made up
+        scans = [s for _, _, s, _ in group if isinstance(s, Scan) and self._node.use_scan]
         return {scan.frame_id for scan in scans if self._repeats.is_stale(scan, odometry)}
 
     def _errors_of(self, group: list[Waiting]) -> tuple[float, float]:

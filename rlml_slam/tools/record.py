@@ -95,7 +95,6 @@ class Run:
     rejected: int = 0
     back_end_ms: Array = field(default_factory=lambda: np.zeros(0))
     inputs: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
-    topics: dict[str, str] = field(default_factory=dict)
     truth: Truth | None = None
     wall_s: float = 0.0
     problem: str = ''
@@ -103,6 +102,7 @@ class Run:
     extra: Mapping[str, Any] = field(default_factory=dict)
     closure_table: str = ''
     reflector_states: tuple[ReflectorState, ...] = ()
+    topics: dict[str, str] = field(default_factory=dict)
 
     @property
     def duration_s(self) -> float:

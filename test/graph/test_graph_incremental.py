@@ -11,7 +11,16 @@ from rlml_slam import se2
 from rlml_slam.errors import SolverError
 from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.incremental import FILLED, SCATTERED, Incremental, Step, Thresholds
-from rlml_slam.graph.increments import FACTORS, IN_USE, LITTLE, TOP, compacted
+from rlml_slam.graph.increments import (
+    CLIQUES,
+    FACTORS,
+    IN_USE,
+    LITTLE,
+    TOP,
+    UNKNOWNS,
+    compacted,
+    new_state,
+)
 from rlml_slam.graph.judge import NEAR, USUAL
 from rlml_slam.graph.partial import WIDEST
 from rlml_slam.graph.robust import Loss, Losses, LossKind
@@ -356,6 +365,26 @@ def test_pool_without_gaps_holds_the_same_tree() -> None:
     for _ in range(5):
         solver.update()
     assert ours.graph.chi2() == pytest.approx(batch_chi2(ours.graph), rel=1e-3)
+
+
+def test_clique_is_moved_once_whatever_lies_where_it_came_to() -> None:
+    """Where the second one comes to, the old pool has a member of the third: its own 31."""
+    state, pool = new_state(40, 0, 1, 1), np.zeros(100)
+    numbers, at = pool.view(np.int64), (32, 64, 12)
+    members = ([0], [30, 31], [35, 29, 28, 30, 31])
+    own = (1, 2, 1)
+    state.unknowns['clique'] = -1
+    for c in range(3):
+        state.cliques[c]['block'], state.cliques[c]['room'] = at[c], 0
+        numbers[at[c] : at[c] + len(members[c])] = members[c]
+        state.unknowns['clique'][members[c][: own[c]]] = c
+    state.counts[UNKNOWNS], state.counts[CLIQUES], state.counts[IN_USE] = 40, 3, 48
+    after = compacted(state, pool).view(np.int64)
+    assert state.counts[TOP] == 48
+    assert sorted(state.cliques['block'][:3]) == [0, 16, 32]
+    for c in range(3):
+        block = state.cliques['block'][c]
+        assert after[block : block + len(members[c])].tolist() == members[c]
 
 
 def test_many_changes_at_a_time_do_not_fill_the_tree() -> None:

@@ -124,4 +124,4 @@ def test_missing_map_refuses_to_localize(start, tmp_path):
     args = ['-p', 'mode:=localization', '-p', f'map_directory:={tmp_path}']
     code, out = ended(start('back_end', '--ros-args', *args))
     assert code == 1
-    assert 'map.csv: cannot be read' in out
+    assert 'there is no map.rlml and no map.csv' in out

@@ -3,7 +3,7 @@
 
 import pytest
 
-from rlml_slam.errors import MapError
+from rlml_slam.errors import MapError, NoMapError
 from rlml_slam.ros.map_folder import MapFolder
 
 
@@ -15,5 +15,12 @@ def test_names_stay_inside_of_the_folder(name, tmp_path):
 
 @pytest.mark.parametrize('name', ['hall', 'file://hall', 'halls/north'])
 def test_map_that_is_not_there_is_named_by_the_file_that_it_would_be(name, tmp_path):
-    with pytest.raises(MapError, match=rf'{name.removeprefix("file://")}\.rlml: no such map'):
+    file = name.rpartition('/')[2]
+    with pytest.raises(NoMapError, match=rf'there is no {file}\.rlml and no {file}\.csv'):
         MapFolder(str(tmp_path)).load(name)
+
+
+@pytest.mark.parametrize(('suffix', 'file'), [('.rlml', '.rlml'), ('.yaml', '.csv')])
+def test_suffix_says_which_file_is_missing(suffix, file, tmp_path):
+    with pytest.raises(NoMapError, match=rf'there is no hall\{file}$'):
+        MapFolder(str(tmp_path)).load('hall' + suffix)

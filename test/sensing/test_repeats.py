@@ -45,6 +45,8 @@ def test_without_odometry_nothing_tells():
     repeats.is_stale(scan(WALL), None)
     assert not repeats.is_stale(scan(WALL), None)
     assert not repeats.is_stale(scan(WALL), HERE)
+    # from there on it does
+    assert repeats.is_stale(scan(WALL), HERE + 1.0)
 
 
 def test_scans_that_see_next_to_nothing_may_be_alike():
