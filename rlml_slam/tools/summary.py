@@ -45,7 +45,7 @@ def summary_rows(f: Mapping[str, Any]) -> list[tuple[str, str]]:
     for stream, fate in f['inputs'].items():
         listed = ', '.join(f'{n} {what}' for what, n in fate.items() if n or what == 'used')
         # a bag may have one only topic of a type, by whatever name: the reader has to know
-        source = f' of {f["topics"][stream]}' if stream in f['topics'] else ''
+        source = f' ({f["topics"][stream]})' if stream in f['topics'] else ''
         rows.append((f'input {stream}', listed + source))
     rows.append(('memory', f'{f["peak_rss_mb"]:.0f} MB'))
     return rows + _truth_rows(f)

@@ -96,7 +96,7 @@ def test_summary_says_which_topic_was_taken(tmp_path, capsys):
     assert main([*arguments, '--config', str(config)]) == 0
     (row,) = re.findall(r'input scan +(.*)', capsys.readouterr().out)
     # not the one that was asked for, but the only scans there are
-    assert row.endswith('used of /scan')
+    assert row.endswith('used (/scan)')
 
 
 def test_configuration_is_used(tmp_path, capsys):
