@@ -23,7 +23,7 @@ from rlml_slam import se2, warm_up
 from rlml_slam.errors import ParameterError
 from rlml_slam.params import Parameters, SimulatorParameters, from_mapping
 from rlml_slam.rlml.slam import Slam
-from rlml_slam.ros.memory import keep_large_apart
+from rlml_slam.ros.memory import give_back, keep_large_apart
 from rlml_slam.se2 import Array
 from rlml_slam.simulation.ray_cast import cast
 from rlml_slam.simulation.simulation import GroundTruth, Simulation
@@ -223,6 +223,7 @@ def row(slam: Slam, errors: list[float], t: float, before_mb: float) -> dict[str
     back_end = slam.back_end
     ms = np.array([u.cpu_ms for u in slam.updates])
     slam.updates.clear()
+    give_back()  # as the back end's node does after each map
     return {
         'hours': t / HOUR,
         'keyframes': len(back_end.keyframes),
