@@ -24,6 +24,10 @@ SECOND = 1_000_000_000
 Stamps = NDArray[np.int64]
 BATCH = 256  # samples at least that are forgotten at once
 COAST = 0.2  # [s] for which a robot is taken to go on as it went before its odometry ended
+# Share of the noise of a slow motion that is left where the wheels do not turn: what they miss is
+# less than a tick in all, and adds up to no walk. A larger one lets the noise of the first scan
+# turn the whole map, while the robot stands and could well average it out.
+STANDING = 0.02
 
 
 @brief
@@ -181,7 +185,7 @@ def _drive(
         # the wheels do not turn: so does the robot not, and the IMU shows its bias
         stands = known and speed == 0.0 and turn == 0.0
         if stands:
-            sigma_v, sigma_w = 0.1 * n.b, 0.1 * n.d
+            sigma_v, sigma_w = STANDING * n.b, STANDING * n.d
         rate = _rate(middle, imu_stamps, rates, n.max_gap)
         sigma_rate = n.imu_c * abs(rate) + n.imu_d
         bias, bias_sigma = rate - turn, math.hypot(sigma_rate, sigma_w)

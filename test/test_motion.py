@@ -242,7 +242,7 @@ def test_standing_robot_stays_where_it_is_almost_surely():
     m = filled(lambda t: np.array([3.0, 4.0, 1.0])).motion(T0, T0 + SECOND)
     np.testing.assert_array_equal(m.delta, 0.0)
     moving = filled(line(0.01)).motion(T0, T0 + SECOND)
-    assert (np.diag(m.cov)[[0, 2]] < 0.02 * np.diag(moving.cov)[[0, 2]]).all()
+    assert (np.diag(m.cov)[[0, 2]] < 0.001 * np.diag(moving.cov)[[0, 2]]).all()
 
 
 def test_intervals_compose():
