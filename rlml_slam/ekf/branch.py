@@ -22,11 +22,11 @@ from rlml_slam import se2
 from rlml_slam.ekf.association import compatible_ids
 from rlml_slam.ekf.candidates import Candidates
 from rlml_slam.ekf.extraction import Measured
-from rlml_slam.ekf.filter import BIAS, ROBOT, Filter
+from rlml_slam.ekf.filter import Filter
 from rlml_slam.ekf.likelihood import SAME_PLACE, log_density
 from rlml_slam.ekf.matching import Matcher
-from rlml_slam.ekf.models import POINT
-from rlml_slam.ekf.smoother import Sight, Step
+from rlml_slam.graph.landmark_models import POINT
+from rlml_slam.graph.smoother import BIAS, ROBOT, Sight, Step
 from rlml_slam.matching.hypotheses import GATE, OUTLIER, TOGETHER, UNKNOWN
 from rlml_slam.motion import STILL
 from rlml_slam.params import EkfParameters

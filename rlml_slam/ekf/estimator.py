@@ -20,8 +20,8 @@ from rlml_slam.ekf.extraction import Measured, measure
 from rlml_slam.ekf.filter import Filter
 from rlml_slam.ekf.likelihood import ALIKE
 from rlml_slam.ekf.matching import Matcher
-from rlml_slam.ekf.models import POINT, line_model
-from rlml_slam.ekf.smoother import Smoothed, Start, smooth
+from rlml_slam.graph.landmark_models import POINT, line_model
+from rlml_slam.graph.smoother import Smoothed, Start, smooth
 from rlml_slam.maps.occupancy import OccupancyGrid, render
 from rlml_slam.params import EkfParameters
 from rlml_slam.rlml.confirmation import START_SIGMA, Confirmation

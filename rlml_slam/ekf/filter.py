@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.ekf.models import Model
+from rlml_slam.graph.landmark_models import Model
+from rlml_slam.graph.smoother import BIAS, ROBOT, SPEED, TURN
 from rlml_slam.se2 import Array
 from rlml_slam.types import Motion
 
-BIAS, SPEED, TURN, ROBOT = 3, 4, 5, 6
 WHEELS = slice(SPEED, TURN + 1)
 JOINED = 1e-3  # [m] what the places of one landmark may differ by
 PENDING = 128  # updates whose share in Psi is summed up at once

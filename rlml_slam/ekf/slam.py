@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.ekf.estimator import Estimator
-from rlml_slam.ekf.smoother import Smoothed
+from rlml_slam.graph.smoother import Smoothed
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import EkfParameters
 from rlml_slam.se2 import Array

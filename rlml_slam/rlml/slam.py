@@ -21,6 +21,7 @@ from rlml_slam.rlml.apart import Apart
 from rlml_slam.rlml.back_end import BackEnd, Update
 from rlml_slam.rlml.find_place import find_place
 from rlml_slam.rlml.front_end import FrontEnd
+from rlml_slam.rlml.hindsight import Hindsight
 from rlml_slam.rlml.recovery import Recovery
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.driven import Driven
@@ -53,6 +54,9 @@ class Slam(Driven):
         self.front_end = FrontEnd(params)
         self.back_end = BackEnd(params, survey)
         self.recovery = Recovery(params)
+        self.hindsight = Hindsight(params)
+        if survey is not None:  # its frame is not that of the start
+            self.hindsight.close()
         self.updates: list[Update] = []
         self._params = params
         self._saved: SavedMap | None = None
@@ -73,6 +77,7 @@ class Slam(Driven):
         Where that is not told, it is taken to be at ``map_start_pose``. Raises FileFormatError if
         the parts of the map do not fit together.
         """
+        self.hindsight.close()  # the map knows what this run does not
         stored_map.restore(content, self.back_end)
         self._begin_in = stored_map.saved_map(content)
 
@@ -93,7 +98,19 @@ class Slam(Driven):
         frames = self.process(self.sequencer.flush()) + self._take_turns()
         if self._saved is None:
             self.back_end.finish()
+            self._look_back()
         return frames
+
+    def _look_back(self) -> None:
+        """Make the map again from what the whole run tells, where that is more."""
+        frames = self.hindsight.look_back(
+            self.back_end.trajectory()[1], self.back_end.reflectors()
+        )
+        if frames:
+            self.back_end.reset()
+            for frame in frames:
+                self.back_end.add(frame)
+            self.back_end.finish()
 
     def process(self, observations: Iterable[Observation]) -> list[Frame]:
         """What the sequencer made of the inputs."""
@@ -108,6 +125,7 @@ class Slam(Driven):
             frame = self.front_end.process(observation)
             if enters:  # no motion leads here from where the map was left
                 frame = replace(frame, jumped=True)
+            self.hindsight.add(observation, frame)
             if self._saved is not None:
                 self._path.append((frame.stamp, frame.T_map_base))
                 frames.append(frame)

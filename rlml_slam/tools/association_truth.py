@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.ekf.models import Model
+from rlml_slam.graph.landmark_models import Model
 from rlml_slam.se2 import Array
 from rlml_slam.tools.ate import interpolate
 from rlml_slam.tools.tum import Trajectory

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from rlml_slam import se2
-from rlml_slam.ekf.models import POINT
 from rlml_slam.ekf.slam import EkfSlam
+from rlml_slam.graph.landmark_models import POINT
 from rlml_slam.params import EkfParameters, SimulatorParameters, from_mapping
 from rlml_slam.rlml.slam import Slam
 from rlml_slam.simulation.simulation import Message

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rlml_slam.ekf.filter import Filter
-from rlml_slam.ekf.models import POINT
+from rlml_slam.graph.landmark_models import POINT
 from rlml_slam.params import Ransac
 from rlml_slam.se2 import Array
 from rlml_slam.sensing import lines as ransac

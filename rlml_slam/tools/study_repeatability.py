@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.ekf.models import POINT, line_model
+from rlml_slam.graph.landmark_models import POINT, line_model
 from rlml_slam.params import EkfParameters, from_mapping, read_yaml
 from rlml_slam.se2 import Array
 from rlml_slam.sensing import lines, spikes

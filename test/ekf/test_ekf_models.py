@@ -6,7 +6,7 @@ import pytest
 from differences import central_differences
 
 from rlml_slam import se2
-from rlml_slam.ekf.models import POINT, line_innovation, line_model, to_polar
+from rlml_slam.graph.landmark_models import POINT, line_innovation, line_model, to_polar
 
 # random, near 0 and near pi
 POSES = [(0.3, -0.7, 0.4), (2.0, 1.0, 1e-7), (-1.0, 0.5, np.pi - 1e-7), (0.1, 0.2, -2.6)]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from rlml_slam.ekf.models import POINT, line_model
+from rlml_slam.graph.landmark_models import POINT, line_model
 from rlml_slam.tools import study_ekf_consistency as consistency
 from rlml_slam.tools.association_truth import AssociationLog, association_figures
 from rlml_slam.tools.main import main

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.ekf.filter import BIAS, ROBOT, SPEED, TURN
-from rlml_slam.ekf.models import Model
+from rlml_slam.graph.landmark_models import Model
 from rlml_slam.se2 import Array
 from rlml_slam.types import Motion
 
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
     from scipy.sparse.linalg import SuperLU
 
+BIAS, SPEED, TURN, ROBOT = 3, 4, 5, 6  # after the pose, what gyro and wheels err by; the size
 ITERATIONS = 20
 SETTLED = 1e-6  # [m], [rad] of the largest correction
 LEAST = 1e-3  # share of a step below which a better one is not looked for
@@ -240,7 +240,9 @@ class _Problem:
             out.add(R, -nu, (robot, H_r), (columns, H_m))
 
 
-def smooth(start: Start, steps: Sequence[Step], model: Model, poses: Array) -> Smoothed:
+def smooth(
+    start: Start, steps: Sequence[Step], model: Model, poses: Array, iterations: int = ITERATIONS
+) -> Smoothed:
     """The path (n,) and the landmarks; ``poses`` (n, 3) are the filter's, to begin with."""
     problem = _Problem(start, steps, model)
     x = np.tile(start.x, (len(steps) + 1, 1))
@@ -248,7 +250,7 @@ def smooth(start: Start, steps: Sequence[Step], model: Model, poses: Array) -> S
     points = _first_points(problem.keys, steps, model, poses)
     rows = problem.rows(x, points)
     cost = float(rows.errors() @ rows.errors())
-    for _ in range(ITERATIONS):
+    for _ in range(iterations):
         dx = rows.step(x.size + points.size)
         share, best = 1.0, rows
         while True:

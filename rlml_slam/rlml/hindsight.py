@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run on reflectors and odometry alone, looked at again when it is over.
+
+While it goes on, a detection that fits several reflectors is used for none, and those that stand
+closer than can be told apart count as one. In the end the whole run tells which is which: every
+detection is matched once more to the reflectors as they turned out to be (:mod:`second_match`),
+and the path is smoothed by the new answers; in turns, until nothing changes. What the estimate
+errs by besides the noise of the detections shows in how far they are off, and shrinks from turn to
+turn (graduated assignment: Gold, Rangarajan 1996); a wrong answer of the first turns is so taken
+back later. The back end then goes through the run once more, as it should have been: its map is
+the only one.
+
+With scans there is no need: they hold the path by themselves, and the graph has them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam import se2
+from rlml_slam.graph.landmark_models import POINT, to_polar
+from rlml_slam.graph.smoother import Sight, Smoothed, Start, Step, smooth
+from rlml_slam.matching.association import gate
+from rlml_slam.params import Parameters
+from rlml_slam.rlml.second_match import Marks, SecondMatch
+from rlml_slam.se2 import Array
+from rlml_slam.types import Frame, Observation, Reflectors
+
+TURNS = 20
+STEPS = 3  # Gauss-Newton steps of a turn: the next one corrects what is left
+
+Indices = NDArray[np.int64]
+
+
+class Hindsight:
+    """Keeps what was measured, as long as it is reflectors and odometry alone."""
+
+    def __init__(self, params: Parameters) -> None:
+        self._p = params
+        self._frames: list[Frame] = []
+        self._steps: list[Step] = []
+        self._limit = gate(params.reflector.gate)
+        self._is_open = params.node.mode == 'mapping' and params.node.use_odom
+
+    def close(self) -> None:
+        """There will be nothing to look back on: the graph knows better."""
+        self._is_open = False
+        self._frames, self._steps = [], []
+
+    def add(self, observation: Observation, frame: Frame) -> None:
+        """Keep an observation and what the front end made of it; with a scan, none is kept."""
+        if not self._is_open:
+            return
+        is_long = len(self._steps) >= self._p.back_end.path_frames
+        known = observation.motion.known or not self._frames
+        if observation.points is not None or frame.jumped or not known or is_long:
+            self.close()
+            return
+        m = self._p.motion
+        dt = 1e-9 * (frame.stamp - self._frames[-1].stamp) if self._frames else 0.0
+        walk, kept = m.imu_bias_walk**2 * dt, math.exp(-dt / m.wheels_time)
+        self._steps.append(Step(observation.motion, walk, kept))
+        self._frames.append(frame)
+
+    def look_back(self, poses: Array, reflectors: Reflectors) -> list[Frame]:
+        """The frames as they should have been, from the graph's ``poses`` (n, 3) and reflectors.
+
+        Their local frame is that of the map; landmarks are numbered from 0. Empty if there is
+        nothing to look back on.
+        """
+        if not self._is_open or not len(reflectors) or len(poses) != len(self._steps):
+            return []
+        match = SecondMatch([f.observation.detections for f in self._frames], self._p.reflector)
+        marks = Marks(reflectors.points, reflectors.ids)
+        answers: Indices = np.zeros(0, dtype=np.int64)
+        for _ in range(TURNS):
+            before = answers
+            marks, answers = match.answer(poses, marks)
+            smoothed = smooth(self._start(), self._sights(match, answers, poses, marks.points),
+                              POINT, poses, STEPS)  # fmt: skip
+            poses, marks = smoothed.states[:, :3], Marks(smoothed.points, marks.ids)
+            if np.array_equal(before, answers):
+                break
+        return self._told(smoothed, match.looks(answers))
+
+    def _start(self) -> Start:
+        """Where the run began, which defines the map, and what is not known of gyro and wheels."""
+        m = self._p.motion
+        sigma = np.array([0.0, 0.0, 0.0, m.imu_bias, *m.wheels])
+        return Start(np.append(self._p.node.map_start_pose, np.zeros(3)), np.diag(sigma**2))
+
+    def _sights(
+        self, match: SecondMatch, answers: Indices, poses: Array, points: Array
+    ) -> list[Step]:
+        """The steps with what each one saw; by Cauchy's loss, what is far off counts less."""
+        steps = []
+        for step, frame, at, pose in zip(
+            self._steps, self._frames, match.looks(answers), poses, strict=True
+        ):
+            d, used = frame.observation.detections, np.flatnonzero(at >= 0)
+            if d is None or not len(used):
+                steps.append(step)
+                continue
+            z, R = to_polar(d.points[used], d.cov[used])
+            nu = POINT.innovation(z, POINT.observe(pose, points[at[used]])[0])
+            d2 = _distance2(nu, R)
+            R *= (1.0 + d2 / self._p.reflector.robust_scale**2)[:, None, None]
+            sights = tuple(map(Sight, at[used].tolist(), z, R))
+            steps.append(dataclasses.replace(step, sights=sights))
+        return steps
+
+    def _told(self, smoothed: Smoothed, looks: Sequence[Indices]) -> list[Frame]:
+        """The frames as they should have been: all that is measured is where the end has it.
+
+        So the graph of them has its minimum where the run turned out to be. What it knows is as
+        much as was measured, for the covariances stay.
+        """
+        poses = np.concatenate([smoothed.start[None, :3], smoothed.states[:, :3]])
+        out = []
+        for frame, a, b, at in zip(self._frames, poses[:-1], poses[1:], looks, strict=True):
+            motion = dataclasses.replace(frame.observation.motion, delta=se2.between(a, b))
+            observation = dataclasses.replace(frame.observation, motion=motion)
+            if (d := observation.detections) is not None:
+                points, at = d.points.copy(), at.copy()
+                used = np.flatnonzero(at >= 0)
+                points[used] = se2.transform(se2.inverse(b), smoothed.points[at[used]])
+                off = _distance2(d.points[used] - points[used], d.cov[used])
+                at[used[off > self._limit]] = -1  # told by an id, but elsewhere
+                observation = dataclasses.replace(
+                    observation, detections=dataclasses.replace(d, points=points)
+                )
+            out.append(
+                dataclasses.replace(
+                    frame, observation=observation, landmarks=at, T_local_base=b.copy()
+                )
+            )
+        return out
+
+
+def _distance2(nu: Array, cov: Array) -> Array:
+    """Squared Mahalanobis distances (k,) of nu (k, 2)."""
+    return np.asarray(np.einsum('ki,ki->k', nu, np.linalg.solve(cov, nu[..., None])[..., 0]))

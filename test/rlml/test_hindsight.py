@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Looking back on a run on reflectors and odometry alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rlml.made_worlds import ROOM, TinyWorld, drive, errors, observations
+
+from rlml_slam.params import Parameters
+from rlml_slam.rlml import stored_map
+from rlml_slam.rlml.slam import Slam
+
+ROUND = drive(*[(0.5, 0.4, 15.7)] * 3)  # three times round a circle of 1.25 m
+SINGLE = np.array([[4.0, 0.0], [0.0, 4.5], [-3.5, 1.0], [1.0, -2.5]])
+BESIDE = np.array([[0.0, 1.0], [1.0, 0.0], [0.0, 1.0], [1.0, 0.0]])
+
+
+def world(*groups):
+    return TinyWorld(np.zeros((0, 4)), np.concatenate(groups))
+
+
+def run(place, seed=None, seen=1.0, **kwargs):
+    """The system before it looks back; of the reflectors in view, a share is ``seen``."""
+    rng = None if seed is None else np.random.default_rng(seed)
+    made = observations(place, ROUND, rng=rng, **kwargs)
+    if seen < 1.0:
+        for k, o in enumerate(made):
+            d, kept = o.detections, rng.random(len(o.detections)) < seen
+            d = replace(
+                d, points=d.points[kept], cov=d.cov[kept], ids=d.ids[kept],
+                diameters=d.diameters[kept],
+            )  # fmt: skip
+            made[k] = replace(o, detections=d)
+    slam = Slam(Parameters())
+    slam.process(made)
+    slam.back_end.finish()
+    return slam
+
+
+def rmse(slam):
+    """Of the position [m]."""
+    poses = slam.back_end.trajectory()[1]
+    return float(np.sqrt(((poses[:, :2] - ROUND[:, :2]) ** 2).sum(axis=1).mean()))
+
+
+def test_noiseless_run_stays_exact():
+    slam = run(ROOM, scan=False)
+    slam.finish()
+    assert np.abs(errors(slam.trajectory()[1], ROUND)).max() < 1e-4
+    assert len(slam.reflectors()) == len(ROOM.reflectors)
+
+
+@pytest.mark.parametrize(('apart', 'sigma'), [(0.15, 0.03), (0.25, 0.08)])
+@pytest.mark.parametrize('seed', [0, 1])
+def test_reflectors_of_a_group_are_told_apart_in_the_end(seed, apart, sigma):
+    """Closer than can be told while the run goes on, which takes a group for one."""
+    place = world(SINGLE, SINGLE + apart * BESIDE)
+    slam = run(place, seed, scan=False, sigma=sigma)
+    assert len(slam.reflectors()) < len(place.reflectors)
+    before = rmse(slam)
+    slam.finish()
+    found = slam.reflectors()
+    gap = np.linalg.norm(found.points[:, None] - place.reflectors, axis=-1)
+    assert sorted(gap.argmin(axis=1)) == list(range(len(place.reflectors)))
+    assert gap.min(axis=1).max() < 0.5 * apart
+    assert rmse(slam) < before
+
+
+@pytest.mark.parametrize('seed', [0, 1, 2])
+def test_reflector_by_itself_stays_one_however_it_scatters(seed):
+    slam = run(world(SINGLE), seed, seen=0.6, scan=False, sigma=0.15)
+    before = rmse(slam)
+    slam.finish()
+    assert len(slam.reflectors()) == len(SINGLE)
+    # in these runs there is nothing to be gained
+    assert rmse(slam) < 1.2 * before
+
+
+def test_the_graph_has_its_minimum_where_the_run_turned_out_to_be():
+    slam = run(world(SINGLE, SINGLE + 0.5 * BESIDE), 5, scan=False, sigma=0.05)
+    slam.finish()
+    poses = slam.back_end.graph.poses.copy()
+    assert slam.back_end.graph.chi2() < 1e-6
+    slam.back_end.optimize(final=True)
+    np.testing.assert_allclose(slam.back_end.graph.poses, poses, atol=1e-9)
+
+
+def test_ids_are_kept():
+    slam = run(ROOM, 3, scan=False, ids=True)
+    slam.finish()
+    assert sorted(slam.reflectors().ids) == list(range(100, 100 + len(ROOM.reflectors)))
+
+
+def test_with_scans_there_is_nothing_to_look_back_on():
+    slam = run(ROOM, 4)
+    assert slam.hindsight.look_back(slam.back_end.trajectory()[1], slam.reflectors()) == []
+
+
+def test_map_that_is_gone_on_with_stays_what_it_was():
+    """It has seen what this run has not: it is not made anew of the run alone."""
+    slam = run(world(SINGLE), 6, scan=False, sigma=0.02)
+    slam.finish()
+    content = stored_map.content_of(slam.back_end, Parameters(), None)
+    again = Slam(Parameters())
+    again.continue_map(content)
+    keyframes = len(again.back_end.keyframes)
+    made = observations(world(SINGLE), ROUND[:60], rng=np.random.default_rng(7), scan=False)
+    again.process([replace(o, stamp=o.stamp + 10**12) for o in made])
+    again.finish()
+    assert len(again.back_end.keyframes) >= keyframes
+    assert again.hindsight.look_back(np.zeros((60, 3)), again.reflectors()) == []
