@@ -196,11 +196,16 @@ def _drive(
         # the figures hold for n.interval: a shorter one has the same accumulated noise; where
         # the motion is too fast for its interval, the stamps are wrong, not the noise larger
         lasted = max(dt, abs(speed) * dt / n.max_speed, abs(turn) * dt / n.max_turn_rate)
-        scale = n.interval / lasted
-        lateral = n.lateral * abs(speed) if known else n.max_speed / 5.0
+        scale = along = n.interval / lasted
+        lateral = n.lateral * abs(speed)
+        if not known:
+            # one unknown speed for all of a gap: the variance of the way goes with the square of
+            # the time since odometry ended, and that of a part is what it grows by
+            lateral, since = n.max_speed / 5.0, _since(middle, stamps, at)
+            along = max(n.interval, 2.0 * since) / dt
         rows[0, k], rows[1, k], rows[2, k], rows[6, k] = speed, turn, dt, gyro
-        rows[3, k], rows[4, k] = sigma_v**2 * scale, sigma_w**2 * scale
-        rows[5, k] = lateral**2 * scale
+        rows[3, k], rows[4, k] = sigma_v**2 * along, sigma_w**2 * scale
+        rows[5, k] = lateral**2 * along
         all_known = all_known and known
         if says_bias:
             weight += 1.0 / (bias_sigma**2 * scale)
@@ -210,6 +215,14 @@ def _drive(
     if weight > 0.0:
         return out, all_known, weighted / weight, 1.0 / weight, turned / weight
     return out, all_known, 0.0, np.inf, 0.0
+
+
+@part
+def _since(stamp: int, stamps: Stamps, at: int) -> float:
+    """Seconds to the sample ``at - 1`` before a stamp, where there is none to the first one."""
+    if not len(stamps):
+        return 0.0
+    return float(abs(stamp - stamps[max(at - 1, 0)]) / SECOND)
 
 
 @part
@@ -357,7 +370,7 @@ class MotionBuffer:
         """Relative motion of base from stamp ``start`` to ``end`` (eq. 5-9).
 
         Parts without odometry, across a gap or a jump, count as standing still with the noise of
-        an unknown speed, and make the result ``known=False``. A control interval before the first
+        one unknown speed, and make the result ``known=False``. A control interval before the first
         odometry is none of them: its first speed holds there too.
         """
         if end <= start:

@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import itertools
 import math
 
 import numpy as np
@@ -342,11 +343,22 @@ def test_motion_across_a_long_gap_is_unknown_and_wide():
     m = with_gap(gap).motion(T0 + 2 * SECOND, T0 + round((2.0 + gap) * SECOND))
     assert not m.known
     np.testing.assert_array_equal(m.delta, 0.0)
-    # a speed that is unknown anew in each interval; one that lasts would be gap^2
+    # a speed that lasts, and a turn rate that is unknown anew in each interval: after so long, no
+    # heading is left to be known either way
     expected = (np.array([NOISE.max_speed, NOISE.max_speed, NOISE.max_turn_rate]) / 5.0) ** 2
-    np.testing.assert_allclose(np.diag(m.cov), expected * NOISE.interval * gap, rtol=1e-9)
+    lasted = np.array([gap, gap, NOISE.interval])
+    np.testing.assert_allclose(np.diag(m.cov), expected * gap * lasted, rtol=1e-9)
     longer = with_gap(gap).motion(T0 + SECOND, T0 + round((2.5 + gap) * SECOND))
     assert not longer.known
+
+
+def test_parts_of_a_gap_add_up_to_the_whole():
+    gap = NOISE.max_gap + 1.0
+    ends = T0 + 2 * SECOND + np.rint(np.linspace(0.0, gap, 8) * SECOND).astype(np.int64)
+    buffer = with_gap(gap)
+    whole = buffer.motion(int(ends[0]), int(ends[-1])).cov
+    parts = [buffer.motion(a, b).cov for a, b in itertools.pairwise(ends.tolist())]
+    np.testing.assert_allclose(sum(np.diag(cov) for cov in parts), np.diag(whole), rtol=1e-6)
 
 
 def test_one_sample_that_jumps_away_is_dropped():

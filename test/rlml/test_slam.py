@@ -4,7 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_worlds import FIRST, ROOM, SECOND, STEP, detections_of, drive, errors, messages
+from made_worlds import (
+    FIRST,
+    ROOM,
+    SECOND,
+    STEP,
+    TinyWorld,
+    detections_of,
+    drive,
+    errors,
+    messages,
+    polygon,
+)
 
 from rlml_slam import se2
 from rlml_slam.errors import SolverError
@@ -13,6 +24,12 @@ from rlml_slam.rlml import slam as slam_module
 from rlml_slam.rlml.slam import Slam
 from rlml_slam.types import Detections, Imu, Level, Odometry, Scan
 
+HALL = TinyWorld(
+    np.vstack(
+        [polygon((-4, -4), (6, -4), (6.5, 6), (-3.5, 5.5)), polygon((5, 0), (6, 0), (5, 1))]
+    ),
+    np.array([[-3.8, -3.5], [5.5, -3.4], [5.9, 5.2], [-3.2, 5.1], [1.0, 5.5], [2.5, -3.8]]),
+)
 CURVE = drive((0.6, 0.0, 2.0), (0.6, 0.6, 3.0), (0.5, -0.7, 1.0))
 
 
@@ -105,6 +122,21 @@ def test_moving_the_start_pose_moves_the_result():
     distance, turn = errors(b.trajectory()[1], se2.compose(np.array(start), a.trajectory()[1]))
     # the solver stops at a relative fall of the cost of 1e-5
     assert max(distance.max(), turn.max()) < 1e-4
+
+
+@pytest.mark.parametrize('scan', [False, True])
+def test_reflectors_are_known_again_after_a_pause_of_everything(scan):
+    """Five seconds, in which the robot goes on for metres: nothing tells where it went."""
+    path = drive((0.8, 0.0, 2.0), (0.8, 0.5, 25.0), start=(0.0, -1.2, 0.0))
+    sent = messages(HALL, path, scan=scan, rng=np.random.default_rng(5))
+    begin = FIRST + 15 * SECOND
+    sent = [m for m in sent if not begin < m.stamp < begin + 5 * SECOND]
+    _, slam = run(sent, Parameters(node=Node(map_start_pose=tuple(path[0]))))
+    assert len(slam.reflectors()) == len(HALL.reflectors)
+    stamps, poses = slam.trajectory()
+    distance, _ = errors(poses, path[(stamps - FIRST) // STEP])
+    # but for the one frame that was extrapolated when the pause began
+    assert np.sort(distance)[-2] < 0.1
 
 
 def test_ghosts_and_broken_messages_leave_no_trace_in_the_map():
