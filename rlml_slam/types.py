@@ -201,11 +201,12 @@ class Belief:
 
 
 class Verdict(Enum):
-    """What a search of the whole map says."""
+    """What a search of the whole map says; NOT_SEARCHED where there is too much to be searched."""
 
     UNIQUE = 'unique'
     AMBIGUOUS = 'ambiguous'
     IMPOSSIBLE = 'impossible'
+    NOT_SEARCHED = 'not searched'
 
 
 class EdgeKind(Enum):

@@ -18,6 +18,8 @@ from rlml_slam import se2
 from rlml_slam.matching.association import gate
 from rlml_slam.matching.pair_votes import (
     LOOSE,
+    MAX_PAIRS,
+    MAX_TESTS,
     MIN_MATCHES,
     buckets_of,
     pairs_of,
@@ -77,8 +79,8 @@ class Candidate:
 class Constellation:
     """The verdict, why in words, and the candidates, best first.
 
-    One candidate where unique, none where impossible. ``chance`` is how many poses are expected
-    to match as many detections as the best one does by chance, infinite without a pose.
+    One candidate where unique, none where impossible or not searched. ``chance`` is how many poses
+    are expected to match as many detections as the best one does by chance, infinite without one.
     """
 
     verdict: Verdict
@@ -94,12 +96,14 @@ def locate(
     reflectors_cov: Array,
     params: Relocalization,
     prior: Prior | None = None,
+    max_tests: int = MAX_TESTS,
 ) -> Constellation:
     """Find detections ``points`` (k, 2) with ``cov`` (k, 2, 2), base frame, among ``reflectors``.
 
     The reflectors (m, 2) and their covariances (m, 2, 2) are of the map frame. What is not finite
     does not take part. Where the matches lie farther apart than their covariances allow, these
-    are widened until they do, once.
+    are widened until they do, once. Where thousands of reflectors stand alike, there may be more
+    to be searched than ``max_tests``: then the verdict is just that.
     """
     used = np.flatnonzero(np.isfinite(points).all(axis=1) & np.isfinite(cov).all(axis=(1, 2)))
     k, m = len(used), len(reflectors)
@@ -107,18 +111,20 @@ def locate(
         return Constellation(Verdict.IMPOSSIBLE, f'the map has {m} reflectors, three are needed')
     if k < MIN_MATCHES:
         return Constellation(Verdict.IMPOSSIBLE, f'{k} reflectors are seen, three are needed')
+    if m * (m - 1) // 2 > MAX_PAIRS:
+        return _not_searched(k, m)
     z = np.ascontiguousarray(points[used], dtype=np.float64)
     z_cov = cov[used] + params.sigma_floor**2 * np.eye(2)
     p = np.ascontiguousarray(reflectors, dtype=np.float64)
     p_cov = np.ascontiguousarray(reflectors_cov, dtype=np.float64)
-    result = _Search(z, z_cov, p, p_cov, params).run(prior)
+    result = _Search(z, z_cov, p, p_cov, params, max_tests).run(prior)
     if result.verdict is Verdict.UNIQUE:
         best = result.candidates[0]
         dof = 2 * best.num_matches - (3 if prior is None else 0)
         # the noise is larger than stated, and gates by what was stated may have cut off a rival
         if best.chi2 > gate(1.0 - params.risk, dof):
             scale = best.chi2 / dof
-            result = _Search(z, scale * z_cov, p, scale * p_cov, params).run(prior)
+            result = _Search(z, scale * z_cov, p, scale * p_cov, params, max_tests).run(prior)
     match = np.full((len(result.candidates), len(points)), -1, dtype=np.int64)
     for row, c in zip(match, result.candidates, strict=True):
         row[used] = c.match
@@ -129,7 +135,11 @@ def locate(
 class _Search:
     """One search: detections z (k, 2) and reflectors p (m, 2) with covariances."""
 
-    def __init__(self, z: Array, z_cov: Array, p: Array, p_cov: Array, params: Relocalization):
+    def __init__(
+        self, z: Array, z_cov: Array, p: Array, p_cov: Array, params: Relocalization,
+        max_tests: int,
+    ) -> None:  # fmt: skip
+        self._max_tests = max_tests
         self._z, self._z_cov, self._p, self._p_cov, self._params = z, z_cov, p, p_cov, params
         self._gate2 = gate(params.gate)
         self._z_var = _largest(z_cov)
@@ -141,22 +151,24 @@ class _Search:
 
     def run(self, prior: Prior | None) -> Constellation:
         """Verdict and candidates."""
-        found, proposals = self._candidates(prior)
+        found, proposals, searched = self._candidates(prior)
+        if not searched:
+            return _not_searched(len(self._z), len(self._p))
         if found:
             return self._judged(found, proposals)
         why = f'no pose matches three of the {len(self._z)} detections with the map'
         return Constellation(Verdict.IMPOSSIBLE, why)
 
-    def _candidates(self, prior: Prior | None) -> tuple[list[Candidate], int]:
-        """All different poses, best first, and the number of proposals that they came from."""
+    def _candidates(self, prior: Prior | None) -> tuple[list[Candidate], int, bool]:
+        """All different poses, best first; of how many proposals; whether that were all."""
         pose = np.zeros(3) if prior is None else np.array(prior.pose, dtype=np.float64)
         information = np.zeros((3, 3))
         if prior is not None:
             information[:] = np.linalg.inv(prior.cov)
         buckets = buckets_of(self._p, float(np.sqrt((1.0 + LOOSE) * self._floor2)))
-        counts, bases, proposals = vote(
+        counts, bases, proposals, searched = vote(
             self._z, self._z_var, self._p, self._p_var, pairs_of(self._p), buckets, self._gate2,
-            pose, information, gate(self._params.gate, 3),
+            pose, information, gate(self._params.gate, 3), self._max_tests,
         )  # fmt: skip
         found: list[Candidate] = []
         matches = np.full((MAX_CANDIDATES, len(self._z)), -1, dtype=np.int64)
@@ -180,7 +192,7 @@ class _Search:
                 matches[twin], found[twin] = match, candidate
             if len(found) == MAX_CANDIDATES:
                 break
-        return sorted(found, key=_rank), proposals
+        return sorted(found, key=_rank), proposals, searched
 
     def _scored(self, T: Array, cov: Array, match: NDArray[np.int64], chi2: float) -> Candidate:
         """The likelihood ratio of a pose against one at which every detection is a ghost.
@@ -252,6 +264,11 @@ class _Search:
             # at which so many proposals are expected to reach what that many do
             share = max(share, float(betaincinv(s, others - s + 1, min(TYPICAL / proposals, 1.0))))
         return float(proposals * bdtrc(num_matches[0] - 3, others, share))
+
+
+def _not_searched(k: int, m: int) -> Constellation:
+    why = f'{k} detections are too many to be searched among {m} reflectors that stand so alike'
+    return Constellation(Verdict.NOT_SEARCHED, why)
 
 
 def _area(points: Array, floor2: float) -> float:

@@ -24,6 +24,10 @@ CAPACITY = 20000  # of the proposals kept; the ones with fewest matches go first
 LOOSE = 4.0  # a match waits while the pose's variance there is this many times the noise
 ROUNDS = 12  # of matching and fitting; a pose that still changes is taken as it is
 MAX_CELLS = 256  # per side of the buckets
+MAX_PAIRS = 10_000_000  # of reflectors: as many take 300 MB
+# Pairs of reflectors, and detections at them, that a search looks at: half a second of it. Sixty
+# detections are found with less among two thousand reflectors, if these do not stand in rows.
+MAX_TESTS = 50_000_000
 
 
 class Buckets(NamedTuple):
@@ -124,13 +128,15 @@ def vote(
     prior: Array,
     information: Array,
     prior_gate2: float,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
+    max_tests: int,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], int, bool]:
     """Proposals with at least MIN_MATCHES matches and not over SLACK fewer than the best.
 
     Detections ``z`` (k, 2) with variances of their worst direction ``z_var`` (k,), reflectors
     ``p`` (m, 2) likewise. A pose must lie within ``prior_gate2`` of ``prior`` (3,) in the squared
     distance of ``information`` (3, 3); zeros are no prior. Returns counts (h,), bases (h, 4) =
-    detections a, b and their reflectors, and how many proposals there were at all.
+    detections a, b and their reflectors, how many proposals there were at all, and whether these
+    are all: after ``max_tests`` the search ends.
     """
     k, m = len(z), len(p)
     g = math.sqrt(gate2)
@@ -142,8 +148,11 @@ def vote(
     kept, proposals, best, need, stamp = 0, 0, 0, MIN_MATCHES, 0
     taken = np.zeros(m, np.int64)
     lens = np.zeros(k, np.int64)
+    tests = 0
     for a in range(k):
         for b in range(a + 1, k):
+            if tests > max_tests:
+                return counts[:0], bases[:0], proposals, False
             dx, dy = z[b, 0] - z[a, 0], z[b, 1] - z[a, 1]
             length = math.hypot(dx, dy)
             tolerance = g * math.sqrt(z_var[a] + z_var[b] + 2.0 * widest_var)
@@ -161,6 +170,7 @@ def vote(
                 if near_a and math.hypot(z[c, 0] - z[b, 0], z[c, 1] - z[b, 1]) <= length:
                     lens[inside] = c
                     inside += 1
+            tests += 2 * (high - low)
             for q in range(2 * low, 2 * high):
                 i, j = pairs.first[q // 2], pairs.second[q // 2]
                 if q % 2 == 1:
@@ -200,6 +210,7 @@ def vote(
                 for n in range(inside):
                     if count + inside - n < need:
                         break
+                    tests += 1
                     c = lens[n]
                     x = tx + cos * z[c, 0] - sin * z[c, 1]
                     y = ty + sin * z[c, 0] + cos * z[c, 1]
@@ -243,7 +254,7 @@ def vote(
             for i in range(4):
                 bases[chosen, i] = bases[n, i]
             chosen += 1
-    return counts[:chosen], bases[:chosen], proposals
+    return counts[:chosen], bases[:chosen], proposals, True
 
 
 @kernel
@@ -438,5 +449,6 @@ def warm_up() -> None:
     var, cov = np.full(3, 1e-4), np.tile(1e-4 * np.eye(2), (3, 1, 1))
     none, nothing = np.zeros(3), np.zeros((3, 3))
     buckets = buckets_of(p, 0.1)
-    _, bases, _ = vote(p, var, p, var, pairs_of(p), buckets, 9.0, none, nothing, 9.0)
+    pairs = pairs_of(p)
+    _, bases, _, _ = vote(p, var, p, var, pairs, buckets, 9.0, none, nothing, 9.0, MAX_TESTS)
     refine(bases[0], p, cov, p, cov, buckets, 9.0, 2e-4, none, nothing)

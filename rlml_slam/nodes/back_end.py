@@ -73,6 +73,7 @@ class BackEndNode(Node):
         """Figures for /diagnostics."""
         graph, tried = self.mapper.back_end.graph, self.mapper.back_end.scans.tried
         plant = self.mapper.back_end.plant
+        not_searched = self.mapper.back_end.constellations.not_searched
         return {
             'keyframes': len(graph.poses),
             'edges': len(graph.edges),
@@ -81,6 +82,7 @@ class BackEndNode(Node):
             **fates(self.mapper.back_end.scans.closures),
             **self.mapper.continued,
             **({} if plant is None else {'survey': plant.why}),
+            **({'constellations not searched': not_searched} if not_searched else {}),
             'frames waiting for the worker': self.mapper.worker.backlog,
             'frames without their points or detections': self.join.incomplete,
         }

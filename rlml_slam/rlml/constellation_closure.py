@@ -53,13 +53,17 @@ class Place:
 
 
 class Constellations:
-    """Looks again whenever another reflector is new."""
+    """Looks again whenever another reflector is new.
+
+    ``not_searched`` counts the times when there was too much to be searched.
+    """
 
     def __init__(self, params: Parameters, graph: Graph, reflectors: ReflectorGraph) -> None:
         self._p = params
         self._graph = graph
         self._reflectors = reflectors
         self._looked: frozenset[int] = frozenset()
+        self.not_searched = 0
 
     def look(self, keys: Sequence[Keyframe]) -> Place | None:
         """Where the newest of some keyframes is among what was mapped before, if that is told."""
@@ -82,6 +86,7 @@ class Constellations:
         points, cov = self._seen_from(pose, new)
         places, spread = self._seen_from(np.zeros(3), old)
         stars = locate(points, cov, places, spread, self._p.relocalization)
+        self.not_searched += stars.verdict is Verdict.NOT_SEARCHED
         if stars.verdict is not Verdict.UNIQUE or stars.candidates[0].num_matches < LEAST:
             return None
         return self._place(keys, stars.candidates[0], new, old, stars.chance, places)

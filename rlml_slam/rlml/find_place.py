@@ -8,6 +8,8 @@ nothing is unique.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from rlml_slam import se2
@@ -56,6 +58,10 @@ def find_place(
     by_scan = relocalize(grid, points, p, complete)
     if stars.verdict is Verdict.IMPOSSIBLE:
         return by_scan
+    if stars.verdict is Verdict.NOT_SEARCHED:
+        nowhere = by_scan.verdict is Verdict.IMPOSSIBLE
+        verdict = Verdict.NOT_SEARCHED if nowhere else by_scan.verdict
+        return replace(by_scan, verdict=verdict, why=f'{by_scan.why}; {stars.why}')
     return _of_several(stars, by_scan, grid, points, p, complete)
 
 

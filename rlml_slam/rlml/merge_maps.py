@@ -20,6 +20,7 @@ from rlml_slam.graph.factors import relative_information
 from rlml_slam.maps.container import Content
 from rlml_slam.maps.survey import same
 from rlml_slam.matching.constellation import locate
+from rlml_slam.matching.pair_votes import MAX_TESTS
 from rlml_slam.params import Parameters, Relocalization
 from rlml_slam.rlml import stored_map
 from rlml_slam.rlml.back_end import BackEnd
@@ -30,6 +31,7 @@ from rlml_slam.types import EdgeKind, Verdict
 # of a map that overlaps with another, most reflectors may be of places that the other lacks; that
 # what they have in common is no chance, the verdict still has to show
 APART = 0.95
+PATIENCE = 100  # nobody waits for a pose: a minute of searching at most
 LATER = (
     'key_looked', 'key_jumped', 'reflector_gone', 'reflector_life', 'reflector_surveyed',
     'reflector_view',
@@ -62,7 +64,8 @@ def merge_maps(first: Content, second: Content, params: Parameters) -> Merged:
         raise MapError('the maps have the frames of two different surveys')
     if surveys[0] is None and surveys[1] is not None:
         raise MapError('only the second map has the frame of a survey: name it first')
-    stars = locate(b.points, b.cov, a.points, a.cov, replace(Relocalization(), ghosts=APART))
+    alike = replace(Relocalization(), ghosts=APART)
+    stars = locate(b.points, b.cov, a.points, a.cov, alike, max_tests=PATIENCE * MAX_TESTS)
     if stars.verdict is not Verdict.UNIQUE:
         raise MapError(f'the reflectors do not tell how the maps lie: {stars.why}')
     best = stars.candidates[0]

@@ -384,6 +384,37 @@ def test_crowded_regular_map_is_searched_to_the_end():
     assert min(error_of(c.pose)[0] for c in found.candidates) < 0.05
 
 
+def lattice(n):
+    x, y = np.meshgrid(np.arange(n) * 4.0, np.arange(n) * 4.0)
+    return np.stack([x.ravel(), y.ravel()], -1)
+
+
+@pytest.mark.parametrize('k', [200, 1000])
+def test_search_of_a_plant_in_rows_ends_without_a_guess(k):
+    """Without a bound, two hundred take minutes, and a thousand days."""
+    reflectors = lattice(45)
+    z = np.random.default_rng(19).uniform(0.0, 28.0, (k, 2))
+    found = search(z, reflectors)
+    assert found.verdict is Verdict.NOT_SEARCHED
+    assert found.candidates == ()
+    assert f'{k} detections are too many' in found.why
+
+
+def test_map_with_too_many_pairs_is_not_searched():
+    found = search(lattice(4), lattice(68))
+    assert found.verdict is Verdict.NOT_SEARCHED
+
+
+def test_search_that_may_take_longer_finds_the_same():
+    rng = np.random.default_rng(20)
+    reflectors, z = with_ghosts(rng)
+    arguments = z, covs(len(z)), reflectors, covs(len(reflectors), 0.01), P
+    found, longer = locate(*arguments), locate(*arguments, max_tests=10**12)
+    assert found.verdict is longer.verdict is Verdict.UNIQUE
+    np.testing.assert_array_equal(found.candidates[0].pose, longer.candidates[0].pose)
+    assert locate(*arguments, max_tests=100).verdict is Verdict.NOT_SEARCHED
+
+
 def test_kernels_are_compiled_by_the_warm_up():
     pair_votes.warm_up()
     rng = np.random.default_rng(19)

@@ -11,8 +11,10 @@ from made_maps import whole
 from made_worlds import TinyWorld, drive, observations
 
 from rlml_slam import se2
+from rlml_slam.matching.constellation import Constellation
 from rlml_slam.params import LoopClosure, Parameters
-from rlml_slam.types import Detections, Motion
+from rlml_slam.rlml import constellation_closure
+from rlml_slam.types import Detections, Motion, Verdict
 
 # a yard of 45 by 30 m: posts stand where the drive begins and ends, and none on the way
 POSTS = np.array(
@@ -85,6 +87,16 @@ def test_posts_of_another_place_are_not_taken_for_known_ones():
     posts = np.vstack([POSTS, there])
     back_end = mapped(posts, path, Parameters())
     assert len(back_end.reflectors()) == 14
+    assert not any(c.accepted for c in back_end.scans.closures)
+
+
+def test_what_could_not_be_searched_is_counted_and_closes_nothing(monkeypatch):
+    def never(*_, **__):
+        return Constellation(Verdict.NOT_SEARCHED, 'too many')
+
+    monkeypatch.setattr(constellation_closure, 'locate', never)
+    back_end = mapped(POSTS, PATH, Parameters())
+    assert back_end.constellations.not_searched > 0
     assert not any(c.accepted for c in back_end.scans.closures)
 
 

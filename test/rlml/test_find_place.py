@@ -131,6 +131,20 @@ def test_scan_alone_tells_the_place_where_reflectors_cannot():
         assert_here(found)
 
 
+def test_scan_tells_the_place_where_reflectors_are_too_many_to_be_searched():
+    x, y = np.meshgrid(20.0 + 4.0 * np.arange(68), 4.0 * np.arange(68))
+    far = np.stack([x.ravel(), y.ravel()], -1)
+    plant = map_of(np.vstack([ROOM.reflectors, far]))
+    found = find_place(grid_of(ROOM), plant, seen(ROOM), P)
+    assert found.verdict is Verdict.UNIQUE
+    assert_here(found)
+    # a place that nothing was searched for is not impossible
+    found = find_place(None, plant, seen(ROOM), P)
+    assert found.verdict is Verdict.NOT_SEARCHED
+    assert found.pose is None
+    assert 'too many to be searched' in found.why
+
+
 def test_reflectors_that_are_switched_off_do_not_count():
     world = TinyWorld(HALL, SOME)
     off = replace(P, node=replace(Node(), use_reflectors=False))
