@@ -63,8 +63,16 @@ def eliminate(graph: Graph, pose: int, floor2: Array) -> Elimination:
     """Disable the edges of ``pose`` and tie its neighbours to one another.
 
     Its sightings are the caller's to move. Robust weights at the current estimate count; fused
-    edges are no better than ``floor2`` (3,). Raises SolverError for a pose without edges.
+    edges are no better than ``floor2`` (3,). Raises SolverError for a pose without edges, or where
+    its neighbours cannot be tied by numbers of this size; then the graph is as it was.
     """
+    try:
+        return _eliminated(graph, pose, floor2)
+    except np.linalg.LinAlgError as e:
+        raise SolverError(f'pose {pose} cannot be eliminated: {e}') from e
+
+
+def _eliminated(graph: Graph, pose: int, floor2: Array) -> Elimination:
     edges = graph.edges
     touching = np.flatnonzero((edges.nodes == pose).any(-1) & edges.enabled)
     if not len(touching):
@@ -76,11 +84,11 @@ def eliminate(graph: Graph, pose: int, floor2: Array) -> Elimination:
     np.maximum.at(kinds, at, edges.kinds[touching])  # that of the least trusted one
     hub = int(np.argmin(np.linalg.slogdet(star.cov)[1]))
     onto, back = int(who[hub]), Ties(star.T[hub], star.cov[hub]).inverse()
-    edges.enabled[touching] = False
     rest = np.delete(np.arange(len(who)), hub)
     leaves = back.then(Ties(star.T[rest], star.cov[rest]))
     kinds = np.maximum(kinds[rest], kinds[hub])
     index, replaced, of = _tie(graph, onto, who[rest], leaves, kinds, floor2)
+    edges.enabled[touching] = False
     told = np.full(len(who), -1)
     told[rest] = index
     now = dict(zip(touching.tolist(), told[at].tolist(), strict=True))
@@ -142,10 +150,10 @@ def _tie(
         np.concatenate([ties.T, there.T[same]]), np.concatenate([ties.cov, there.cov[same]])
     )
     new = fused(both, np.concatenate([np.arange(len(others)), of]), len(others), floor2)
-    e.enabled[replaced] = False
     nodes = np.stack([np.full(len(others), i), others], -1)
     information = relative_information(new.T, new.cov)
     index = graph.add_edges([KINDS[k] for k in kinds.tolist()], nodes, new.T, information)
+    e.enabled[replaced] = False
     return index, replaced, of
 
 

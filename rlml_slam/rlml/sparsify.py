@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from rlml_slam import se2
+from rlml_slam.errors import SolverError
 from rlml_slam.graph.eliminate import Ties, eliminate
 from rlml_slam.graph.graph import Renumbering
 from rlml_slam.graph.live import Live
@@ -57,11 +58,15 @@ class Sparsifier:
         covers = self._redundant(poses, [k.scan_stamp for k in keys], end)
         if not covers:
             return False
+        edges, ties = self._eliminate(list(covers))
+        self._judged += len(covers) - len(ties)
+        covers = {gone: onto for gone, onto in covers.items() if gone in ties}
+        if not covers:
+            return False
         for gone, onto in covers.items():
             keys[onto].take_scan(keys[gone], se2.between(poses[onto], poses[gone]))
             self._scans.take_over(gone, keys[onto])
         before = poses.copy()
-        edges, ties = self._eliminate(list(covers))
         self._reflectors.move(ties)
         fed = [*self._fed, *(keys[k] for k in sorted({onto for onto, _ in ties.values()}))]
         kept = np.ones(len(keys), dtype=np.bool_)
@@ -116,7 +121,10 @@ class Sparsifier:
         return new
 
     def _eliminate(self, poses: list[int]) -> tuple[dict[int, int], dict[int, tuple[int, Ties]]]:
-        """What each edge of the poses went to, -1 if to none; and each pose, with its tie."""
+        """What each edge of the poses went to, -1 if to none; and each pose, with its tie.
+
+        One whose neighbours cannot be tied to one another stays.
+        """
         edges: dict[int, int] = {}
         ties: dict[int, tuple[int, Ties]] = {}
         floor2 = np.array(self._p.scan_floor2)
@@ -126,7 +134,10 @@ class Sparsifier:
             degrees = np.bincount(e.nodes[e.enabled].ravel(), minlength=int(left.max()) + 1)[left]
             gone = int(left[np.argmin(degrees)])
             left = left[left != gone]
-            done = eliminate(self._graph, gone, floor2)
+            try:
+                done = eliminate(self._graph, gone, floor2)
+            except SolverError:
+                continue
             ties[gone] = done.onto, done.tie
             edges.update(done.edges)
         for gone in reversed(ties):  # what it went to may have gone as well, but later

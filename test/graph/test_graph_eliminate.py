@@ -154,3 +154,17 @@ def test_pose_without_edges_is_refused():
     graph.add_pose(np.zeros(3))
     with pytest.raises(SolverError, match='pose 0 has no edge'):
         eliminate(graph, 0, NO_FLOOR)
+
+
+def test_where_neighbours_cannot_be_tied_the_graph_stays_as_it_was():
+    """Surely so far along the way, and by any heading anywhere across it."""
+    graph = Graph()
+    for x in (0.0, 100.0, 101.0):
+        graph.add_pose([x, 0.0, 0.0])
+    graph.add_edge(EdgeKind.ODOMETRY, 0, 1, [100.0, 0.0, 0.0], np.diag([1e8, 1e8, 1e-8]))
+    graph.add_edge(EdgeKind.SCAN, 1, 2, [1.0, 0.0, 0.0], np.diag([1e8, 1e8, 1e8]))
+    graph.add_edge(EdgeKind.SCAN, 0, 2, [101.0, 0.0, 0.0], np.diag([1.0, 1.0, 1.0]))
+    with pytest.raises(SolverError, match='pose 1 cannot be eliminated'):
+        eliminate(graph, 1, NO_FLOOR)
+    assert len(graph.edges) == 3
+    assert graph.edges.enabled.all()

@@ -8,10 +8,13 @@ import pytest
 from made_worlds import ROOM, TinyWorld, drive, errors, observations, polygon
 
 from rlml_slam import se2
+from rlml_slam.errors import SolverError
 from rlml_slam.graph.cost import total_cost
+from rlml_slam.graph.eliminate import eliminate
 from rlml_slam.graph.solver import optimize
 from rlml_slam.params import BackEnd as BackEndParameters
-from rlml_slam.params import LoopClosure, Parameters
+from rlml_slam.params import LoopClosure, Node, Parameters
+from rlml_slam.rlml import sparsify
 from rlml_slam.rlml.back_end import BackEnd
 from rlml_slam.rlml.front_end import FrontEnd
 from rlml_slam.rlml.keyframes import Keyframe
@@ -306,3 +309,35 @@ def test_jump_is_not_forgotten_with_the_keyframe_that_it_led_to():
     assert [k.stamp for k in left] == [0, 1, 5, 6]
     assert [k.index for k in left] == [0, 1, 2, 3]
     assert [k.jumped for k in left] == [False, False, True, False]
+
+
+@pytest.mark.parametrize('share', [0.3, 1.0])
+def test_keyframe_that_cannot_be_let_go_of_stays_with_all_it_tells(monkeypatch, share):
+    rng = np.random.default_rng(8)
+    refused = []
+
+    def eliminated(graph, pose, floor2):
+        if rng.random() < share:
+            refused.append(pose)
+            raise SolverError('cannot be tied')
+        return eliminate(graph, pose, floor2)
+
+    monkeypatch.setattr(sparsify, 'eliminate', eliminated)
+    path = drive(*ROUND * 3, start=START)
+    observed = observations(SQUARE, path, rng=np.random.default_rng(0))
+    node = Node(map_start_pose=START)
+    few, all_ = (
+        mapped(observed, replace(params(keyframes_per_place=n), node=node))[0] for n in (2, 0)
+    )
+    assert refused
+    here = {key.stamp for key in few.keyframes}
+    assert len(few.graph.poses) == len(few.keyframes)
+    # each is judged once, and those that are left are all there
+    assert few.sparsifier._judged <= len(few.keyframes)
+    if share == 1.0:
+        assert here == {key.stamp for key in all_.keyframes}
+    else:
+        assert len(here) < 0.8 * len(all_.keyframes)
+    distance, turn = errors(few.trajectory()[1], path)
+    assert distance.max() < 0.1
+    assert turn.max() < 0.03
