@@ -12,6 +12,9 @@ import contextlib
 import hashlib
 import json
 from pathlib import Path
+from typing import Any
+
+import numba
 
 # What a file with kernels imports to make them.
 MAKER = 'rlml_slam.compiled'
@@ -20,10 +23,10 @@ MAKER = 'rlml_slam.compiled'
 def forget_stale(package: Path) -> None:
     """Delete the compiled kernels of a package which were made of other sources.
 
-    Where the folder cannot be written to, Numba keeps them elsewhere, and an installation gives
-    all files new times.
+    Where the folder cannot be written to, and NUMBA_CACHE_DIR tells no other, Numba keeps them
+    with the user's files, and an installation gives all files new times.
     """
-    folder = package / '__pycache__'
+    folder = _cache_of(package)
     stamp = folder / 'kernels.stamp'
     paths = sorted(package.rglob('*.py'))
     times = _times(package, paths)
@@ -35,10 +38,20 @@ def forget_stale(package: Path) -> None:
         for name, digest in made_of.items():
             if known.get(name) != digest:
                 source = package / name
-                for path in source.parent.glob(f'__pycache__/{source.stem}.*.nb[ci]'):
+                for path in _cache_of(source.parent).glob(f'{source.stem}.*.nb[ci]'):
                     path.unlink(missing_ok=True)
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         stamp.write_text(json.dumps({'times': times, **made_of}), encoding='utf-8')
+
+
+def _cache_of(folder: Path) -> Path:
+    """Where Numba keeps the kernels of a folder's sources."""
+    config: Any = numba.config
+    if not config.CACHE_DIR:
+        return folder / '__pycache__'
+    # as numba.core.caching names it
+    digest = hashlib.sha1(str(folder).encode()).hexdigest()
+    return Path(config.CACHE_DIR) / f'{folder.name}_{digest}'
 
 
 def _read(stamp: Path) -> dict[str, str]:

@@ -32,12 +32,14 @@ def package(tmp_path):
     return folder
 
 
-def answer(package):
-    """What the kernel answers to 10 in a new process."""
+def answer(package, cache=None):
+    """What the kernel answers to 10 in a new process; ``cache`` is Numba's folder."""
     code = 'from some.kernels import answer; print(answer(10))'
     path = f'{package.parent}:{Path(rlml_slam.__file__).parents[1]}'
+    told = {} if cache is None else {'NUMBA_CACHE_DIR': str(cache)}
     done = subprocess.run(
-        [sys.executable, '-c', code], env={'PYTHONPATH': path, 'HOME': str(package.parent)},
+        [sys.executable, '-c', code],
+        env={'PYTHONPATH': path, 'HOME': str(package.parent), **told},
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     return int(done.stdout)
@@ -48,6 +50,18 @@ def test_constant_that_changed_in_another_file_is_used(package):
     assert list(package.glob('__pycache__/*.nbi'))
     (package / 'constants.py').write_text('N = 25\n')
     assert answer(package) == 35
+
+
+def test_folder_that_numba_is_told_to_use_is_looked_at(package, tmp_path):
+    cache = tmp_path / 'cache'
+    assert answer(package, cache) == 11
+    (compiled,) = cache.glob('some_*/kernels.answer-*.nbi')
+    before = compiled.stat().st_mtime_ns
+    assert answer(package, cache) == 11
+    assert compiled.stat().st_mtime_ns == before
+    (package / 'constants.py').write_text('N = 25\n')
+    assert answer(package, cache) == 35
+    assert not list(package.glob('__pycache__/*.nbi'))
 
 
 def test_kernels_of_the_same_sources_stay(package):

@@ -6,11 +6,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from rlml_slam.errors import MapError, NoMapError
-from rlml_slam.maps import occupancy, reflector_file, survey
+from rlml_slam.maps import container, occupancy, reflector_file, survey
 from rlml_slam.maps.saved import SavedMap
 from rlml_slam.maps.survey import Survey
 from rlml_slam.rlml import stored_map
 
+LOST = '.lost-'
+LOST_KEPT = 10  # maps: a robot that begins anew every day must not fill its disk
 SUFFIXES = ('.rlml', '.yaml', '.csv', '.pgm')
 
 
@@ -65,6 +67,27 @@ class MapFolder:
         """The path of the one file that has everything of a map."""
         path = self.path(name)
         return path.with_name(path.name + '.rlml')
+
+    def lost(self, name: str, seconds: int) -> Path:
+        """The path of a map that nothing leads back to, made until a time."""
+        return self.whole(f'{name}{LOST}{seconds}')
+
+    def forget_lost(self, name: str) -> list[Path]:
+        """Remove all but the newest LOST_KEPT of these; those that were removed, oldest first.
+
+        Raises MapError where one cannot be.
+        """
+        path = self.path(name)
+        begin = path.name + LOST
+        try:
+            lost = [file for file in path.parent.glob('*.rlml') if file.name.startswith(begin)]
+            lost.sort(key=lambda file: (file.stat().st_mtime_ns, file.name))
+            for file in lost[:-LOST_KEPT]:
+                file.unlink()
+                file.with_name(file.name + container.PREVIOUS).unlink(missing_ok=True)
+        except OSError as e:
+            raise MapError(f'{begin}…: an old one cannot be removed: {e.strerror}') from e
+        return lost[:-LOST_KEPT]
 
     def load(self, name: str) -> SavedMap:
         """Read name.rlml where it is there, else name.csv and name.yaml; a suffix says which.

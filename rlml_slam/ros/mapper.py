@@ -15,6 +15,7 @@ from rlml_slam.errors import MapError
 from rlml_slam.maps import container
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved import SavedMap
+from rlml_slam.motion import SECOND
 from rlml_slam.params import Parameters
 from rlml_slam.rlml import stored_map
 from rlml_slam.rlml.back_end import BackEnd
@@ -161,13 +162,18 @@ class Mapper:
         keys, name = self.back_end.keyframes, self._p.node.map_file_name
         if len(keys) < 2 or keys[-1].stamp == self._written:
             return
-        path = self.folder.whole(f'{name}.lost-{keys[-1].stamp // 1_000_000_000}')
+        path = self.folder.lost(name, keys[-1].stamp // SECOND)
         try:
             self._write(path, self.products.grid(self.back_end))
         except MapError as e:
             self._logger.warning(f'the map until now is lost: {e}')
-        else:
-            self._logger.warning(f'the map until now is kept: {path}')
+            return
+        self._logger.warning(f'the map until now is kept: {path}')
+        try:
+            for old in self.folder.forget_lost(name):
+                self._logger.warning(f'an older one is removed: {old}')
+        except MapError as e:
+            self._logger.warning(f'{e}')
 
     def _write(self, path: Path, grid: OccupancyGrid | None) -> None:
         container.write(path, stored_map.content_of(self.back_end, self._p, grid))

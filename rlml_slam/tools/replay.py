@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -160,9 +160,7 @@ def replay(
             result.stored = stored_map.content_of(slam.back_end, params, result.grid)
             result.extra = survey_figures(slam.back_end)
         result.inputs = fates(slam.counts, bag.skipped, inputs.topics)
-        result.topics = {_counted_as(stream): topic for stream, topic in inputs.topics.items()}
-        if inputs.more_scans:
-            result.topics['scan'] = ', '.join([inputs.topics['scan'], *inputs.more_scans])
+        result.topics = sources(inputs.topics, inputs.more_scans)
     result.wall_s = wall
     ended = f'{problem}; the results hold what came before' if problem else ''
     result.problem = '; '.join(filter(None, (ended, result.problem)))
@@ -259,6 +257,14 @@ def fates(
         fate['invalid'] += unread[stream]
         out[stream] = fate
     return out
+
+
+def sources(topics: Mapping[str, str], more_scans: Iterable[str] = ()) -> dict[str, str]:
+    """The topics of a bag that each counted stream came from."""
+    out: dict[str, list[str]] = {}
+    for stream, topic in (*topics.items(), *(('scan', topic) for topic in more_scans)):
+        out.setdefault(_counted_as(stream), []).append(topic)
+    return {stream: ', '.join(names) for stream, names in out.items()}
 
 
 def _counted_as(stream: str) -> str:

@@ -19,6 +19,7 @@ from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved import SavedMap
 from rlml_slam.params import Parameters
 from rlml_slam.rlml import stored_map
+from rlml_slam.ros import map_folder
 from rlml_slam.ros.associated import read_reflector_map
 from rlml_slam.ros.frames import Record
 from rlml_slam.ros.last_pose import LastPose
@@ -228,6 +229,16 @@ def lost(folder):
         path.name: len(stored_map.load(path).arrays['pose'])
         for path in sorted(folder.glob('*.lost-*'))
     }
+
+
+def test_maps_of_every_beginning_do_not_fill_the_disk(make, ear, tmp_path, monkeypatch):
+    monkeypatch.setattr(map_folder, 'LOST_KEPT', 2)
+    mapper = make(map_directory=str(tmp_path))
+    for session in range(1, 5):
+        drives(mapper, range(21 * session, 21 * session + 21), session=session)
+    give(mapper, 105, session=5)
+    assert list(lost(tmp_path)) == ['map.lost-10.rlml', 'map.lost-8.rlml']
+    assert any('an older one is removed' in told for told in ear.warnings)
 
 
 def test_map_is_kept_when_the_front_end_begins_anew(make, ear, tmp_path):

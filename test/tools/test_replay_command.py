@@ -18,7 +18,7 @@ from rlml_slam.ros import build
 from rlml_slam.ros.bag import BagWriter
 from rlml_slam.ros.messages import make_bag
 from rlml_slam.tools.main import main
-from rlml_slam.tools.replay import fates, replay
+from rlml_slam.tools.replay import fates, replay, sources
 from rlml_slam.tools.tum import Trajectory, read_tum, write_tum
 from rlml_slam.types import Detections, Scan
 
@@ -97,6 +97,13 @@ def test_summary_says_which_topic_was_taken(tmp_path, capsys):
     (row,) = re.findall(r'input scan +(.*)', capsys.readouterr().out)
     # not the one that was asked for, but the only scans there are
     assert row.endswith('used (/scan)')
+
+
+def test_both_topics_of_reflectors_are_told():
+    topics = {'scan': '/front', 'reflectors': '/cloud', 'reflector_poses': '/poses'}
+    told = sources(topics, ['/rear'])
+    assert told == {'scan': '/front, /rear', 'reflectors': '/cloud, /poses'}
+    assert sources({'odom': '/odom'}, ['/rear']) == {'odom': '/odom', 'scan': '/rear'}
 
 
 def test_configuration_is_used(tmp_path, capsys):
