@@ -15,6 +15,7 @@ one another where messages do, and are even once they are sorted. Such stamps st
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import deque
 from typing import NamedTuple
@@ -104,8 +105,13 @@ class SteadyClock:
 
         A stamp that is off a steady line, or far from its end, begins another one.
         """
-        sigma = max(line.sigma, SMALL)
-        ahead = stamp - self._first - (line.start + line.period * number)
+        # One lost message that nobody noticed bends the line: its end and the jitter about it must
+        # not hide all others. What the intervals and the newest stamps tell is not bent.
+        sigma = max(line.sigma / max(math.sqrt(2.0 * line.ratio), 1.0), SMALL)
+        ahead = self._off(line, number, stamp)
+        if not self._is_steady:
+            newest = itertools.islice(reversed(self._stamps), FEW)
+            ahead -= sorted(self._off(line, k, s) for k, s in newest)[FEW // 2]
         if self._lost == 1 and ahead < -0.5 * line.period:
             # none was lost: the one before was late
             self._renumber_newest(number - 2)
@@ -121,6 +127,10 @@ class SteadyClock:
             return 0
         self._lost = lost
         return number + lost
+
+    def _off(self, line: Line, number: int, stamp: int) -> float:
+        """How far a stamp is from a line [ns]."""
+        return stamp - self._first - (line.start + line.period * number)
 
     def _renumber_newest(self, number: int) -> None:
         newest, before = self._stamps.pop(), self._stamps[-1]

@@ -94,6 +94,18 @@ def test_lost_messages_are_counted():
     assert np.abs(error[ENOUGH:]).max() < 20 * MS
 
 
+@pytest.mark.parametrize('sigma', [12, 20])
+@pytest.mark.parametrize('seed', [0, 5, 6])
+def test_message_lost_before_there_is_a_line_does_not_hide_all_others(seed, sigma):
+    rng = np.random.default_rng(seed)
+    true = ticks(100, 6000)
+    kept = true[(rng.random(len(true)) > 0.02) & (np.arange(len(true)) != 4)]
+    error = (told(jittered(kept, rng, sigma)) - kept)[2 * WINDOW :] / MS
+    # where one was lost, the stamp stays as it is
+    assert np.mean(np.abs(error) > 0.5 * sigma) < 0.03
+    assert np.sqrt((error**2).mean()) < 0.4 * sigma
+
+
 def test_jump_of_the_clock_begins_another_line():
     true = np.concatenate([ticks(100, 200), 5 * SECOND // 3 + 500 * SECOND + ticks(100, 200)])
     stamps = jittered(true, np.random.default_rng(2))
