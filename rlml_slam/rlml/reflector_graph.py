@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from rlml_slam.graph.eliminate import Ties, limited
 from rlml_slam.graph.graph import Renumbering
@@ -151,17 +152,19 @@ class ReflectorGraph:
         if len(alive) < 2:
             return False
         points = self._graph.landmarks[[m.index for m in alive]]
-        gap = np.linalg.norm(points[:, None] - points[None], axis=-1)
-        pairs = [(i, j) for i, j in np.argwhere(gap < MERGE_DISTANCE) if i < j]
-        pairs = [(i, j) for i, j in pairs if not self._distinct(alive[i], alive[j])]
-        if not pairs:
+        # of thousands, most are far from most
+        pairs = cKDTree(points).query_pairs(MERGE_DISTANCE, output_type='ndarray')
+        distinct = [self._distinct(alive[i], alive[j]) for i, j in pairs.tolist()]
+        pairs = pairs[~np.array(distinct, dtype=np.bool_)]
+        if not len(pairs):
             return False
         merged: set[int] = set()
         limit = gate(self._p.gate)
-        pairs.sort(key=lambda p: gap[p[0], p[1]])
+        gaps = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=-1)
+        order = np.lexsort((pairs[:, 1], pairs[:, 0], gaps))
         close = np.unique(pairs)
         joint = self._live.joint([], [alive[k].index for k in close])
-        for i, j in pairs:
+        for (i, j), gap in zip(pairs[order].tolist(), gaps[order].tolist(), strict=True):
             if i in merged or j in merged:
                 continue
             cov = _difference_cov(joint, *np.searchsorted(close, (i, j))) + 1e-6 * np.eye(2)
@@ -169,7 +172,7 @@ class ReflectorGraph:
             if peak < self._p.sure * (peak + self._p.density):
                 continue
             d = points[i] - points[j]
-            near = gap[i, j] < self._p.min_separation
+            near = gap < self._p.min_separation
             if near or d @ np.linalg.solve(cov, d) < limit:
                 self._absorb(*_first(alive[i], alive[j]))
                 merged |= {i, j}
