@@ -4,11 +4,13 @@
 While it goes on, a detection that fits several reflectors is used for none, and those that stand
 closer than can be told apart count as one. In the end the whole run tells which is which: every
 detection is matched once more to the reflectors as they turned out to be (:mod:`second_match`),
-and the path is smoothed by the new answers; in turns, until nothing changes. What the estimate
-errs by besides the noise of the detections shows in how far they are off, and shrinks from turn to
-turn (graduated assignment: Gold, Rangarajan 1996); a wrong answer of the first turns is so taken
-back later. The back end then goes through the run once more, as it should have been: its map is
-the only one.
+and the path is smoothed by the new answers; in turns, until nothing changes. A path by answers
+that cannot tell two reflectors apart errs by as much as they are apart: the first turn grants each
+detection that much besides its noise, each later one half the variance of the one before
+(graduated assignment: Gold, Rangarajan 1996). So a look at a group finds all of it, where the path
+is off by one of its gaps, before what is left over may be a further reflector, and a wrong answer
+of the first turns is taken back later. The back end then goes through the run once more, as it
+should have been: its map is the only one.
 
 With scans there is no need: they hold the path by themselves, and the graph has them.
 """
@@ -32,6 +34,7 @@ from rlml_slam.se2 import Array
 from rlml_slam.types import Frame, Observation, Reflectors
 
 TURNS = 20
+COLD = 10  # turns until what is granted is no more: 0.1 % of the first variance
 STEPS = 3  # Gauss-Newton steps of a turn: the next one corrects what is left
 
 Indices = NDArray[np.int64]
@@ -78,15 +81,20 @@ class Hindsight:
         match = SecondMatch([f.observation.detections for f in self._frames], self._p.reflector)
         marks = Marks(reflectors.points, reflectors.ids)
         answers: Indices = np.zeros(0, dtype=np.int64)
-        for _ in range(TURNS):
+        for turn in range(TURNS):
             before = answers
-            marks, answers = match.answer(poses, marks)
+            granted = self._granted(turn) if match.is_open else 0.0
+            marks, answers = match.answer(poses, marks, granted)
             smoothed = smooth(self._start(), self._sights(match, answers, poses, marks.points),
                               POINT, poses, STEPS)  # fmt: skip
             poses, marks = smoothed.states[:, :3], Marks(smoothed.points, marks.ids)
-            if np.array_equal(before, answers):
+            if not granted and np.array_equal(before, answers):
                 break
         return self._told(smoothed, match.looks(answers))
+
+    def _granted(self, turn: int) -> float:
+        """Variance per axis [m²] by which the path may err in a turn."""
+        return 0.5**turn * self._p.reflector.min_separation**2 if turn < COLD else 0.0
 
     def _start(self) -> Start:
         """Where the run began, which defines the map, and what is not known of gyro and wheels."""

@@ -66,20 +66,26 @@ class SecondMatch:
         self._limit = gate(params.gate)
         self._density = params.density
 
+    @property
+    def is_open(self) -> bool:
+        """Whether any detection leaves open which reflector it is of."""
+        return bool((self._ids == ANONYMOUS).any())
+
     def looks(self, answers: Indices) -> list[Indices]:
         """The answers (n,) to the detections of each observation."""
         return np.split(answers, self._ends[:-1])
 
-    def answer(self, poses: Array, marks: Marks) -> tuple[Marks, Indices]:
+    def answer(self, poses: Array, marks: Marks, granted: float = 0.0) -> tuple[Marks, Indices]:
         """The reflectors, and which (n,) each detection is of, -1 for none, by ``poses`` (k, 3).
 
-        All of them are of some detection.
+        The poses may err by the variance ``granted`` per axis [m²], or by more where it shows.
+        All reflectors are of some detection.
         """
         T = poses[self._look]
         self._points = se2.transform(T, self._z[:, None])[:, 0]
         R = se2.rotation(T[:, 2])
         cov = R @ self._R @ np.swapaxes(R, 1, 2)
-        self._cov = cov + self._spread2(cov, marks) * np.eye(2)
+        self._cov = cov + max(granted, self._spread2(cov, marks)) * np.eye(2)
         self._W = np.linalg.inv(self._cov)
         self._peak = 0.5 * np.linalg.slogdet(self._W)[1] - math.log(2.0 * math.pi) - OUTLIER
         self._reach = np.sqrt(self._limit * np.linalg.eigvalsh(self._cov)[:, 1])
@@ -154,13 +160,14 @@ class SecondMatch:
         """The reflectors and, after them, those that detections of none of them show."""
         left = np.flatnonzero((self._match(self._pairs(marks)) < 0) & (self._ids == ANONYMOUS))
         found = [marks.points]
-        tree = cKDTree(self._points[left]) if len(left) else None
-        near = [] if tree is None else tree.query_ball_point(self._points[left], self._reach[left])
+        tree = cKDTree(self._points[left])
+        # of many in one cloud each is near all others: their lists are made one by one
+        near = tree.query_ball_point(self._points[left], self._reach[left], return_length=True)
         free = np.ones(len(left), dtype=np.bool_)
-        for k in sorted(range(len(left)), key=lambda k: -len(near[k])):
+        for k in np.argsort(-near, kind='stable').tolist():
             if not free[k]:
                 continue
-            group = np.array(near[k], dtype=np.int64)
+            group = np.array(tree.query_ball_point(self._points[left[k]], self._reach[left[k]]))
             group = left[group[free[group]]]
             point = self._mean(group)
             own = group[np.argsort(-self._gain(group, point))]

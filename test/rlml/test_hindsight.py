@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from rlml.made_worlds import ROOM, TinyWorld, drive, errors, observations
 
+from rlml_slam import se2
 from rlml_slam.params import Parameters
 from rlml_slam.rlml import stored_map
 from rlml_slam.rlml.slam import Slam
@@ -65,6 +66,42 @@ def test_reflectors_of_a_group_are_told_apart_in_the_end(seed, apart, sigma):
     assert sorted(gap.argmin(axis=1)) == list(range(len(place.reflectors)))
     assert gap.min(axis=1).max() < 0.5 * apart
     assert rmse(slam) < before
+
+
+def rows_beside_a_circle():
+    """Rows of three, 18 cm apart, in and outside of a circle of 4 m; (15, 2)."""
+    out = []
+    for k, a in enumerate((0.3, 1.6, 2.7, 4.0, 5.2)):
+        along = np.array([-np.sin(1.4 * a), np.cos(1.4 * a)])
+        middle = np.array([0.0, 4.0]) + (4.0 + 1.5 * (-1) ** k) * np.array([np.cos(a), np.sin(a)])
+        out.append(middle + 0.18 * np.outer([-1.0, 0.0, 1.0], along))
+    return np.concatenate(out)
+
+
+@pytest.mark.parametrize('seed', [0, 1])
+def test_rows_are_told_apart_though_the_path_is_off_by_their_gaps(seed):
+    """Of each row some are seen ahead from nearby, and no other on the way to the next row."""
+    rng = np.random.default_rng(seed)
+    place, way = world(rows_beside_a_circle()), drive((0.5, 0.125, 150.6))
+    made, truth = [], []
+    for k, o in enumerate(observations(place, way, scan=False, rng=rng)):
+        z = se2.transform(se2.inverse(way[k]), place.reflectors)
+        near = (np.linalg.norm(z, axis=1) < 3.0) & (np.abs(np.arctan2(z[:, 1], z[:, 0])) < 1.0)
+        seen = np.flatnonzero(near & (rng.random(len(near)) < 0.8 * (k % 3 == 0)))
+        d = o.detections
+        kept = replace(
+            d, points=d.points[seen], cov=d.cov[seen], ids=d.ids[seen],
+            diameters=d.diameters[seen],
+        )  # fmt: skip
+        made.append(replace(o, detections=kept))
+        truth.append(seen)
+    slam = Slam(Parameters())
+    slam.process(made)
+    slam.back_end.finish()
+    frames = slam.hindsight.look_back(slam.back_end.trajectory()[1], slam.reflectors())
+    told, of = np.concatenate([f.landmarks for f in frames]), np.concatenate(truth)
+    pairs = np.unique(np.stack([of, told])[:, told >= 0], axis=1, return_counts=True)[1]
+    assert np.sort(pairs)[-15:].sum() > 0.9 * len(of)  # one of the answers for each of the 15
 
 
 @pytest.mark.parametrize('seed', [0, 1, 2])

@@ -202,9 +202,10 @@ def test_front_end_goes_on_from_the_newest_correction():
     assert checked > 3
 
 
-@pytest.mark.parametrize('reflectors', [False, True])
-def test_back_end_in_a_process_changes_no_bit(reflectors):
-    sent = messages(ROOM, CURVE, reflectors=reflectors, rng=np.random.default_rng(5))
+@pytest.mark.parametrize(('scan', 'reflectors'), [(True, False), (True, True), (False, True)])
+def test_back_end_in_a_process_changes_no_bit(scan, reflectors):
+    """Nor does it where the run is looked back on."""
+    sent = messages(ROOM, CURVE, scan=scan, reflectors=reflectors, rng=np.random.default_rng(5))
     # small submaps, so that loops are closed on a short way
     params = Parameters(back_end=BackEnd(submap_size=4), loop_closure=LoopClosure(every=1))
     slams = [Slam(params, parallel) for parallel in (False, True)]
