@@ -39,3 +39,17 @@ def test_the_command_prints_one_json_object(tmp_path, capsys):
     (result,) = json.loads(capsys.readouterr().out)['results']
     assert result['poses'] == 60
     assert result['difference'] < 1e-6
+
+
+def test_a_peer_that_finds_the_equations_singular_is_told_as_such(tmp_path, capsys, monkeypatch):
+    def fail(graph):
+        raise RuntimeError('Indeterminate linear system')
+
+    monkeypatch.setattr('rlml_slam.tools.bench_marginals._gtsam', fail)
+    path = tmp_path / 'city.g2o'
+    write_graph(path, city(60))
+    assert main(['bench', 'marginals', str(path), '--runs', '1']) == 0
+    assert 'gtsam finds the equations singular' in capsys.readouterr().out
+    result = compare(city(60))
+    assert result['rlml_ms'] > 0.0
+    assert result['difference'] is None
