@@ -44,7 +44,8 @@ COLUMNS: dict[str, tuple[str, str]] = {
     'edges': ('edges', 'd'),
     'sightings': ('sightings', 'd'),
     'submaps': ('submaps', 'd'),
-    'memory_mb': ('memory since start [MB]', '.1f'),
+    'memory_mb': ('memory [MB]', '.1f'),
+    'grown_mb': ('since start [MB]', '.1f'),
     'median_ms': ('median [ms]', '.2f'),
     'p99_ms': ('p99 [ms]', '.2f'),
     'live_ate_rmse_m': ('live ATE [m]', '.4f'),
@@ -224,13 +225,15 @@ def row(slam: Slam, errors: list[float], t: float, before_mb: float) -> dict[str
     ms = np.array([u.cpu_ms for u in slam.updates])
     slam.updates.clear()
     give_back()  # as the back end's node does after each map
+    memory_mb = resident_mb()
     return {
         'hours': t / HOUR,
         'keyframes': len(back_end.keyframes),
         'edges': int(back_end.graph.edges.enabled.sum()),
         'sightings': int(back_end.graph.sightings.enabled.sum()),
         'submaps': back_end.scans.num_submaps,
-        'memory_mb': resident_mb() - before_mb,
+        'memory_mb': memory_mb,
+        'grown_mb': memory_mb - before_mb,
         'taken': len(ms),
         'median_ms': float(np.median(ms)),
         'p99_ms': float(np.percentile(ms, 99)),

@@ -29,6 +29,10 @@ def test_short_drive_has_a_row_per_part(capsys):
     assert first['hours'] == pytest.approx(0.003, abs=1e-3)
     assert last['hours'] == 0.006
     assert last['keyframes'] > first['keyframes'] > 0
+    assert last['memory_mb'] > last['grown_mb']
+    assert first['memory_mb'] - first['grown_mb'] == pytest.approx(
+        last['memory_mb'] - last['grown_mb']
+    )
     assert last['live_ate_rmse_m'] < 0.05
     assert figures['reflectors']['mapped'] > 0
     assert figures['reflectors']['unmoved_rmse_m'] < 0.05
