@@ -211,7 +211,7 @@ class MotionNoise(Group, prefix='motion.'):
     )
     max_turn_rate: float = param(15.0, 'a faster odometry turn is a jump', 'rad/s', 0.01, 100.0)
     free_speeds: tuple[float, ...] = param(
-        (0.5, 0.1, 2.0),
+        (1.0, 0.1, 2.0),
         'speed forward, sideways and of turning of a robot without odometry, 1 sigma',
         'm/s, m/s, rad/s',
     )

@@ -51,14 +51,22 @@ def _accumulate(
     J = np.empty(3)
     c, s = math.cos(pose[2]), math.sin(pose[2])
     n = len(points)
+    place, fits, told = np.empty((n, 2)), np.empty(n, np.bool_), np.empty(n, np.bool_)
     for k in range(n):
         px, py = points[k, 0], points[k, 1]
-        rx, ry = c * px - s * py, s * px + c * py
-        column, row = (pose[0] + rx) * scale - corner_j, (pose[1] + ry) * scale - corner_i
-        if sample(values, column, row)[0] < INLIER:
+        place[k, 0] = (pose[0] + c * px - s * py) * scale - corner_j
+        place[k, 1] = (pose[1] + s * px + c * py) * scale - corner_i
+        fits[k] = sample(values, place[k, 0], place[k, 1])[0] >= INLIER
+        # beside a post that is not in the submap, a wall point would seem to hold the pose along
+        told[k] = fits[k] or not sparse
+    for k in range(n):
+        if not fits[k]:
             continue
+        px, py = points[k, 0], points[k, 1]
+        rx, ry = c * px - s * py, s * px + c * py
+        column, row = place[k, 0], place[k, 1]
         first, last = max(0, k - WINDOW), min(n, k + WINDOW + 1)
-        count, sxx, sxy, syy = _scatter(points, k, first, last, REACH)
+        count, sxx, sxy, syy = _scatter(points, told, k, first, last, REACH)
         least = 5
         if count < 5 and sparse:
             least = 4
@@ -67,7 +75,7 @@ def _accumulate(
                 first -= 1
             while last < min(n - 1, k + FEW) and _joined(points, last):
                 last += 1
-            count, sxx, sxy, syy = _scatter(points, k, first, last + 1, np.inf)
+            count, sxx, sxy, syy = _scatter(points, told, k, first, last + 1, np.inf)
         if count < least:
             continue  # too lonely to tell a pole from a wall seen at a grazing angle
         mean, half = 0.5 * (sxx + syy), 0.5 * (sxx - syy)
@@ -104,14 +112,14 @@ def _accumulate(
 
 @part
 def _scatter(
-    points: Array, k: int, first: int, end: int, reach: float
+    points: Array, told: NDArray[np.bool_], k: int, first: int, end: int, reach: float
 ) -> tuple[int, float, float, float]:
-    """How many of the points [first, end) are within reach of point k, and their scatter."""
+    """How many of the points [first, end) that are told are near point k, and their scatter."""
     px, py, count = points[k, 0], points[k, 1], 0
     sx = sy = sxx = sxy = syy = 0.0
     for q in range(np.uint64(first), np.uint64(end)):
         dx, dy = points[q, 0] - px, points[q, 1] - py
-        if dx * dx + dy * dy < reach * reach:
+        if told[q] and dx * dx + dy * dy < reach * reach:
             count += 1
             sx += dx
             sy += dy

@@ -18,13 +18,14 @@ from rlml_slam.rlml.free_sweep import Sweep, deskewed
 from rlml_slam.rlml.health import Evidence, ends_of, weak_direction
 from rlml_slam.rlml.joint_state import JointState
 from rlml_slam.rlml.open_direction import OpenDirection
-from rlml_slam.rlml.scan_update import fuse, prior_of
+from rlml_slam.rlml.scan_update import fuse, prior_of, relative
 from rlml_slam.rlml.second_look import AS_USUAL, TURN, second_look
 from rlml_slam.rlml.submaps import Submaps
 from rlml_slam.se2 import Array
 from rlml_slam.types import Observation
 
 FAR = 3.0  # [sigma] a search without odometry reaches
+LOOSE = 0.5  # [m] 1 sigma in its submap of a robot without odometry, for which it begins another
 KNOWN = 0.33  # share of a scan's end points that tells whether it is of the submap
 
 
@@ -178,7 +179,19 @@ class ScanTerm:
             self._last_fit = observation.stamp
         elif observation.stamp - self._last_fit < self._p.health.patience * 1e9:
             return
+        if evidence.used and not self.has_odometry and self._is_loose():
+            self.submaps.forget()
         self.submaps.insert(self._state, observation.points, observation.origin)
+
+    def _is_loose(self) -> bool:
+        """Whether the robot hardly knows any more where in its submap it is.
+
+        Then a post that comes in sight may be any of those in it: what fits there tells nothing,
+        and a scan in the wrong place would spoil it. In a submap that begins here, the next scans
+        tell how the robot moves, while the anchor keeps how unsure it is of where.
+        """
+        _, cov = relative(self._state.x, self._state.P)
+        return ends_of(cov[:2, :2])[1] > LOOSE**2
 
     def lasts(self, stamp: int) -> bool:
         """Whether the contradiction lasts for so long that the robot is lost."""

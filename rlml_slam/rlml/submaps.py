@@ -61,6 +61,10 @@ class Submaps:
             scans.append((se2.transform(T, points), se2.transform(T, origin[None])[0]))
         return True
 
+    def forget(self) -> None:
+        """Begin anew with the next scan."""
+        self._maps, self._open, self._last = [], [], None
+
     def settle(self) -> None:
         """Carve the scan that was inserted last: this takes longest, and no pose needs it.
 

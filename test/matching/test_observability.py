@@ -123,6 +123,20 @@ def test_bare_walls_tell_a_robot_alone_with_its_scans_nothing_along_them():
         assert np.linalg.eigvalsh(info)[0] < 1e-6
 
 
+def test_a_post_that_the_submap_does_not_have_holds_nothing_along_the_wall():
+    """A wall point has post and wall for neighbours, and only of the wall it is said to fit."""
+    rng = np.random.default_rng(0)
+    submap = Submap()
+    for _ in range(12):
+        submap.insert(CORRIDOR + 0.01 * rng.standard_normal(CORRIDOR.shape), np.zeros(2))
+    posts = [wall((x, 1.0), (x, 1.2)) for x in (-5.0, -2.0, 3.0, 6.0)]
+    at = [int(np.argmin(np.hypot(*(CORRIDOR - p[-1]).T))) for p in posts]
+    points = np.insert(CORRIDOR, np.repeat(at, [len(p) for p in posts]), np.vstack(posts), axis=0)
+    seen = points + 0.01 * rng.standard_normal(points.shape)
+    info = information(submap, seen, np.zeros(3), PARAMS, alone=True)
+    assert info[0, 0] < 1e-3 * info[1, 1]
+
+
 def test_few_beams_on_the_end_of_a_corridor_hold_a_robot_alone_with_its_scans():
     end = wall((8.0, -1.0), (8.0, 1.0), spacing=0.25)
     scan = np.vstack([CORRIDOR[len(CORRIDOR) // 2 :], end, CORRIDOR[: len(CORRIDOR) // 2]])

@@ -19,6 +19,10 @@ walls:
   - {points: [[95.0, -1.2], [-35.0, -1.2]]}
   - {points: [[-35.0, 1.2], [95.0, 1.2]]}
 """
+POSTS = """
+boxes:
+"""
+POST = '  - {{at: [{:.2f}, {:.2f}], size: [0.1, 0.1]}}\n'
 
 
 def held_across(direction):
@@ -63,22 +67,46 @@ def test_what_holds_all_directions_is_left_as_it_is():
     np.testing.assert_array_equal(OpenDirection().cleared(H, 0.3), H)
 
 
+def driven(world, p, seed, seconds):
+    """Errors along and across (n, 2), sigmas along and levels (n,) of a drive on scans alone."""
+    p = from_mapping({'world': str(world), **p}, SimulatorParameters)
+    messages, truth = simulate(p, seed)
+    messages = [m for m in messages if m.stamp < START + seconds * 1_000_000_000]
+    frames = [f for some in feed(system(p, {}, 'scan alone'), messages) for f in some]
+    true = truth.trajectory
+    at = np.searchsorted(true.stamps, [f.stamp for f in frames])
+    errors = np.abs([f.T_map_base[:2] for f in frames] - true.poses[at, :2])
+    sigmas = np.sqrt([f.cov_map[0, 0] for f in frames])
+    return errors, sigmas, np.array([f.health.level for f in frames])
+
+
 @pytest.mark.parametrize('seed', [0, 1])
 def test_robot_without_odometry_in_a_bare_corridor_says_that_it_is_lost(tmp_path, seed):
     world = tmp_path / 'bare.yaml'
     world.write_text(BARE)
-    p = from_mapping({'world': str(world)}, SimulatorParameters)
-    messages, truth = simulate(p, seed)
-    messages = [m for m in messages if m.stamp < START + 7_000_000_000]
-    frames = [f for some in feed(system(p, {}, 'scan alone'), messages) for f in some]
-    true = truth.trajectory
-    at = np.searchsorted(true.stamps, [f.stamp for f in frames])
-    errors = np.abs([f.T_map_base[0] for f in frames] - true.poses[at, 0])
-    sigmas = np.sqrt([f.cov_map[0, 0] for f in frames])
-    levels = np.array([f.health.level for f in frames])
-    assert errors.max() > 3.0
-    assert errors[levels == Level.OK].max() < 0.05
+    errors, sigmas, levels = driven(world, {}, seed, 7)
+    assert errors[:, 0].max() > 3.0
+    assert errors[levels == Level.OK, 0].max() < 0.05
     assert levels[-1] == Level.LOST
-    assert (errors[5:] < 3.0 * sigmas[5:]).all()
+    assert (errors[5:, 0] < 3.0 * sigmas[5:]).all()
     # and across it, it is not
-    assert np.abs([f.T_map_base[1] for f in frames] - true.poses[at, 1]).max() < 0.02
+    assert errors[:, 1].max() < 0.02
+
+
+@pytest.mark.parametrize('seed', [0, 1])
+def test_posts_that_look_alike_do_not_tell_such_a_robot_where_it_is(tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    posts = [
+        POST.format(x, 1.15 * side)
+        for side in (-1, 1)
+        for x in np.cumsum(rng.uniform(4.0, 12.0, 12)) - 35.0
+    ]
+    world = tmp_path / 'posts.yaml'
+    world.write_text(BARE + POSTS + ''.join(posts))
+    laser = {'laser.beams': 360, 'laser.range_max': 12.0, 'speed': 1.0}
+    errors, sigmas, levels = driven(world, laser, seed, 20)
+    assert errors[:, 0].max() > 3.0
+    assert errors[levels == Level.OK, 0].max() < 1.0
+    known = levels != Level.LOST
+    assert (errors[known, 0][5:] < 3.0 * sigmas[known][5:]).all()
+    assert (levels[-20:] == Level.LOST).all()
