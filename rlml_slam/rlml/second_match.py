@@ -65,6 +65,7 @@ class SecondMatch:
         self._ends = np.cumsum([0 if d is None else len(d) for d in seen])
         self._limit = gate(params.gate)
         self._density = params.density
+        self._fewest = params.min_sightings
 
     @property
     def is_open(self) -> bool:
@@ -174,7 +175,8 @@ class SecondMatch:
             own = own[np.unique(self._look[own], return_index=True)[1]]
             gain = self._gain(own, point)
             own, gain = own[gain > 0.0], gain[gain > 0.0]
-            if len(own) and gain.sum() > self._price(own):
+            # what is seen less often is no reflector to the back end, and most of it are ghosts
+            if len(own) >= self._fewest and gain.sum() > self._price(own):
                 found.append(self._mean(own)[None])
                 free[np.searchsorted(left, group)] = False
         points = np.concatenate(found)

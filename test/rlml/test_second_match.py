@@ -68,3 +68,13 @@ def test_only_what_is_anonymous_is_open():
     assert SecondMatch(seen(ROW), Reflector()).is_open
     told = [detections_of(ROW, 0, [1, 2, 3])]
     assert not SecondMatch(told, Reflector()).is_open
+
+
+def test_a_ghost_that_nothing_repeats_is_no_reflector():
+    rng = np.random.default_rng(3)
+    ghosts = rng.uniform(-30.0, 30.0, (200, 1, 2))
+    looks = [detections_of(np.vstack([ROW, g]), k, None, 0.02) for k, g in enumerate(ghosts)]
+    match = SecondMatch(looks, Reflector())
+    marks, answers = match.answer(np.zeros((len(looks), 3)), marks_at(ROW), 0.0)
+    assert len(marks.points) == len(ROW)
+    assert (answers.reshape(-1, 4)[:, 3] == -1).all()
