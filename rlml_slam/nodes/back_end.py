@@ -71,18 +71,16 @@ class BackEndNode(Node):
 
     def figures(self) -> dict[str, object]:
         """Figures for /diagnostics."""
-        graph, tried = self.mapper.back_end.graph, self.mapper.back_end.scans.tried
-        plant = self.mapper.back_end.plant
-        not_searched = self.mapper.back_end.constellations.not_searched
+        back_end = self.mapper.back_end
         return {
-            'keyframes': len(graph.poses),
-            'edges': len(graph.edges),
-            'closures accepted': tried[True],
-            'closures rejected': tried[False],
-            **fates(self.mapper.back_end.scans.closures),
+            'keyframes': len(back_end.graph.poses),
+            'edges': len(back_end.graph.edges),
+            'closures accepted': back_end.scans.tried[True],
+            'closures rejected': back_end.scans.tried[False],
+            **fates(back_end.scans.closures),
             **self.mapper.continued,
-            **({} if plant is None else {'survey': plant.why}),
-            **({'constellations not searched': not_searched} if not_searched else {}),
+            **({} if back_end.plant is None else {'survey': back_end.plant.why}),
+            'constellations not searched': back_end.constellations.not_searched,
             'frames waiting for the worker': self.mapper.worker.backlog,
             'frames without their points or detections': self.join.incomplete,
         }

@@ -56,8 +56,8 @@ def test_processes_follow_a_carrier_within_their_covariances(kind, ids):
     # the mean over a run varies less than one sample, whose 99.9 % bounds these are
     summary = study.summarize({kind: [drive]})
     found = dict(study.claims(summary))
-    assert found[f'{kind}: NEES of the pose is consistent']
-    assert found[f'{kind}: NEES of the features is consistent']
+    assert found[f'{kind}: NEES of the pose is consistent'], summary[kind]
+    assert found[f'{kind}: NEES of the features is consistent'], summary[kind]
     assert found[f'{kind}: memory grows by less than 4 MB']
     assert np.percentile(drive.pose, 99) < chi2_bounds(3, 1, 0.9999)[1]
 
