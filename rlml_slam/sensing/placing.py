@@ -14,17 +14,20 @@ from rlml_slam.se2 import Array
 from rlml_slam.types import Detections
 
 SIGMA = (1e-4, 10.0)  # [m] a detection that claims to be better or worse is believed this much
+NEAREST = (
+    0.01  # [m] nothing stands in the sensor: that is how drivers tell of what they did not see
+)
 
 
 def placed(d: Detections, frame_id: str, T: Array, max_range: float) -> tuple[Detections, bool]:
-    """Those within ``max_range`` [m] of a sensor at ``T`` (3,), seen from the frame it sits in.
+    """Those within range of a sensor at ``T`` (3,), seen from the frame it sits in.
 
-    And whether the sigmas of one of them had to be bounded.
+    That is from NEAREST to ``max_range`` [m]. And whether the sigmas of one had to be bounded.
     """
-    near = within(np.ascontiguousarray(d.points, dtype=np.float64), max_range)
-    if not near.all():
+    there = within(np.ascontiguousarray(d.points, dtype=np.float64), max_range)
+    if not there.all():
         d = Detections(
-            d.stamp, d.frame_id, d.points[near], d.cov[near], d.ids[near], d.diameters[near]
+            d.stamp, d.frame_id, d.points[there], d.cov[there], d.ids[there], d.diameters[there]
         )
     cov, bounded = believable(np.ascontiguousarray(d.cov, dtype=np.float64))
     points, cov = se2.transform(T, d.points), turned(cov, float(T[2]))
@@ -33,10 +36,10 @@ def placed(d: Detections, frame_id: str, T: Array, max_range: float) -> tuple[De
 
 @brief
 def within(points: Array, reach: float) -> NDArray[np.bool_]:
-    """Whether each of the points (k, 2) is within ``reach`` of the origin."""
+    """Whether each of the points (k, 2) is from NEAREST to ``reach`` from the origin."""
     out = np.empty(len(points), dtype=np.bool_)
     for k in range(len(points)):
-        out[k] = math.hypot(points[k, 0], points[k, 1]) <= reach
+        out[k] = NEAREST <= math.hypot(points[k, 0], points[k, 1]) <= reach
     return out
 
 

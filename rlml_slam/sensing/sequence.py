@@ -471,10 +471,10 @@ class Sequencer:
         return se2.inverse(self.buffer.motion(end, start).delta)
 
     def _in_base(self, d: Detections, T: Array) -> Detections:
-        """Detections moved from a sensor at ``T`` (3,) to the base frame, far ones left out."""
+        """Detections within range of a sensor at ``T`` (3,), moved to the base frame."""
         moved, bounded = placed(d, self._node.base_frame, T, self._p.reflector.max_range)
         if len(moved) < len(d):
-            self.inputs.count('reflectors', 'points_too_far')
+            self.inputs.count('reflectors', 'points_out_of_range')
         if bounded:
             self.inputs.count('reflectors', 'sigma_bounded')
         return moved

@@ -162,6 +162,20 @@ def test_ghosts_and_broken_messages_leave_no_trace_in_the_map():
     assert all(f.health.level is Level.OK for f in frames)
 
 
+@pytest.mark.parametrize('scan', [False, True])
+@pytest.mark.parametrize('odometry', [False, True])
+def test_detections_in_the_sensor_itself_leave_no_trace(scan, odometry):
+    """So does a driver tell of a reflector that it did not see; a place to stand gives it time."""
+    path = np.vstack([np.tile(CURVE[0], (15, 1)), CURVE])
+    sent = messages(ROOM, path, scan=scan, odometry=odometry, rng=np.random.default_rng(6))
+    for k, m in enumerate(sent):
+        if isinstance(m, Detections):
+            sent[k] = detections_of(np.vstack([m.points, [[0.0, 0.0]]]), m.stamp, frame='laser')
+    _, slam = run(sent, Parameters(node=Node(use_odom=odometry)))
+    assert len(slam.reflectors()) == len(ROOM.reflectors)
+    assert slam.counts['reflectors']['points_out_of_range'] == len(path)
+
+
 def test_ids_are_used_where_detections_tell_them():
     sent = messages(ROOM, CURVE, scan=False, rng=np.random.default_rng(4), ids=True)
     frames, slam = run(sent)

@@ -263,12 +263,13 @@ def test_detections_are_moved_from_their_sensor_to_the_base():
     sequencer, t = running(use_scan=False)
     T = np.array([0.5, 0.2, np.pi / 2])
     sequencer.set_sensor_pose('mast', T)
-    far = ((2.0, 1.0), (300.0, 0.0))
-    (o,) = feed(sequencer, [detections(t, far, frame='mast')])
+    # one is too far, and one in the sensor itself: so do some drivers tell that they saw none
+    seen = ((2.0, 1.0), (300.0, 0.0), (0.0, 0.0))
+    (o,) = feed(sequencer, [detections(t, seen, frame='mast')])
     np.testing.assert_allclose(o.detections.points, [[-0.5, 2.2]], atol=1e-12)
     np.testing.assert_allclose(o.detections.cov[0], np.diag([1e-4, 4e-4]), atol=1e-15)
     assert o.detections.frame_id == 'base_link'
-    assert sequencer.inputs.counts['reflectors']['points_too_far'] == 1
+    assert sequencer.inputs.counts['reflectors']['points_out_of_range'] == 1
 
 
 def test_single_stamps_far_ahead_are_left_out():
