@@ -156,8 +156,9 @@ def way_cov(way: Array, before: Array, after: Array, heading: float) -> Array:
     measured = np.linalg.inv(last) - np.linalg.inv(first + predicted)
     values, axes = np.linalg.eigh(0.5 * (measured + measured.T))
     scan = np.dot(axes / np.maximum(values, OPEN), axes.T.copy())
+    # symmetric to the rounding of what is known least, which may be more than what is known best
     out: Array = np.linalg.inv(np.linalg.inv(predicted) + np.linalg.inv(first + scan))
-    return out + positive(last - first)
+    return 0.5 * (out + out.T) + positive(last - first)
 
 
 def warm_up() -> None:

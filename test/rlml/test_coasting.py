@@ -90,6 +90,21 @@ def test_motion_is_as_sure_as_the_scans_and_no_surer_than_the_speed_where_they_a
     assert cov[0, 0] == pytest.approx(0.08, rel=0.01)
 
 
+def test_covariance_of_a_motion_is_symmetric_however_little_is_known_of_it():
+    """Beside the noise of a sharp sensor, rounding of the wide ones made it none for the graph."""
+    rng = np.random.default_rng(0)
+
+    def covariance():
+        axes, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+        A = axes @ np.diag(10.0 ** rng.uniform(-8.0, 2.0, 3)) @ axes.T
+        return 0.5 * (A + A.T)
+
+    for _ in range(200):
+        cov = way_cov(covariance(), covariance(), covariance(), rng.uniform(-np.pi, np.pi))
+        np.testing.assert_allclose(cov, cov.T, rtol=1e-12)
+        assert np.linalg.eigvalsh(cov)[0] > 0.0
+
+
 @pytest.mark.parametrize(
     ('world', 'reflectors', 'ray_times'),
     [('hall', False, False), ('hall', False, True), ('yard', True, False)],
