@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import pdist
 from scipy.special import bdtr, bdtrc, betaincinv
 
 from rlml_slam import se2
 from rlml_slam.matching.association import gate
 from rlml_slam.matching.pair_votes import (
     LOOSE,
-    MAX_PAIRS,
     MAX_TESTS,
     MIN_MATCHES,
     buckets_of,
@@ -111,8 +111,6 @@ def locate(
         return Constellation(Verdict.IMPOSSIBLE, f'the map has {m} reflectors, three are needed')
     if k < MIN_MATCHES:
         return Constellation(Verdict.IMPOSSIBLE, f'{k} reflectors are seen, three are needed')
-    if m * (m - 1) // 2 > MAX_PAIRS:
-        return _not_searched(k, m)
     z = np.ascontiguousarray(points[used], dtype=np.float64)
     z_cov = cov[used] + params.sigma_floor**2 * np.eye(2)
     p = np.ascontiguousarray(reflectors, dtype=np.float64)
@@ -166,8 +164,11 @@ class _Search:
         if prior is not None:
             information[:] = np.linalg.inv(prior.cov)
         buckets = buckets_of(self._p, float(np.sqrt((1.0 + LOOSE) * self._floor2)))
+        pairs = pairs_of(self._p, float(pdist(self._z).max() + np.sqrt(2.0 * self._floor2)))
+        if pairs is None:
+            return [], 0, False
         counts, bases, proposals, searched = vote(
-            self._z, self._z_var, self._p, self._p_var, pairs_of(self._p), buckets, self._gate2,
+            self._z, self._z_var, self._p, self._p_var, pairs, buckets, self._gate2,
             pose, information, gate(self._params.gate, 3), self._max_tests,
         )  # fmt: skip
         found: list[Candidate] = []

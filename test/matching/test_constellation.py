@@ -401,8 +401,20 @@ def test_search_of_a_plant_in_rows_ends_without_a_guess(k):
 
 
 def test_map_with_too_many_pairs_is_not_searched():
-    found = search(lattice(4), lattice(68))
+    found = search(22.0 * lattice(4), lattice(68))
     assert found.verdict is Verdict.NOT_SEARCHED
+    assert pair_votes.pairs_of(lattice(68), 400.0) is None
+
+
+def test_pairs_are_all_those_that_detections_may_be_of():
+    points = np.random.default_rng(21).uniform(0.0, 9.0, (40, 2))
+    first, second = np.triu_indices(len(points), 1)
+    length = np.hypot(*(points[first] - points[second]).T)
+    order = np.argsort(length)[: (length < 4.0).sum()]
+    pairs = pair_votes.pairs_of(points, 4.0)
+    np.testing.assert_array_equal(pairs.length, length[order])
+    np.testing.assert_array_equal(pairs.first, first[order])
+    np.testing.assert_array_equal(pairs.second, second[order])
 
 
 def test_search_that_may_take_longer_finds_the_same():

@@ -132,9 +132,9 @@ def test_scan_alone_tells_the_place_where_reflectors_cannot():
 
 
 def test_scan_tells_the_place_where_reflectors_are_too_many_to_be_searched():
-    x, y = np.meshgrid(20.0 + 4.0 * np.arange(68), 4.0 * np.arange(68))
+    x, y = np.meshgrid(np.arange(68), np.arange(68))
     far = np.stack([x.ravel(), y.ravel()], -1)
-    plant = map_of(np.vstack([ROOM.reflectors, far]))
+    plant = map_of(np.vstack([ROOM.reflectors, 20.0 + 0.1 * far]))
     found = find_place(grid_of(ROOM), plant, seen(ROOM), P)
     assert found.verdict is Verdict.UNIQUE
     assert_here(found)
@@ -143,6 +143,10 @@ def test_scan_tells_the_place_where_reflectors_are_too_many_to_be_searched():
     assert found.verdict is Verdict.NOT_SEARCHED
     assert found.pose is None
     assert 'too many to be searched' in found.why
+    # as many that do not stand that close are searched
+    found = find_place(None, map_of(np.vstack([ROOM.reflectors, 20.0 + 4.0 * far])), seen(ROOM), P)
+    assert found.verdict is Verdict.UNIQUE
+    assert_here(found)
 
 
 def test_reflectors_that_are_switched_off_do_not_count():
