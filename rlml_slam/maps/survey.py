@@ -3,7 +3,8 @@
 
 By the suffix of the file's name:
 
-    .csv    a header with ``x`` and ``y`` [m], and if need be ``id`` and ``diameter`` [m]
+    .csv    a header with ``x`` and ``y`` [m], and if need be ``id`` and ``diameter`` [m]; as
+            ``x_m`` and so on, the reflectors of a map have them
     .json   a list of objects with the same names
     .imk    layout of a SICK NAV scanner: ``globID x y type subtype size layer…`` [mm] per line
 """
@@ -87,7 +88,7 @@ def _checked(where: str, row: Mapping[str, Any]) -> tuple[float, float, float, f
 
 def _csv(text: str) -> Iterable[tuple[str, Mapping[str, Any]]]:
     for number, row in enumerate(csv.DictReader(text.splitlines()), 2):
-        yield f'line {number}', row
+        yield f'line {number}', {str(name).removesuffix('_m'): row[name] for name in row}
 
 
 def _json(text: str) -> Iterable[tuple[str, Mapping[str, Any]]]:

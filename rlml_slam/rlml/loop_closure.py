@@ -10,7 +10,7 @@ waits.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -243,22 +243,24 @@ class ScanGraph:
         maps = [m for m in self._finished + self._active if m.size]
         cells = [m.submap.values.ravel() for m in maps]
         c = self.closures
+
+        def pairs(rows: Iterable[tuple[int, int]]) -> NDArray[np.int64]:
+            return np.array(list(rows), dtype=np.int64).reshape(-1, 2)
+
         return {
             'submap_anchor': np.array([m.anchor.index for m in maps], dtype=np.int64),
             'submap_pose': np.array([m.T_anchor_grid for m in maps]).reshape(-1, 3),
-            'submap_size': np.array([(m.size, m.submap.insertions) for m in maps]).reshape(-1, 2),
+            'submap_size': pairs((m.size, m.submap.insertions) for m in maps),
             'submap_centre': np.array([m.centre for m in maps]).reshape(-1, 2),
-            'submap_corner': np.array([m.submap.corner for m in maps]).reshape(-1, 2),
-            'submap_shape': np.array([m.submap.values.shape for m in maps]).reshape(-1, 2),
+            'submap_corner': pairs(m.submap.corner for m in maps),
+            'submap_shape': pairs(m.submap.values.shape for m in maps),
             'submap_cells': np.concatenate([np.zeros(0, dtype=np.uint16), *cells]),
             'closure': np.array([(r.i, r.j, r.edge) for r in c], dtype=np.int64).reshape(-1, 3),
             'closure_fit': np.array([(*r.delta, r.score, r.overlap, r.second) for r in c]).reshape(
                 -1, 6
             ),
             'closure_why': np.array([r.why for r in c], dtype=np.str_),
-            'closure_fate': np.array(
-                [(r.number, r.fate.state.value) for r in c], dtype=np.int64
-            ).reshape(-1, 2),
+            'closure_fate': pairs((r.number, r.fate.state.value) for r in c),
             'closure_reason': np.array([r.fate.reason for r in c], dtype=np.str_),
             'closures_tried': np.array([self.tried[False], self.tried[True]], dtype=np.int64),
         }

@@ -6,7 +6,7 @@ import pytest
 
 from rlml_slam import se2
 from rlml_slam.errors import FileFormatError, MapError
-from rlml_slam.maps import survey
+from rlml_slam.maps import reflector_file, survey
 from rlml_slam.maps.survey import Survey
 from rlml_slam.tools import map_survey
 from rlml_slam.types import ANONYMOUS, Reflectors
@@ -31,6 +31,17 @@ def test_three_formats_say_the_same(tmp_path, name, text):
     np.testing.assert_array_equal(found.ids, [7, 9])
     np.testing.assert_allclose(found.points, [[1.5, -2.25], [10.0, 4.0]])
     np.testing.assert_allclose(found.diameters, [0.08, 0.05])
+
+
+def test_reflectors_of_a_map_are_a_survey(tmp_path):
+    points, cov = np.array([r[1:3] for r in ROWS]), np.tile(1e-4 * np.eye(2), (2, 1, 1))
+    ids, diameters = np.array([ANONYMOUS, 9]), np.array([np.nan, 0.05])
+    seen = Reflectors(np.arange(2), points, cov, ids, np.ones(2, dtype=np.int64), diameters)
+    reflector_file.save(seen, tmp_path / 'reflectors.csv')
+    found = survey.load(tmp_path / 'reflectors.csv')
+    np.testing.assert_array_equal(found.ids, ids)
+    np.testing.assert_allclose(found.points, points)
+    np.testing.assert_allclose(found.diameters, diameters)
 
 
 def test_id_and_diameter_may_be_missing(tmp_path):

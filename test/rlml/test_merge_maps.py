@@ -26,12 +26,12 @@ START = np.array([2.0, -1.4, 1.2])
 AGAIN = drive((0.5, 0.5, 7.0), (0.4, -0.5, 4.0), start=START)
 
 
-def mapped(world, poses, seed):
+def mapped(world, poses, seed, scan=True):
     """A back end that knows nothing of where in the world its first pose is."""
     slam = Slam(PARAMS)
     slam.set_sensor_pose('laser', np.zeros(3))
     add = {Odometry: slam.add_odometry, Scan: slam.add_scan, Detections: slam.add_detections}
-    for m in messages(world, poses, rng=np.random.default_rng(seed)):
+    for m in messages(world, poses, scan=scan, rng=np.random.default_rng(seed)):
         add[type(m)](m)
     slam.finish()
     return slam.back_end
@@ -121,6 +121,18 @@ def test_maps_of_which_nothing_tells_how_they_lie_are_refused(two, tmp_path, cap
     twin = stored_map.content_of(mapped(replace(ROOM, reflectors=square), CURVE, 4), PARAMS, None)
     with pytest.raises(MapError, match='do not tell'):
         merge_maps(twin, twin, PARAMS)
+
+
+@pytest.mark.parametrize('is_first', [False, True])
+def test_map_without_a_scan_is_merged_with_one_of_scans(two, is_first):
+    blind = stored_map.content_of(mapped(ROOM, AGAIN, 2, scan=False), PARAMS, None)
+    pair = (blind, two[0]) if is_first else (two[0], blind)
+    merged = merge_maps(*pair, PARAMS)
+    assert merged.joined == len(ROOM.reflectors)
+    again = stored_map.saved_map(merged.content)
+    assert len(again.reflectors) == len(ROOM.reflectors)
+    shapes = [c.arrays['submap_shape'] for c in (two[0], merged.content)]
+    np.testing.assert_array_equal(*shapes)
 
 
 def test_map_of_an_older_program_is_refused(two):
