@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 from rlml_slam.compiled import kernel, part
 from rlml_slam.graph.fronts import factorise, solve_lower, solve_upper
-from rlml_slam.graph.linearize import linearize, move
+from rlml_slam.graph.linearize import linearize, linearize_here, move
 from rlml_slam.graph.system import System
 from rlml_slam.se2 import Array
 
@@ -115,7 +115,7 @@ def gauss_newton(
         if converged:
             break
         if not far:
-            linearize(system, poses, landmarks, True)
+            linearize_here(system, poses, landmarks, True)
     if not cost <= best:
         copy(kept, poses)
         copy(kept_landmarks, landmarks)

@@ -34,15 +34,30 @@ def wrapped(angle: float) -> float:
 @kernel
 def linearize(system: System, poses: Array, landmarks: Array, fill: bool) -> tuple[float, float]:
     """(cost, chi2) at an estimate, with the gradient g = J^T W e; with ``fill`` also H."""
+    rotations = system.rotations
+    for i in range(len(poses)):
+        angle = poses[i, 2]
+        rotations[i, 0], rotations[i, 1] = math.cos(angle), math.sin(angle)
+    return linearize_here(system, poses, landmarks, fill)
+
+
+@part
+def linearize_here(
+    system: System, poses: Array, landmarks: Array, fill: bool
+) -> tuple[float, float]:
+    """As linearize, at the estimate of its last call: the rotations are those."""
     g, values = system.g, system.values
+    fill = bool(fill)  # not of a literal's type, for which all below would be compiled anew
     for i in range(len(g)):
         g[i] = 0.0
     if fill:
         for i in range(len(values)):
             values[i] = 0.0
-    losses, variables = system.losses, system.variables
-    c0, s0 = _edges(system.edges, variables, losses, poses, values, g, fill)
-    c1, s1 = _sightings(system.sightings, variables, losses, poses, landmarks, values, g, fill)
+    losses, variables, rotations = system.losses, system.variables, system.rotations
+    c0, s0 = _edges(system.edges, variables, losses, poses, rotations, values, g, fill)
+    c1, s1 = _sightings(
+        system.sightings, variables, losses, poses, rotations, landmarks, values, g, fill
+    )
     c2, s2 = _priors(system.priors, variables, losses, poses, landmarks, values, g, fill)
     return c0 + c1 + c2, s0 + s1 + s2
 
@@ -53,14 +68,11 @@ def _edges(
     variables: Records,
     losses: Array,
     poses: Array,
+    rotations: Array,
     v: Array,
     g: Array,
     fill: bool,
 ) -> tuple[float, float]:
-    rotations = np.empty((len(poses), 2))
-    for i in range(len(poses)):
-        rotations[i, 0] = math.cos(poses[i, 2])
-        rotations[i, 1] = math.sin(poses[i, 2])
     cost, chi2 = 0.0, 0.0
     for f in range(len(edges)):
         z = edges[f]
@@ -140,14 +152,14 @@ def _edges(
 
 @part
 def _sightings(
-    sightings: Records, variables: Records, losses: Array, poses: Array, landmarks: Array,
-    v: Array, g: Array, fill: bool,
+    sightings: Records, variables: Records, losses: Array, poses: Array, rotations: Array,
+    landmarks: Array, v: Array, g: Array, fill: bool,
 ) -> tuple[float, float]:  # fmt: skip
     cost, chi2 = 0.0, 0.0
     for f in range(len(sightings)):
         z = sightings[f]
         i, j, kind = z['i'], z['j'], z['kind']
-        c, s = math.cos(poses[i, 2]), math.sin(poses[i, 2])
+        c, s = rotations[i, 0], rotations[i, 1]
         dx, dy = landmarks[j, 0] - poses[i, 0], landmarks[j, 1] - poses[i, 1]
         e0 = c * dx + s * dy - z['x']
         e1 = c * dy - s * dx - z['y']

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,7 +33,7 @@ NOTHING = 1e-18
 
 
 class _Kept(threading.local):
-    """Of the last solves of a thread: the memory that they needed, and where they report.
+    """The memory that the last solves of a thread needed.
 
     Taking memory anew from the operating system, a page at a time, would cost as much as a
     factorisation of a small graph.
@@ -41,7 +41,6 @@ class _Kept(threading.local):
 
     def __init__(self) -> None:
         self.memory = np.empty(0)
-        self.report = np.empty((2, 4))
 
 
 _KEPT = _Kept()
@@ -50,8 +49,7 @@ DEFAULT = params.Solver()
 NEVER, IF_BAD, ALWAYS = 0, 1, 2
 
 
-@dataclass(frozen=True)
-class Solution:
+class Solution(NamedTuple):
     """What a solve did; the estimate itself is written back into the graph.
 
     ``chi2`` is the sum of e^T I e over the enabled factors, ``cost`` that of the robust losses
@@ -81,16 +79,15 @@ def optimize(graph: Graph, parameters: params.Solver = DEFAULT) -> Solution:
         start = _evaluate(graph)
         initialize(graph, p.initialization)
     if p.method in ('auto', 'gauss_newton'):
-        places, memory, report = graph.places(), _KEPT.memory, _KEPT.report
-        used = _gauss_newton(
-            places.at, graph.losses.codes, memory, report, relaxing, p.max_iterations,
+        memory = _KEPT.memory
+        used, at, end = _gauss_newton(
+            graph.places().at, graph.losses.codes, memory, relaxing, p.max_iterations,
             p.relative_tolerance,
         )  # fmt: skip
         if used < 0:
             system_of(graph)  # tells what is wrong
         elif used > len(memory):
             _KEPT.memory = np.empty(used + used // 4)
-        at, end = (Progress(a, b, int(k), c > 0.0) for a, b, k, c in report.tolist())
         if p.method == 'auto' and not end.converged:
             more = _descend(graph, at, p, NEVER)
             end = more._replace(iterations=end.iterations + more.iterations)
@@ -130,26 +127,23 @@ def _evaluate(graph: Graph) -> Progress:
 
 @kernel
 def _gauss_newton(
-    places: Ints, losses: Array, memory: Array, report: Array, relaxing: int, max_iterations: int,
+    places: Ints, losses: Array, memory: Array, relaxing: int, max_iterations: int,
     tolerance: float,
-) -> int:  # fmt: skip
-    """Memory used, or -1 if the graph cannot be solved; Gauss-Newton on a graph at ``places``.
+) -> tuple[int, Progress, Progress]:  # fmt: skip
+    """(memory used or -1 if the graph cannot be solved, start, end) of Gauss-Newton.
 
-    All in one call, which saves the wrapping and unwrapping of what lies between. ``report``
-    (2, 4) becomes the Progress at the start and at the end.
+    The graph is the one at ``places``. All in one call, which saves the wrapping and unwrapping
+    of what lies between.
     """
     poses, landmarks = nodes_at(places)
+    nothing = Progress(math.nan, math.nan, 0, False)
     if not (finite(poses) and finite(landmarks)):
-        return -1
+        return -1, nothing, nothing
     loose, system = set_up(tables_at(places, losses), memory)
     if loose >= 0:
-        return -1
+        return -1, nothing, nothing
     start, end = _descend_from(system, poses, landmarks, relaxing, max_iterations, tolerance)
-    for k in range(2):
-        at = start if k == 0 else end
-        report[k, 0], report[k, 1], report[k, 2] = at.cost, at.chi2, at.iterations
-        report[k, 3] = 1.0 if at.converged else 0.0
-    return len(system.values) + len(system.left) + len(system.right)
+    return len(system.values) + len(system.left) + len(system.right), start, end
 
 
 @part
@@ -189,11 +183,11 @@ def num_residuals(system: System) -> int:
 @part
 def finite(values: Array) -> bool:
     """Whether all values are finite."""
-    good = True
+    total = 0.0  # not a number as soon as a value is not finite: no branch in the loop
     for i in range(len(values)):
         for k in range(values.shape[1]):
-            good &= math.isfinite(values[i, k])
-    return good
+            total += values[i, k] - values[i, k]
+    return total == 0.0
 
 
 def warm_up() -> None:

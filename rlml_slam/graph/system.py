@@ -79,7 +79,8 @@ class System(NamedTuple):
     """Variables, packed factors, symbolic structure and memory of the normal equations.
 
     ``values`` holds the panels, ``left`` and ``right`` the update matrices, ``g`` and ``step``
-    (rows,) a gradient and a step in the order of elimination.
+    (rows,) a gradient and a step in the order of elimination, ``rotations`` (n, 2) the cosine and
+    sine of each pose's heading where it was linearised last.
     """
 
     variables: Records
@@ -95,6 +96,7 @@ class System(NamedTuple):
     right: Array
     g: Array
     step: Array
+    rotations: Array
 
 
 @kernel
@@ -110,7 +112,7 @@ def set_up(tables: Tables, memory: Array) -> tuple[int, System]:
     edges, sightings, priors = _pack(tables)
     n = len(tables.fixed_poses)
     total = n + len(tables.fixed_landmarks)
-    loose, touched = _loose_node(tables, edges, sightings, priors)
+    touched = _touched(total, n, edges, sightings, priors)
     index = np.empty(total, np.int64)
     num = 0
     for i in range(total):
@@ -138,6 +140,7 @@ def set_up(tables: Tables, memory: Array) -> tuple[int, System]:
     start, neighbours = adjacency(pairs, num)
     order = elimination_order(start, neighbours, dims)
     order, parent, count = elimination_tree(start, neighbours, order)
+    loose = _loose_node(n, variables, edges, sightings, priors, order, parent)
     structure = supernodes(start, neighbours, order, parent, count, pairs, dims, 3 * num)
     fronts, entries, stack = lay_out(structure, dims)
     place(structure, fronts, entries, variables, edges, sightings)
@@ -150,7 +153,7 @@ def set_up(tables: Tables, memory: Array) -> tuple[int, System]:
     right = memory[size + stack[0] : size + stack[0] + stack[1]]
     return loose, System(
         variables, edges, sightings, priors, tables.losses, structure, fronts, entries,
-        values, left, right, np.empty(rows), np.empty(rows),
+        values, left, right, np.empty(rows), np.empty(rows), np.empty((n, 2)),
     )  # fmt: skip
 
 
@@ -263,55 +266,68 @@ def _pack_priors(factors: Factors, shift: int, priors: Records) -> None:
 
 
 @part
-def _root(parts: Ints, i: int) -> int:
-    """Representative of i's connected part, with path halving."""
-    while parts[i] != i:
-        parts[i] = parts[parts[i]]
-        i = parts[i]
-    return i
+def _touched(total: int, n: int, edges: Records, sightings: Records, priors: Records) -> Flags:
+    """Which nodes a factor touches (total,); landmark k is node n + k."""
+    touched = np.empty(total, np.bool_)
+    for i in range(total):
+        touched[i] = False
+    for f in range(len(edges)):
+        touched[edges[f]['i']] = touched[edges[f]['j']] = True
+    for f in range(len(sightings)):
+        touched[sightings[f]['i']] = touched[n + sightings[f]['j']] = True
+    for f in range(len(priors)):
+        touched[priors[f]['i']] = True
+    return touched
 
 
 @part
 def _loose_node(
-    tables: Tables, edges: Records, sightings: Records, priors: Records
-) -> tuple[int, Flags]:
-    """(a free node whose part is not tied to the map or -1, which nodes a factor touches)."""
-    n = len(tables.fixed_poses)
-    total = n + len(tables.fixed_landmarks)
-    parts = np.empty(total, np.int64)
-    touched = np.empty(total, np.bool_)
-    ties = np.empty(total, np.int64)  # 2 for a pose, 1 for a landmark; then per part
-    for i in range(total):
-        parts[i] = i
-        touched[i] = False
-        if i < n:
-            ties[i] = 2 if tables.fixed_poses[i] else 0
-        else:
-            ties[i] = 1 if tables.fixed_landmarks[i - n] else 0
+    n: int, variables: Records, edges: Records, sightings: Records, priors: Records, order: Ints,
+    parent: Ints,
+) -> int:  # fmt: skip
+    """A node that is solved for and whose connected part is not tied to the map, or -1.
+
+    The parts are the trees of the elimination forest.
+    """
+    num = len(variables)
+    root, of = np.empty(num, np.int64), np.empty(num, np.int64)
+    ties, known = np.empty(num, np.int64), np.empty(num, np.int64)  # 2 for a pose; per part
+    has_pose = np.empty(num, np.bool_)
+    for k in range(num - 1, -1, -1):
+        root[k] = root[parent[k]] if parent[k] >= 0 else k
+        of[order[k]] = root[k]
+        ties[k], known[k], has_pose[k] = 0, -1, False
+    for a in range(num):
+        if variables[a]['node'] < n:
+            has_pose[of[a]] = True
     for f in range(len(edges)):
-        i, j = edges[f]['i'], edges[f]['j']
-        touched[i] = touched[j] = True
-        parts[_root(parts, i)] = _root(parts, j)
+        a, b = edges[f]['a'], edges[f]['b']
+        if a < 0 and b >= 0:
+            ties[of[b]] = 2
+        elif b < 0 and a >= 0:
+            ties[of[a]] = 2
     for f in range(len(sightings)):
-        i, j = sightings[f]['i'], n + sightings[f]['j']
-        touched[i] = touched[j] = True
-        parts[_root(parts, i)] = _root(parts, j)
+        a, b = sightings[f]['a'], sightings[f]['b']
+        if a < 0 and b >= 0:
+            ties[of[b]] = 2
+        elif b < 0 and a >= 0:
+            _tie(ties, known, of[a], n + sightings[f]['j'])
     for f in range(len(priors)):
-        i = priors[f]['i']
-        touched[i] = True
-        ties[i] = 2 if i < n else 1
-    has_pose = np.empty(total, np.bool_)
-    for i in range(total):
-        has_pose[i] = False
-    for i in range(total):
-        top = _root(parts, i)
-        if i < n:
-            has_pose[top] = True
-        if top != i:
-            ties[top] += ties[i]
-    for i in range(total):
-        fixed = tables.fixed_poses[i] if i < n else tables.fixed_landmarks[i - n]
-        top = _root(parts, i)
-        if touched[i] and not fixed and ties[top] < (2 if has_pose[top] else 1):
-            return i, touched
-    return -1, touched
+        i, a = priors[f]['i'], priors[f]['a']
+        if a >= 0 and i < n:
+            ties[of[a]] = 2
+        elif a >= 0:
+            _tie(ties, known, of[a], i)
+    for a in range(num):
+        if ties[of[a]] < (2 if has_pose[of[a]] else 1):
+            return int(variables[a]['node'])
+    return -1
+
+
+@part
+def _tie(ties: Ints, known: Ints, s: int, landmark: int) -> None:
+    """Part s is tied by a landmark whose place is known: a second one ties it for good."""
+    if ties[s] == 0:
+        ties[s], known[s] = 1, landmark
+    elif known[s] != landmark:
+        ties[s] = 2

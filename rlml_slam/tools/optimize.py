@@ -6,7 +6,6 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
         except OSError as error:
             raise FileFormatError(f'{args.out}: cannot be written: {error.strerror}') from None
     if args.json:
-        print(json.dumps(asdict(solution) | {'refused': refused}))
+        print(json.dumps(solution._asdict() | {'refused': refused}))
         return 0
     graph = file.graph
     print(
@@ -98,4 +97,5 @@ def _solve(graph: Graph, robust: str, parameters: params.Solver) -> tuple[Soluti
     solution = optimize(graph, parameters)
     wall_ms = (time.perf_counter() - began) * 1e3
     # without losses the cost is chi2
-    return replace(solution, chi2_initial=before, cost_initial=before, wall_ms=wall_ms), refused
+    whole = solution._replace(chi2_initial=before, cost_initial=before, wall_ms=wall_ms)
+    return whole, refused

@@ -148,6 +148,40 @@ def test_disabling_the_only_tie_is_refused():
         optimize(graph)
 
 
+def two_rooms(*known: int) -> Graph:
+    """Two pairs of poses that share landmark 1 and no more; each sees one of its own, 0 or 2."""
+    graph = Graph()
+    graph.add_poses([[0, 0, 0], [1, 0, 0], [4, 0, 0], [5, 0, 0]])
+    graph.add_landmarks([[0, 1], [2.5, 1], [5, 1]])
+    graph.add_edges(EdgeKind.ODOMETRY, [[0, 1], [2, 3]], [[1, 0, 0]] * 2, [np.eye(3)] * 2)
+    nodes = [[0, 0], [1, 0], [0, 1], [1, 1], [2, 1], [3, 1], [2, 2], [3, 2]]
+    z = [graph.landmarks[k] - graph.poses[i, :2] for i, k in nodes]
+    graph.add_sightings(nodes, z, [np.eye(2)] * 8)
+    graph.fixed_landmarks[list(known)] = True
+    return graph
+
+
+def test_a_part_that_turns_about_one_known_landmark_is_named():
+    with pytest.raises(SolverError, match='pose 0 and what is connected'):
+        optimize(two_rooms(1))
+    with pytest.raises(SolverError, match='pose 2 and what is connected'):
+        optimize(two_rooms(0, 1))  # the other room cannot turn, but shares with this one a point
+    for known in ((0, 1, 2), (0, 2)):
+        assert optimize(two_rooms(*known)).converged
+
+
+def test_two_priors_on_one_landmark_tie_no_more_than_one():
+    graph = two_rooms(0, 1)
+    for _ in range(2):
+        graph.add_landmark_prior(2, [5, 1], np.eye(2))
+    assert optimize(graph).converged
+    graph.fixed_landmarks[1] = False
+    graph.sightings.enabled[4:6] = False
+    graph.add_pose_prior(0, [0, 0, 0], np.eye(3))
+    with pytest.raises(SolverError, match='pose 2 and what is connected'):
+        optimize(graph)
+
+
 def test_estimate_that_is_not_finite_is_refused_by_name():
     graph, _, _ = loop_graph()
     graph.poses[4, 1] = np.nan
