@@ -80,8 +80,12 @@ class Mapper:
         self._steady = SteadyOdom(params.back_end, self._topics.jump)
         if self.saved is not None:
             self.worker.submit(self._use_saved)
-        elif params.node.continue_map and self.folder.whole(params.node.map_file_name).exists():
-            self._continue(params.node.map_file_name)
+        elif params.node.continue_map:
+            whole = self.folder.whole(params.node.map_file_name)
+            if whole.exists():
+                self._continue(params.node.map_file_name)
+            else:
+                self._logger.warning(f'{whole} is not there to go on with: a map is begun')
 
     @property
     def stamp(self) -> int:

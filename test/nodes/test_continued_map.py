@@ -171,8 +171,9 @@ def test_place_that_a_person_tells_is_taken_where_the_scan_fits(make):
 
 
 def test_first_run_without_a_map_begins_one(make):
-    mapper, _ = make(continue_map=True, map_file_name='other')
+    mapper, ear = make(continue_map=True, map_file_name='other')
     assert mapper.continued == {}
+    assert 'other.rlml is not there to go on with' in ear.warnings[-1]
     with pytest.raises(MapError, match='cannot be read'):
         mapper.load('other')
 
