@@ -31,7 +31,7 @@ from rlml_slam.types import EdgeKind, Verdict
 # of a map that overlaps with another, most reflectors may be of places that the other lacks; that
 # what they have in common is no chance, the verdict still has to show
 APART = 0.95
-PATIENCE = 100  # nobody waits for a pose: a minute of searching at most
+PATIENCE = 50  # nobody waits for a pose: a minute of searching
 LATER = (
     'key_looked', 'key_jumped', 'reflector_gone', 'reflector_life', 'reflector_surveyed',
     'reflector_view',
