@@ -321,7 +321,7 @@ class BackEnd:
     def _is_held(self, key: Keyframe) -> bool:
         """Whether reflectors that were in the map when it was last tied together hold a pose."""
         enabled = self.graph.edges.enabled
-        if not any(c.accepted and enabled[c.edge] for c in self.scans.closures):
+        if not enabled[self.scans.closures.edges].any():
             return False
         newest = self.surest_way.newest
         until = bisect_right(self.keyframes, newest, key=lambda k: k.stamp) - 1

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlml_slam.errors import SolverError
 from rlml_slam.graph import factors
@@ -20,7 +21,8 @@ from rlml_slam.graph.live import Live
 from rlml_slam.graph.robust import weights
 from rlml_slam.graph.selection import select_closures
 from rlml_slam.params import Parameters
-from rlml_slam.rlml.closure import Closure, State
+from rlml_slam.rlml.closure import Closure, Fate, State
+from rlml_slam.rlml.closure_records import ClosureRecords
 from rlml_slam.se2 import Array
 
 # judging all anew takes as long as many solves: after one, the graph must have grown this much
@@ -39,24 +41,24 @@ class ClosureWatch:
         self._wrong = uniform(params.loop_closure.searched)
         self._judged = 0
 
-    def review(self, closures: Sequence[Closure], final: bool = False) -> tuple[Closure, ...]:
+    def review(self, closures: ClosureRecords, final: bool = False) -> tuple[Closure, ...]:
         """After a solve: note how each fares; those whose state changed, in a graph solved anew.
 
         With ``final`` doubts are settled whenever the last time was.
         """
-        closures = [c for c in closures if c.accepted]
-        if not closures:
+        edges = closures.edges
+        if not len(edges):
             return ()
-        doubtful = self._note(closures)
+        doubtful = self._note(edges, closures.fates)
         poses = len(self._graph.poses)
         if not doubtful or not (final or poses >= GROWTH * self._judged):
             return ()
         self._judged = poses
-        return self._judge(closures)
+        return self._judge(closures.accepted())
 
-    def revoke(self, closures: Sequence[Closure], number: int) -> Closure:
+    def revoke(self, closures: ClosureRecords, number: int) -> Closure:
         """Take a closure out for good; raises SolverError if there is no such one."""
-        found = next((c for c in closures if c.accepted and c.number == number), None)
+        found = next((c for c in closures.accepted(number) if c.number == number), None)
         if found is None:
             raise SolverError(f'there is no loop closure {number}')
         if found.fate.state is State.REVOKED:
@@ -65,21 +67,21 @@ class ClosureWatch:
         self._graph.edges.enabled[found.edge] = False
         return found
 
-    def _note(self, closures: Sequence[Closure]) -> bool:
+    def _note(self, edges: NDArray[np.int64], fates: Sequence[Fate]) -> bool:
         """Residual and weight of each; whether one that is active is likelier wrong."""
-        graph, edges = self._graph, np.array([c.edge for c in closures])
+        graph = self._graph
         i, j = graph.edges.nodes[edges].T
         e = factors.relative_pose(graph.poses[i], graph.poses[j], graph.edges.measured[edges])[0]
         information = graph.edges.information[edges]
         s, on = factors.chi2(e, information), graph.edges.enabled[edges]
         one = graph.losses.closure
         w = np.where(on, weights(int(one.kind), one.scale, s), 0.0)
-        last = np.array([c.fate.weight for c in closures])
+        last = np.array([fate.weight for fate in fates])
         switched = (w == 0.0) != (last == 0.0)
         for k in np.flatnonzero(np.isnan(last) | switched | (np.abs(w - last) > CHANGED)).tolist():
-            closures[k].fate.note(len(graph.poses) - 1, float(s[k]), float(w[k]))
-        for c, residual in zip(closures, s.tolist(), strict=True):
-            c.fate.residual = residual
+            fates[k].note(len(graph.poses) - 1, float(s[k]), float(w[k]))
+        for fate, residual in zip(fates, s.tolist(), strict=True):
+            fate.residual = residual
         doubt = on & (self._evidence(e, information) < 0.0)
         return bool(doubt.any())
 
@@ -110,5 +112,5 @@ class ClosureWatch:
                 why = 'agrees again' if right else 'contradicts the other closures'
                 c.fate.turn(state, why)
                 changed.append(c)
-        self._note(closures)
+        self._note(np.array([c.edge for c in closures]), [c.fate for c in closures])
         return tuple(changed)

@@ -30,6 +30,7 @@ from rlml_slam.rlml.closure import Closure, Fate, State
 from rlml_slam.rlml.closure_candidates import Candidate, candidates
 from rlml_slam.rlml.closure_entry import may_enter
 from rlml_slam.rlml.closure_match import OPEN, UNDECIDED, Match, Matcher
+from rlml_slam.rlml.closure_records import ClosureRecords
 from rlml_slam.rlml.constellation_closure import Place
 from rlml_slam.rlml.key_submap import TURN, KeySubmap
 from rlml_slam.rlml.keyframes import Keyframe
@@ -38,7 +39,6 @@ from rlml_slam.se2 import Array
 from rlml_slam.types import EdgeKind
 
 COVERED = 0.8  # share of a submap's walls that a newer one must know to take its place
-RECORDS = 2000  # of closures; beyond, the oldest rejected ones go
 WAITING = 60  # closures that wait for others to agree with them, the newest
 WAITS = 'waits for others that agree'
 BY_REFLECTORS = 'proposed by reflectors: '
@@ -65,7 +65,7 @@ class ScanGraph:
         self._failed: set[tuple[int, int]] = set()  # keyframes of rejected closures
         self._count = 0
         self._accepted = 0
-        self.closures: list[Closure] = []
+        self.closures = ClosureRecords()
         self.tried = {True: 0, False: 0}
         self.changed = False
         self._solved = 0  # closures below this number are in the estimate
@@ -175,17 +175,13 @@ class ScanGraph:
         T = se2.between(self._grid(new), self._grid(old))
         return len(old.walls) > 0 and new.submap.knows(se2.transform(T, old.walls)) >= COVERED
 
-    def edges_of_closures(self) -> list[int]:
-        """Of those that were accepted."""
-        return [c.edge for c in self.closures if c.accepted]
-
     def solved(self) -> None:
         """The estimate has all that is in the graph now."""
         self.changed, self._solved = False, self._accepted
 
     def unsolved(self) -> list[int]:
         """Edges of the closures that came since: where the estimate is, they count for little."""
-        return [c.edge for c in self.closures if c.accepted and c.number >= self._solved]
+        return [c.edge for c in self.closures.accepted(self._solved)]
 
     def take_over(self, pose: int, onto: Keyframe) -> None:
         """Keyframe ``pose`` goes: let submaps that stand on it stand on another one."""
@@ -197,39 +193,15 @@ class ScanGraph:
     def renumber(
         self, new: Renumbering, edges: Mapping[int, int], poses: Mapping[int, int]
     ) -> None:
-        """The graph has let go of keyframes: what of the closures' records speaks of now.
-
-        ``edges`` and ``poses`` map what went to what stands for it, by the numbers until now. Of
-        several closures that one edge stands for, the newest has the record.
-        """
+        """The graph has let go of keyframes, as ClosureRecords.renumber has it."""
         self._waiting = [
             c
             for c in self._waiting
             if c.key.index not in poses
             and (c.m in self._finished if c.m.size else c.m.anchor.index not in poses)
         ]
-        kept = []
-        for c in self.closures:
-            if not c.accepted and (c.i in poses or c.j in poses):
-                continue
-            i, j = poses.get(c.i, c.i), poses.get(c.j, c.j)
-            edge = edges.get(c.edge, c.edge)
-            if c.accepted and (i == j or edge < 0):
-                continue
-            i, j = int(new.poses[i]), int(new.poses[j])
-            edge = int(new.edges[edge]) if c.accepted else -1
-            same = (i, j, edge) == (c.i, c.j, c.edge)
-            kept.append(c if same else replace(c, i=i, j=j, edge=edge))
-        newest = {c.edge: k for k, c in enumerate(kept) if c.accepted}
-        kept = [c for k, c in enumerate(kept) if not c.accepted or newest[c.edge] == k]
-        # only of a rejected one is the record all there is: of the others, an edge is in the graph
-        rejected = [k for k, c in enumerate(kept) if not c.accepted]
-        gone = set(rejected[: max(len(kept) - RECORDS, 0)])
-        self.closures = [c for k, c in enumerate(kept) if k not in gone]
-        self._note_failed()
-
-    def _note_failed(self) -> None:
-        self._failed = {(c.i, c.j) for c in self.closures if not c.accepted}
+        self.closures.renumber(new, edges, poses)
+        self._failed = self.closures.failed()
 
     def _pose(self, key: Keyframe) -> Array:
         pose: Array = self._graph.poses[key.index]
@@ -282,7 +254,7 @@ class ScanGraph:
                     a['submap_centre'][k].copy(), a['submap_pose'][k].copy(),
                 )
             )  # fmt: skip
-        self.closures = [
+        self.closures = ClosureRecords(
             Closure(
                 i, j, fit[:3], float(fit[3]), edge, str(why), float(fit[4]), float(fit[5]), number,
                 Fate(State(state), str(reason)),
@@ -291,8 +263,8 @@ class ScanGraph:
                 a['closure'].tolist(), a['closure_fit'], a['closure_why'],
                 a['closure_fate'].tolist(), a['closure_reason'], strict=True
             )
-        ]  # fmt: skip
-        self._note_failed()
+        )  # fmt: skip
+        self._failed = self.closures.failed()
         self._accepted = max((c.number for c in self.closures), default=-1) + 1
         self._solved = self._accepted
         rejected, accepted = a['closures_tried'].tolist()
@@ -359,7 +331,7 @@ class ScanGraph:
         out = [closure for closure in tried if isinstance(closure, Closure)]
         if fit:
             out += self._admit(fit)
-        self.closures += out
+        self.closures.extend(out)
         for closure in out:
             self.tried[closure.accepted] += 1
         self._failed.update((c.i, c.j) for c in out if not c.accepted)
@@ -392,9 +364,7 @@ class ScanGraph:
                 out.append(c.closure(c.source + WAITS))
         entered = {(c.i, c.j) for c in out if c.accepted} & self._failed
         if entered:
-            kept = [c for c in self.closures if c.accepted or (c.i, c.j) not in entered]
-            self.tried[False] -= len(self.closures) - len(kept)
-            self.closures = kept
+            self.tried[False] -= self.closures.take_back(entered)
             self._failed -= entered
         left = [c for c, enters in zip(matches, may.tolist(), strict=True) if not enters]
         self._waiting = left[-WAITING:]

@@ -113,7 +113,7 @@ class Sparsifier:
     ) -> Renumbering:
         """Let go of all poses but those (n,); edges and poses that go, to what stands for them."""
         recorded = np.zeros(len(self._graph.edges), dtype=np.bool_)
-        of = [edges.get(k, k) for k in self._scans.edges_of_closures()]
+        of = [edges.get(k, k) for k in self._scans.closures.edges.tolist()]
         recorded[[k for k in of if k >= 0]] = True
         new = self._live.keep(kept, self._reflectors.keep_alive(), recorded)
         self._reflectors.renumber(new)

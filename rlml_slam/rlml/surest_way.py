@@ -21,7 +21,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rlml_slam.graph.table import FactorTable
-from rlml_slam.rlml.closure import Closure
+from rlml_slam.rlml.closure_records import ClosureRecords
 from rlml_slam.rlml.correction import Correction, Known, carried, positive, turned
 from rlml_slam.rlml.keyframes import Keyframe
 from rlml_slam.se2 import Array
@@ -65,10 +65,10 @@ class SurestWay:
         self._enter(key, turned(key.cov_local, -key.T_local[2]))
 
     def close(
-        self, closures: Sequence[Closure], keys: Sequence[Keyframe], edges: FactorTable
+        self, closures: ClosureRecords, keys: Sequence[Keyframe], edges: FactorTable
     ) -> None:
         """Take in what is new of all closures; ``keys`` are the keyframes, by index."""
-        fresh = [c for c in closures if c.number >= self._num and edges.enabled[c.edge]]
+        fresh = [c for c in closures.accepted(self._num) if edges.enabled[c.edge]]
         for c in sorted(fresh, key=lambda c: c.number):
             self._num = c.number + 1
             T = edges.measured[c.edge]

@@ -16,8 +16,9 @@ from rlml_slam.graph.live import Live
 from rlml_slam.graph.robust import Loss, Losses, LossKind
 from rlml_slam.graph.solver import optimize
 from rlml_slam.params import Parameters
-from rlml_slam.rlml import loop_closure
+from rlml_slam.rlml import closure_records
 from rlml_slam.rlml.closure import NOTES, Closure, State
+from rlml_slam.rlml.closure_records import ClosureRecords
 from rlml_slam.rlml.closure_table import closure_table, told, weight
 from rlml_slam.rlml.closure_watch import ClosureWatch
 from rlml_slam.rlml.loop_closure import ScanGraph
@@ -34,7 +35,7 @@ class Drive:
 
     def __init__(self):
         self.graph = Graph(Losses(closure=Loss(LossKind.HUBER, 2.0)))
-        self.closures = []
+        self.closures = ClosureRecords()
         self.rng = np.random.default_rng(0)
         self.watch = ClosureWatch(Parameters(), Live(self.graph))
 
@@ -76,18 +77,22 @@ def drive():
 
 def test_record_of_a_closure_stays_as_long_as_its_edge(monkeypatch):
     """Without it, nobody would know that the closure was revoked, and it would come back."""
-    monkeypatch.setattr(loop_closure, 'RECORDS', 4)
+    monkeypatch.setattr(closure_records, 'RECORDS', 4)
     scans = ScanGraph(Parameters(), Live(Graph()))
     edges = [0, -1, -1, 1, -1, 2, -1, 3]
-    scans.closures = [Closure(k, k + 9, np.zeros(3), 0.7, e, '') for k, e in enumerate(edges)]
+    scans.closures = ClosureRecords(
+        Closure(k, k + 9, np.zeros(3), 0.7, e, '') for k, e in enumerate(edges)
+    )
     same = [np.arange(n) for n in (20, 0, 4, 0, 0, 0)]
     scans.renumber(Renumbering(*same), {}, {})
     assert [c.i for c in scans.closures] == [0, 3, 5, 7]
-    monkeypatch.setattr(loop_closure, 'RECORDS', 3)
+    monkeypatch.setattr(closure_records, 'RECORDS', 3)
     scans.renumber(Renumbering(*same), {}, {})
     assert len(scans.closures) == 4
-    monkeypatch.setattr(loop_closure, 'RECORDS', 6)
-    scans.closures = [Closure(k, k + 9, np.zeros(3), 0.7, e, '') for k, e in enumerate(edges)]
+    monkeypatch.setattr(closure_records, 'RECORDS', 6)
+    scans.closures = ClosureRecords(
+        Closure(k, k + 9, np.zeros(3), 0.7, e, '') for k, e in enumerate(edges)
+    )
     scans.renumber(Renumbering(*same), {}, {})
     assert [c.i for c in scans.closures] == [0, 3, 4, 5, 6, 7]  # the oldest went
 

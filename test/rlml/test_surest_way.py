@@ -16,6 +16,7 @@ from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.marginals import Marginals
 from rlml_slam.graph.solver import optimize
 from rlml_slam.rlml.closure import Closure
+from rlml_slam.rlml.closure_records import ClosureRecords
 from rlml_slam.rlml.correction import either, turned
 from rlml_slam.rlml.joint_state import JointState
 from rlml_slam.rlml.keyframes import Keyframe
@@ -82,7 +83,7 @@ def test_other_end_of_a_closure_is_known_as_a_graph_of_the_closure_alone_knows_i
         graph.add_poses([i.T_local, j.T_local])
         graph.add_pose_prior(0, i.T_local, np.linalg.inv(i.cov_local))
         way = SurestWay()
-        way.close([closure(graph, 0, 0, 1, delta, cov)], [i, j], graph.edges)
+        way.close(ClosureRecords([closure(graph, 0, 0, 1, delta, cov)]), [i, j], graph.edges)
         expected = Marginals(graph).poses([1])[0]
         assert_allclose(turned(way.cov(j), j.T_local[2]), expected, rtol=1e-6, atol=1e-12)
 
@@ -90,7 +91,9 @@ def test_other_end_of_a_closure_is_known_as_a_graph_of_the_closure_alone_knows_i
 def test_nothing_gets_less_sure_by_a_closure_and_what_was_driven_before_it_gets_surer():
     keys = chain(STEPS)
     graph, way, before = graph_of(keys), SurestWay(), SurestWay()
-    way.close([closure(graph, 0, 2, 28, [0.0, 0.0, np.pi], MATCH)], keys, graph.edges)
+    way.close(
+        ClosureRecords([closure(graph, 0, 2, 28, [0.0, 0.0, np.pi], MATCH)]), keys, graph.edges
+    )
     for key in keys:
         ratio = np.linalg.det(way.cov(key)) / max(np.linalg.det(before.cov(key)), 1e-300)
         assert ratio <= 1.0 + 1e-9 or key.index == 0
@@ -102,16 +105,16 @@ def test_closures_that_are_none_leave_nothing_behind():
     keys = chain(STEPS)
     graph, way = graph_of(keys), SurestWay()
     closures = [closure(graph, n, 2 + n, 28 - n, [0.0, 0.0, np.pi], MATCH) for n in range(3)]
-    way.close(closures, keys, graph.edges)
+    way.close(ClosureRecords(closures), keys, graph.edges)
     surer = way.cov(keys[-1])
     graph.edges.enabled[closures[0].edge] = False
     way.forget()
-    way.close(closures, keys, graph.edges)
+    way.close(ClosureRecords(closures), keys, graph.edges)
     assert np.linalg.det(way.cov(keys[-1])) > np.linalg.det(surer)
     for c in closures:
         graph.edges.enabled[c.edge] = False
     way.forget()
-    way.close(closures, keys, graph.edges)
+    way.close(ClosureRecords(closures), keys, graph.edges)
     assert_allclose(way.cov(keys[-1]), SurestWay().cov(keys[-1]), atol=1e-15)
 
 
@@ -137,7 +140,7 @@ def test_letting_go_of_keyframes_changes_nothing_for_those_that_stay():
     pairs.sort(key=lambda pair: pair[1])
     delta = [se2.between(keys[i].T_local, keys[j].T_local) for i, j in pairs]
     closures = [closure(graph, n, *pairs[n], delta[n], MATCH) for n in range(150)]
-    way.close(closures, keys, graph.edges)
+    way.close(ClosureRecords(closures), keys, graph.edges)
     kept = [key for key in keys if key.index % 25 == 0]
     before = [way.cov(key) for key in kept]
     way.keep(kept)
@@ -208,7 +211,7 @@ def test_wheels_that_err_for_long_are_in_the_covariance_after_a_loop(honest):
         optimize(graph)
         cov = Marginals(graph).poses([len(steps)])[0]
         if honest:
-            way.close([found], keys, graph.edges)
+            way.close(ClosureRecords([found]), keys, graph.edges)
             cov = either(cov, turned(way.cov(keys[-1]), graph.poses[-1, 2]))
         e = graph.poses[-1] - poses[-1]
         e[2] = se2.wrap(e[2])
