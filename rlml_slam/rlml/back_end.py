@@ -77,6 +77,7 @@ class BackEnd:
     def reset(self) -> None:
         """Forget everything."""
         p = self._p
+        self.is_told = False  # which detection is of which reflector: not to be asked again
         # wheels slip; the front end's own motion, without any, does not
         slips = Loss(LossKind.CAUCHY, p.back_end.odometry_robust_scale)
         self.graph = Graph(
@@ -247,7 +248,7 @@ class BackEnd:
     def _see_reflectors(self, interval: Interval) -> None:
         """The reflectors seen near the newest keyframe, and what they tell of earlier ones."""
         pose = len(self.keyframes) - 1
-        if self.deferred.begins(interval):
+        if not self.is_told and self.deferred.begins(interval):
             if self._is_behind:
                 self.optimize()
             self.deferred.begin(pose)
@@ -281,7 +282,7 @@ class BackEnd:
             return
         solve = self.live.solve_all if final else self.live.solve
         solve()
-        if self.reflector_graph.merge(self.deferred.pending):
+        if not self.is_told and self.reflector_graph.merge(self.deferred.pending):
             solve()
         # open hypotheses are about places in the frame of now
         if self.plant is not None and not self.deferred.pending and self.plant.update():

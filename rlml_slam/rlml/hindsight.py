@@ -68,7 +68,9 @@ class Hindsight:
         dt = 1e-9 * (frame.stamp - self._frames[-1].stamp) if self._frames else 0.0
         walk, kept = m.imu_bias_walk**2 * dt, math.exp(-dt / m.wheels_time)
         self._steps.append(Step(observation.motion, walk, kept))
-        self._frames.append(frame)
+        # as measured: what the front end grants the detections of a group is no noise in the end
+        measured = dataclasses.replace(frame.observation, detections=observation.detections)
+        self._frames.append(dataclasses.replace(frame, observation=measured))
 
     def look_back(self, poses: Array, reflectors: Reflectors) -> list[Frame]:
         """The frames as they should have been, from the graph's ``poses`` (n, 3) and reflectors.
@@ -85,11 +87,14 @@ class Hindsight:
             before = answers
             granted = self._granted(turn) if match.is_open else 0.0
             marks, answers = match.answer(poses, marks, granted)
-            smoothed = smooth(self._start(), self._sights(match, answers, poses, marks.points),
-                              POINT, poses, STEPS)  # fmt: skip
+            steps = self._sights(match, answers, poses, marks.points, granted)
+            smoothed = smooth(self._start(), steps, POINT, poses, STEPS)
             poses, marks = smoothed.states[:, :3], Marks(smoothed.points, marks.ids)
             if not granted and np.array_equal(before, answers):
                 break
+        marks, answers = match.joined(marks, answers)
+        steps = self._sights(match, answers, poses, marks.points, 0.0)
+        smoothed = smooth(self._start(), steps, POINT, poses, STEPS)
         return self._told(smoothed, match.looks(answers))
 
     def _granted(self, turn: int) -> float:
@@ -103,9 +108,12 @@ class Hindsight:
         return Start(np.append(self._p.node.map_start_pose, np.zeros(3)), np.diag(sigma**2))
 
     def _sights(
-        self, match: SecondMatch, answers: Indices, poses: Array, points: Array
+        self, match: SecondMatch, answers: Indices, poses: Array, points: Array, granted: float
     ) -> list[Step]:
-        """The steps with what each one saw; by Cauchy's loss, what is far off counts less."""
+        """The steps with what each one saw; by Cauchy's loss, what is far off counts less.
+
+        Answers that may be off by the variance ``granted`` tell the path no more than that.
+        """
         steps = []
         for step, frame, at, pose in zip(
             self._steps, self._frames, match.looks(answers), poses, strict=True
@@ -114,7 +122,7 @@ class Hindsight:
             if d is None or not len(used):
                 steps.append(step)
                 continue
-            z, R = to_polar(d.points[used], d.cov[used])
+            z, R = to_polar(d.points[used], d.cov[used] + granted * np.eye(2))
             nu = POINT.innovation(z, POINT.observe(pose, points[at[used]])[0])
             d2 = _distance2(nu, R)
             R *= (1.0 + d2 / self._p.reflector.robust_scale**2)[:, None, None]

@@ -66,6 +66,7 @@ class SecondMatch:
         self._limit = gate(params.gate)
         self._density = params.density
         self._fewest = params.min_sightings
+        self._separation = params.min_separation
 
     @property
     def is_open(self) -> bool:
@@ -94,6 +95,29 @@ class SecondMatch:
         marks = self._needed(marks)
         pairs = self._pairs(marks)
         return _numbered(marks, self._match(pairs))
+
+    def joined(self, marks: Marks, answers: Indices) -> tuple[Marks, Indices]:
+        """Those nearer than ``reflector.min_separation`` that no look has two of are one.
+
+        Two that stand beside each other are seen together; what is in many places and never in
+        two at once is a person, or a detection that scatters more than it tells.
+        """
+        of, points = np.arange(len(marks.points)), marks.points.copy()
+        looks = [set(self._look[answers == k].tolist()) for k in of]
+        pairs = cKDTree(points).query_pairs(self._separation, output_type='ndarray')
+        gaps = np.hypot(*(points[pairs[:, 0]] - points[pairs[:, 1]]).T)
+        for i, j in pairs[np.lexsort((pairs[:, 1], pairs[:, 0], gaps))].tolist():
+            a, b = sorted((of[i], of[j]))
+            near = math.dist(points[a], points[b]) < self._separation
+            named = marks.ids[a] != ANONYMOUS or marks.ids[b] != ANONYMOUS
+            if a == b or not near or named or looks[a] & looks[b]:
+                continue
+            share = len(looks[b]) / (len(looks[a]) + len(looks[b]))
+            points[a] += share * (points[b] - points[a])
+            of[of == b] = a
+            looks[a] |= looks[b]
+        out = np.where(answers >= 0, of[answers], -1)
+        return _numbered(Marks(points, marks.ids), out)
 
     def _spread2(self, cov: Array, marks: Marks) -> float:
         """Variance per axis [m²] by which detections miss their reflectors beyond their noise.

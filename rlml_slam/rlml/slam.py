@@ -108,6 +108,7 @@ class Slam(Driven):
         )
         if frames:
             self.back_end.reset()
+            self.back_end.is_told = True
             for frame in frames:
                 self.back_end.add(frame)
             self.back_end.finish()

@@ -9,7 +9,7 @@ from rlml.made_worlds import ROOM, TinyWorld, drive, errors, observations
 
 from rlml_slam import se2
 from rlml_slam.params import Parameters
-from rlml_slam.rlml import stored_map
+from rlml_slam.rlml import hindsight, stored_map
 from rlml_slam.rlml.slam import Slam
 
 ROUND = drive(*[(0.5, 0.4, 15.7)] * 3)  # three times round a circle of 1.25 m
@@ -114,6 +114,41 @@ def test_reflector_by_itself_stays_one_however_it_scatters(seed):
     assert rmse(slam) < 1.2 * before
 
 
+def test_what_is_told_apart_is_as_sure_as_it_was_measured():
+    """While it was taken for one, where it stands within its group was granted besides."""
+    place = world(SINGLE, SINGLE + 0.25 * BESIDE)
+    made = observations(place, ROUND, rng=np.random.default_rng(1), scan=False, sigma=0.08)
+    slam = Slam(Parameters())
+    granted = [
+        np.abs(f.observation.detections.cov - o.detections.cov).max()
+        for f, o in zip(slam.process(made), made, strict=True)
+    ]
+    assert max(granted) > 0.05**2
+    slam.back_end.finish()
+    told = slam.hindsight.look_back(slam.back_end.trajectory()[1], slam.reflectors())
+    for frame, o in zip(told, made, strict=True):
+        np.testing.assert_array_equal(frame.observation.detections.cov, o.detections.cov)
+
+
+def test_what_is_granted_the_path_its_answers_are_not_surer_than(monkeypatch):
+    """Least variances of what the path is smoothed by, from turn to turn."""
+    least, smooth = [], hindsight.smooth
+
+    def spy(start, steps, *args):
+        sights = [q for s in steps for q in s.sights]
+        least.append(min(q.R[0, 0] for q in sights))
+        return smooth(start, steps, *args)
+
+    slam = run(world(SINGLE, SINGLE + 0.15 * BESIDE), 0, scan=False, sigma=0.03)
+    monkeypatch.setattr(hindsight, 'smooth', spy)
+    slam.finish()
+    granted = Parameters().reflector.min_separation ** 2 * 0.5 ** np.arange(len(least))
+    granted[hindsight.COLD :] = 0.0
+    assert len(least) > hindsight.COLD
+    assert (np.array(least) >= granted).all()
+    assert least[-1] < 2.0 * 0.03**2
+
+
 def test_the_graph_has_its_minimum_where_the_run_turned_out_to_be():
     slam = run(world(SINGLE, SINGLE + 0.5 * BESIDE), 5, scan=False, sigma=0.05)
     slam.finish()
@@ -121,6 +156,15 @@ def test_the_graph_has_its_minimum_where_the_run_turned_out_to_be():
     assert slam.back_end.graph.chi2() < 1e-6
     slam.back_end.optimize(final=True)
     np.testing.assert_allclose(slam.back_end.graph.poses, poses, atol=1e-9)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_what_was_told_apart_the_graph_does_not_take_for_one_again(seed):
+    """Nearer than the front end can tell them apart, but seen together."""
+    slam = run(world(SINGLE, SINGLE + 0.15 * BESIDE), seed, scan=False, sigma=0.02)
+    slam.finish()
+    assert len(slam.reflectors()) == 2 * len(SINGLE)
+    assert slam.back_end.graph.chi2() < 1e-6
 
 
 def test_ids_are_kept():

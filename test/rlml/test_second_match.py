@@ -78,3 +78,53 @@ def test_a_ghost_that_nothing_repeats_is_no_reflector():
     marks, answers = match.answer(np.zeros((len(looks), 3)), marks_at(ROW), 0.0)
     assert len(marks.points) == len(ROW)
     assert (answers.reshape(-1, 4)[:, 3] == -1).all()
+
+
+def joined(groups, gap):
+    """How many reflectors are left of two ``gap`` apart, of which each look sees those told."""
+    points = np.array([[2.0, 1.0], [2.0, 1.0 + gap]])
+    looks = [detections_of(points[list(g)], k, None, 0.02) for k, g in enumerate(groups)]
+    match = SecondMatch(looks, Reflector())
+    marks, answers = match.answer(np.zeros((len(looks), 3)), marks_at(points), 0.0)
+    assert len(marks.points) == 2
+    return match.joined(marks, answers)
+
+
+def test_what_is_near_and_never_seen_together_is_one():
+    """It lies where the detections of both say; all of them are its own."""
+    marks, answers = joined([[0], [1], [1], [1]] * 10, 0.2)
+    np.testing.assert_allclose(marks.points, [[2.0, 1.15]], atol=1e-9)
+    assert (answers == 0).all()
+
+
+@pytest.mark.parametrize(
+    ('groups', 'gap'),
+    [
+        ([[0], [1]] * 20 + [[0, 1]], 0.2),  # one look has two of them
+        ([[0], [1]] * 20, 0.3),  # farther than reflector.min_separation
+    ],
+)
+def test_what_is_seen_together_or_far_apart_stays_two(groups, gap):
+    marks, answers = joined(groups, gap)
+    assert len(marks.points) == 2
+    assert set(answers.tolist()) == {0, 1}
+
+
+def test_what_tells_another_id_is_not_joined():
+    points = np.array([[2.0, 1.0], [2.0, 1.2]])
+    looks = [detections_of(points[[k % 2]], k, [k % 2 + 7], 0.02) for k in range(20)]
+    match = SecondMatch(looks, Reflector())
+    marks, answers = match.answer(np.zeros((20, 3)), Marks(points, np.array([7, 8])), 0.0)
+    assert len(match.joined(marks, answers)[0].points) == 2
+
+
+def test_a_cloud_that_scatters_more_than_it_tells_is_not_spread_over_many():
+    """Of a person with a reflecting vest; without joining there are a dozen."""
+    rng = np.random.default_rng(0)
+    at = np.array([2.0, 1.0]) + 0.1 * rng.standard_normal((400, 1, 2))
+    match = SecondMatch([detections_of(p, k, None, 0.02) for k, p in enumerate(at)], Reflector())
+    marks, answers = match.answer(np.zeros((400, 3)), marks_at(np.array([[2.0, 1.0]])), 0.0)
+    before = len(marks.points)
+    marks, _ = match.joined(marks, answers)
+    assert before > 4
+    assert len(marks.points) <= before // 2
