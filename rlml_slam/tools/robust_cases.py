@@ -43,8 +43,8 @@ class Outcome(NamedTuple):
 
 
 Method = Callable[[Graph], Outcome]
-# of one solver on one case: ate_m, cpu_ms, missed and accepted_wrong of those that select; or
-# cpu_ms and stopped
+# of one solver on one case: ate_m, chi2_ratio, cpu_ms, missed and accepted_wrong of those that
+# select; or cpu_ms and stopped
 Judged = dict[str, Any]
 
 
@@ -79,6 +79,7 @@ class Cases:
         self.best = copied(graph)
         initialize(self.best, 'chordal')
         optimize(self.best, EXACT)
+        self._least = self.best.chi2()
         e = graph.edges
         parts = (e.nodes, e.measured, e.information)
         self._digest = zlib.crc32(b''.join(np.ascontiguousarray(p).tobytes() for p in parts))
@@ -123,7 +124,11 @@ class Cases:
             same = kept.get('solver') == _solver_digest()
         except (OSError, ValueError, KeyError, TypeError) as e:
             raise RlmlError(f'{path}: not a case of this benchmark: {e}') from e
-        return {name: one for name, one in results.items() if same or name not in self._own}
+        return {
+            name: one
+            for name, one in results.items()
+            if (same or name not in self._own) and one.keys() & {'stopped', 'chi2_ratio'}
+        }
 
     def _judge(self, spoilt: Graph, method: Method) -> Judged:
         """One solver on a copy of a graph."""
@@ -131,7 +136,12 @@ class Cases:
         outcome = method(own)
         if outcome.stopped is not None:
             return {'cpu_ms': outcome.cpu_ms, 'stopped': outcome.stopped}
-        out = {'ate_m': ate(own.poses, best), 'cpu_ms': outcome.cpu_ms}
+        right = copied(self.best)
+        right.poses[:] = own.poses
+        out = {
+            'ate_m': ate(own.poses, best), 'chi2_ratio': right.chi2() / self._least,
+            'cpu_ms': outcome.cpu_ms,
+        }  # fmt: skip
         if outcome.accepted is not None:
             out['missed'] = float(np.sum(~outcome.accepted[: self.right]))
             out['accepted_wrong'] = float(np.sum(outcome.accepted[self.right :]))
@@ -162,6 +172,7 @@ def summary(each: Sequence[Judged]) -> dict[str, Any]:
     if done:
         errors = [one['ate_m'] for one in done]
         out |= {'ate_median_m': float(np.median(errors)), 'ate_max_m': max(errors)}
+        out['chi2_ratio_max'] = max(one['chi2_ratio'] for one in done)
         for name in done[0].keys() & {'missed', 'accepted_wrong'}:
             out[name] = float(np.mean([one[name] for one in done]))
     return out

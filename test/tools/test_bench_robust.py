@@ -57,6 +57,9 @@ def test_benchmark_judges_against_the_graph_without_wrong_closures(graph_file, c
         row = rows[wrong, 'select']
         assert row['accepted_wrong'] == row['missed'] == 0.0
         assert row['ate_max_m'] < 1e-4
+        assert 1.0 - 1e-9 <= row['chi2_ratio_max'] < 1.0 + 1e-6
+    # a kernel bends the right ones too
+    assert rows['20', 'dcs']['chi2_ratio_max'] > 1.0 + 1e-6
     assert rows['20', 'gnc']['ate_max_m'] >= rows['20', 'select']['ate_max_m']
     assert 'missed' not in rows['20', 'dcs']
 
