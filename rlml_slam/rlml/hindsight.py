@@ -9,8 +9,9 @@ that cannot tell two reflectors apart errs by as much as they are apart: the fir
 detection that much besides its noise, each later one half the variance of the one before
 (graduated assignment: Gold, Rangarajan 1996). So a look at a group finds all of it, where the path
 is off by one of its gaps, before what is left over may be a further reflector, and a wrong answer
-of the first turns is taken back later. The back end then goes through the run once more, as it
-should have been: its map is the only one.
+of the first turns is taken back later. At the end, two that are close and never seen together are
+one. The back end then goes through the run once more, as it should have been, and takes nothing
+for one that was told apart: its map is the only one.
 
 With scans there is no need: they hold the path by themselves, and the graph has them.
 """
