@@ -150,7 +150,7 @@ class BackEnd:
     def _add_keyframe(self, frame: Frame, began: tuple[float, float]) -> Update:
         self._optimized, self._changed, self._gone = False, (), ()
         key = self._node(frame)
-        closures = self._return()
+        closures = () if self.is_told else self._return()
         if key.points is not None:
             closures += self.scans.add(key)
         self._join(self.scans.take_pairs())

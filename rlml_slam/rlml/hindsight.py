@@ -9,9 +9,9 @@ that cannot tell two reflectors apart errs by as much as they are apart: the fir
 detection that much besides its noise, each later one half the variance of the one before
 (graduated assignment: Gold, Rangarajan 1996). So a look at a group finds all of it, where the path
 is off by one of its gaps, before what is left over may be a further reflector, and a wrong answer
-of the first turns is taken back later. At the end, two that are close and never seen together are
-one. The back end then goes through the run once more, as it should have been, and takes nothing
-for one that was told apart: its map is the only one.
+of the first turns is taken back later. At the end, two that are close, never seen together and not
+parted by a gap are one. The back end then goes through the run once more, as it should have been,
+and takes nothing for one that was told apart: its map is the only one.
 
 With scans there is no need: they hold the path by themselves, and the graph has them.
 """
@@ -32,7 +32,7 @@ from rlml_slam.matching.association import gate
 from rlml_slam.params import Parameters
 from rlml_slam.rlml.second_match import Marks, SecondMatch
 from rlml_slam.se2 import Array
-from rlml_slam.types import Frame, Observation, Reflectors
+from rlml_slam.types import ANONYMOUS, Frame, Observation, Reflectors
 
 TURNS = 20
 COLD = 10  # turns until what is granted is no more: 0.1 % of the first variance
@@ -88,6 +88,8 @@ class Hindsight:
             before = answers
             granted = self._granted(turn) if match.is_open else 0.0
             marks, answers = match.answer(poses, marks, granted)
+            if not len(marks.points):
+                return []
             steps = self._sights(match, answers, poses, marks.points, granted)
             smoothed = smooth(self._start(), steps, POINT, poses, STEPS)
             poses, marks = smoothed.states[:, :3], Marks(smoothed.points, marks.ids)
@@ -146,8 +148,8 @@ class Hindsight:
                 points, at = d.points.copy(), at.copy()
                 used = np.flatnonzero(at >= 0)
                 points[used] = se2.transform(se2.inverse(b), smoothed.points[at[used]])
-                off = _distance2(d.points[used] - points[used], d.cov[used])
-                at[used[off > self._limit]] = -1  # told by an id, but elsewhere
+                off = _distance2(d.points[used] - points[used], d.cov[used]) > self._limit
+                at[used[off & (d.ids[used] != ANONYMOUS)]] = -1  # told by an id, but elsewhere
                 observation = dataclasses.replace(
                     observation, detections=dataclasses.replace(d, points=points)
                 )

@@ -112,6 +112,7 @@ class Slam(Driven):
             for frame in frames:
                 self.back_end.add(frame)
             self.back_end.finish()
+            self.back_end.is_told = False
 
     def process(self, observations: Iterable[Observation]) -> list[Frame]:
         """What the sequencer made of the inputs."""

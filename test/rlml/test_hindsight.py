@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rlml.made_worlds import ROOM, TinyWorld, drive, errors, observations
+from rlml.made_worlds import ROOM, TinyWorld, detections_of, drive, errors, observations
 
 from rlml_slam import se2
 from rlml_slam.params import Parameters
@@ -21,18 +21,22 @@ def world(*groups):
     return TinyWorld(np.zeros((0, 4)), np.concatenate(groups))
 
 
+def only(o, kept):
+    """An observation with some of its detections."""
+    d = o.detections
+    d = replace(
+        d, points=d.points[kept], cov=d.cov[kept], ids=d.ids[kept], diameters=d.diameters[kept]
+    )
+    return replace(o, detections=d)
+
+
 def run(place, seed=None, seen=1.0, **kwargs):
     """The system before it looks back; of the reflectors in view, a share is ``seen``."""
     rng = None if seed is None else np.random.default_rng(seed)
     made = observations(place, ROUND, rng=rng, **kwargs)
     if seen < 1.0:
         for k, o in enumerate(made):
-            d, kept = o.detections, rng.random(len(o.detections)) < seen
-            d = replace(
-                d, points=d.points[kept], cov=d.cov[kept], ids=d.ids[kept],
-                diameters=d.diameters[kept],
-            )  # fmt: skip
-            made[k] = replace(o, detections=d)
+            made[k] = only(o, rng.random(len(o.detections)) < seen)
     slam = Slam(Parameters())
     slam.process(made)
     slam.back_end.finish()
@@ -158,13 +162,63 @@ def test_the_graph_has_its_minimum_where_the_run_turned_out_to_be():
     np.testing.assert_allclose(slam.back_end.graph.poses, poses, atol=1e-9)
 
 
-@pytest.mark.parametrize('seed', range(3))
-def test_what_was_told_apart_the_graph_does_not_take_for_one_again(seed):
-    """Nearer than the front end can tell them apart, but seen together."""
-    slam = run(world(SINGLE, SINGLE + 0.15 * BESIDE), seed, scan=False, sigma=0.02)
+def pillar(gap, seed, sigma):
+    """The system after it looked back: in the circle, a reflector on either side of a pillar."""
+    middle = np.array([0.0, 1.25])
+    place = world(SINGLE, middle + gap * np.array([[0.5, 0.0], [-0.5, 0.0]]))
+    made = observations(place, ROUND, rng=np.random.default_rng(seed), scan=False, sigma=sigma)
+    for k, (o, pose) in enumerate(zip(made, ROUND, strict=True)):
+        made[k] = only(o, [0, 1, 2, 3, 4 if pose[0] > 0.0 else 5])
+    slam = Slam(Parameters())
+    slam.process(made)
     slam.finish()
-    assert len(slam.reflectors()) == 2 * len(SINGLE)
+    return slam, place
+
+
+@pytest.mark.parametrize(
+    ('gap', 'seed', 'sigma'), [(0.15, 0, 0.02), (0.2, 0, 0.02), (0.3, 1, 0.04), (0.3, 2, 0.04)]
+)
+def test_what_was_told_apart_the_graph_does_not_take_for_one_again(gap, seed, sigma):
+    """Never seen together, and nearer than the front end can tell them apart."""
+    slam, place = pillar(gap, seed, sigma)
+    found = slam.reflectors()
+    off = np.linalg.norm(found.points[:, None] - place.reflectors, axis=-1)
+    assert len(found) == 6
+    assert off.min(axis=1).max() < 0.03
+    assert found.sightings.min() > 200
     assert slam.back_end.graph.chi2() < 1e-6
+    assert not slam.back_end.is_told
+
+
+def test_a_person_who_stands_is_not_taken_for_many():
+    """Somebody with a reflecting vest, 0.15 m wide, of which the front end makes some."""
+    rng = np.random.default_rng(0)
+    made = observations(world(SINGLE), ROUND, rng=rng, scan=False, sigma=0.05)
+    for k, (o, pose) in enumerate(zip(made, ROUND, strict=True)):
+        vest = np.array([-1.0, 4.0]) + 0.15 * rng.standard_normal(2)
+        points = np.vstack([o.detections.points, se2.transform(se2.inverse(pose), vest)])
+        made[k] = replace(o, detections=detections_of(points, o.stamp, None, 0.05))
+    slam = Slam(Parameters())
+    slam.process(made)
+    slam.finish()
+    off = np.linalg.norm(slam.reflectors().points[:, None] - SINGLE, axis=-1).min(axis=1)
+    assert (off < 0.05).sum() == len(SINGLE)
+    assert (off > 0.3).sum() < 8
+
+
+def test_a_run_that_no_reflector_explains_keeps_its_map():
+    """One that is seen at the start, and ghosts, each once."""
+    rng, way = np.random.default_rng(0), drive((1.0, 0.0, 60.0))
+    made = observations(TinyWorld(np.zeros((0, 4)), np.array([[2.0, 3.0]])), way, rng=rng,
+                        scan=False)  # fmt: skip
+    for k, o in enumerate(made):
+        points = o.detections.points if k < 30 else rng.uniform(-12.0, 12.0, (int(k % 4 == 0), 2))
+        made[k] = replace(o, detections=detections_of(points, o.stamp, None, 0.02))
+    slam = Slam(Parameters())
+    slam.process(made)
+    slam.finish()
+    assert len(slam.reflectors()) == 1
+    assert slam.hindsight.look_back(slam.back_end.trajectory()[1], slam.reflectors()) == []
 
 
 def test_ids_are_kept():
