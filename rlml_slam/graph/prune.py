@@ -12,8 +12,9 @@ was. The same holds of the sightings of a pose, h = tr(Q W) / 2, of which the le
 Were it for leverage alone, the edges that stay would lie the more at random the longer new ones
 come in, and the factor of such a graph is nearly full. There, an edge to a pose with many
 neighbours costs little, for that pose separates the others anyway: so what an edge tells counts
-times the number of neighbours of the busier one of its poses. Some that go tell more than the
-mean for that; none tells more than it leaves to the others, AT_ONCE.
+times the square of the number of neighbours of the busier one of its poses. By the number itself
+the factor still grew, by 8 % in an hour of driving in one hall; by its square it does not. Some
+that go tell more than the mean for that; none tells more than it leaves to the others, AT_ONCE.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def prune(graph: Graph, may: NDArray[np.bool_], most: int) -> NDArray[np.int64]:
     nodes = e.nodes[use]
     neighbours = np.bincount(np.unique(np.sort(nodes), axis=0).ravel())
     busier = neighbours[nodes].max(axis=1)
-    gone = use[_least(leverages(graph), may[use], len(use) - most, busier)]
+    gone = use[_least(leverages(graph), may[use], len(use) - most, busier**2)]
     e.enabled[gone] = False
     return gone
 

@@ -136,7 +136,7 @@ def test_factor_does_not_fill_however_long_edges_come_and_go():
     rng = np.random.default_rng(0)
     graph = crowd(rng, 100, 0)
     filled = []
-    for lap in range(9):
+    for lap in range(13):
         for hub in rng.choice(100, 4, replace=False):
             for other in rng.choice(100, 30, replace=False):
                 if hub != other:
@@ -145,8 +145,9 @@ def test_factor_does_not_fill_however_long_edges_come_and_go():
             pass
         if lap:  # the first one leaves fewer edges than that
             filled.append(room(graph))
-    # by leverage alone it doubles
+    # by leverage alone it doubles; by that times the number of neighbours the last are 0.88
     assert max(filled) < 1.3 * filled[0], filled
+    assert np.mean(filled[-4:]) < 0.85 * filled[0], filled
 
 
 def room(graph):
