@@ -13,7 +13,9 @@ from rlml_slam.graph.table import Column
 from rlml_slam.rlml.landmark import Landmark
 from rlml_slam.se2 import Array
 
-MOST = 1000  # that are remembered; the first ones make room
+# That are remembered; the first ones make room, those that never were in the map before others:
+# in a day ghosts come and go by thousands, and what was moved is told by where it was.
+MOST = 1000
 # ``mapped``: it was in the map, and was not only seen too seldom to enter it
 GONE = np.dtype(
     [
@@ -46,7 +48,9 @@ class GoneList:
         row['first'], row['last'], row['mapped'] = m.life.first, m.life.last, m.index >= 0
         self._rows.append(row)
         if len(self._rows) > 2 * MOST:
-            kept = self._rows.view[-MOST:].copy()
+            rows = self._rows.view
+            newest = np.argsort(rows['mapped'], kind='stable')[-MOST:]
+            kept = rows[np.sort(newest)].copy()
             self._rows = Column((), GONE)
             self._rows.append(kept)
 

@@ -21,6 +21,9 @@ COLUMNS = (
     'from_key', 'from_x_m', 'from_y_m', 'by_m',
 )  # fmt: skip
 FAR = 3.0  # [m] one that is missing and one that is new are one that was moved, if this near
+# [s] that both may seem to be there, for looks count by the keyframe they were near; and that the
+# missing one was there at least, longer than most who pass: then what is near was mapped
+TOGETHER, SETTLED = 10.0, 60.0
 
 
 @dataclass
@@ -49,8 +52,9 @@ class ReflectorState:
 def reflector_states(reflectors: ReflectorGraph, params: Reflector) -> list[ReflectorState]:
     """All reflectors, those of the map first.
 
-    One that left the map is missing, or moved where a new one stands near or tells its id. What
-    was seen in one pass alone is a ghost, and so is what was seen too seldom to enter the map.
+    One that left the map is missing, or moved where a new one stands near or tells its id; what
+    came when an old one went is new there, whatever earlier keyframes tell. What was seen in one
+    pass alone is a ghost, and so is what was seen too seldom to enter the map.
     """
     there = [_alive(m, reflectors.place(m)) for m in reflectors.alive()]
     there.sort(key=lambda s: s.key)
@@ -59,7 +63,7 @@ def reflector_states(reflectors: ReflectorGraph, params: Reflector) -> list[Refl
         s for s in left
         if s.state == MISSING and all(_gap(s, t) > params.min_separation for t in there)
     ]  # fmt: skip
-    pairs = [(_gap(n, s), n, s) for n in there if n.state == NEW for s in lost if _same(n, s)]
+    pairs = [(_gap(n, s), n, s) for n in there for s in lost if _came_after(n, s) and _same(n, s)]
     for _, new, old in sorted(pairs, key=lambda p: p[0]):
         if new.origin is None and old in lost:
             new.state, new.origin = MOVED, old
@@ -83,6 +87,12 @@ def _left(reflectors: ReflectorGraph, params: Reflector) -> list[ReflectorState]
         state = MISSING if mapped and not passing else GHOST
         out.append(ReflectorState(state, key, id_, np.array(place), count, first, last, 0.0))
     return out
+
+
+def _came_after(new: ReflectorState, old: ReflectorState) -> bool:
+    """Whether one appeared where the other's surroundings were mapped."""
+    came_then = (old.last - new.first) * 1e-9 < TOGETHER
+    return new.state == NEW or (came_then and (old.last - old.first) * 1e-9 > SETTLED)
 
 
 def _same(new: ReflectorState, old: ReflectorState) -> bool:

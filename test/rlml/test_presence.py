@@ -95,6 +95,26 @@ def test_moved_missing_and_new_are_told_apart(changed):
     assert all(s.probability > 0.99 for s in found['present'])
 
 
+@pytest.mark.parametrize(('there', 'state'), [(61.0, 'moved'), (30.0, 'present')])
+def test_what_came_when_a_settled_one_went_was_moved(changed, there, state):
+    """Even where no keyframe is left that stood there before."""
+    reflectors = changed[0].back_end.reflector_graph
+    (moved,) = by_state(changed[0].back_end)['moved']
+    is_new = {m.key: m.life.is_new for m in reflectors.alive()}
+    first = reflectors.gone.rows['first'].copy()
+    try:
+        reflectors.gone.rows['first'] = reflectors.gone.rows['last'] - int(there * 1e9)
+        for m in reflectors.alive():
+            m.life.is_new = False
+        found = {s.key: s.state for s in changed[0].back_end.reflector_states()}
+    finally:
+        reflectors.gone.rows['first'] = first
+        for m in reflectors.alive():
+            m.life.is_new = is_new[m.key]
+    assert found[moved.key] == state
+    assert 'new' not in found.values()
+
+
 def test_map_and_front_end_have_what_is_there_now(changed):
     slam, _ = changed
     points = slam.reflectors().points
