@@ -13,6 +13,12 @@ residual are not known yet. Every block of the normal matrix is a complex number
 so the same fronts serve with two rows per unknown. Without sightings the headings are solved
 alone; with sightings all at once, because then the landmarks are what ties them together.
 Positions follow with the headings back on the unit circle.
+
+What one fixed heading tells fades with the distance and the noise: relaxed headings get shorter
+from edge to edge, by orders of magnitude in large or noisy graphs, and follow the few edges on
+the way rather than all. So they are taken back to length 1 and solved for again, r <- H^-1 (w r /
+|r| - g) with the factor at hand, which turns them towards the maximum of r^H H^-1 r among those
+of length 1 (the generalised power method: Boumal 2016).
 """
 
 from __future__ import annotations
@@ -27,6 +33,12 @@ from rlml_slam.graph.structure import Records
 from rlml_slam.graph.system import System, place
 from rlml_slam.se2 import Array
 
+# Relaxed headings get shorter from node to node, the more the noisier the edges are. Where they
+# are shorter than this, they are worth TURNS solves more, or until none turns by SETTLED.
+WEAK = 1e-4
+TURNS = 10
+SETTLED = 0.01
+
 
 @kernel
 def relax(system: System, poses: Array, landmarks: Array) -> bool:
@@ -34,18 +46,34 @@ def relax(system: System, poses: Array, landmarks: Array) -> bool:
 
     The panels of the system serve as memory: it has to be linearised anew.
     """
-    n = len(poses)
-    state = np.empty((n, 4))  # r and t
+    shift = len(system.sightings) > 0
+    return _relax(system, poses, landmarks, shift, True, TURNS, WEAK)
+
+
+@kernel
+def relax_jointly(system: System, poses: Array, landmarks: Array, anew: bool, turns: int) -> bool:
+    """As relax, but headings together with positions, and held to length 1 for ``turns``.
+
+    These begin with the headings at hand or, ``anew``, with the relaxed ones.
+    """
+    return _relax(system, poses, landmarks, True, anew, turns, math.inf)
+
+
+@part
+def _relax(
+    system: System, poses: Array, landmarks: Array, shift: bool, anew: bool, turns: int,
+    weak: float,
+) -> bool:  # fmt: skip
+    n, variables = len(poses), system.variables
+    units = np.empty((n, 2))
     for i in range(n):
-        state[i, 0], state[i, 1] = math.cos(poses[i, 2]), math.sin(poses[i, 2])
-        state[i, 2], state[i, 3] = poses[i, 0], poses[i, 1]
-    variables = system.variables
-    good = _headings(system, state, landmarks, len(system.sightings) > 0)
+        units[i, 0], units[i, 1] = math.cos(poses[i, 2]), math.sin(poses[i, 2])
+    good = _headings(system, poses, landmarks, units, shift, anew, turns, weak)
     if good:
         for a in range(len(variables)):
             i = variables[a]['node']
-            if i < n and math.hypot(state[i, 0], state[i, 1]) > 1e-9:
-                poses[i, 2] = math.atan2(state[i, 1], state[i, 0])
+            if i < n:
+                poses[i, 2] = math.atan2(units[i, 1], units[i, 0])
         good = _positions(system, poses, landmarks)
     place(system.structure, system.fronts, system.entries, variables, system.edges,
           system.sightings)  # fmt: skip
@@ -122,38 +150,83 @@ def _positions(system: System, poses: Array, landmarks: Array) -> bool:
 
 
 @part
-def _headings(system: System, state: Array, landmarks: Array, shift: bool) -> bool:
-    """Solve for the headings r into ``state``; with ``shift`` together with the positions."""
+def _headings(
+    system: System, poses: Array, landmarks: Array, units: Array, shift: bool, anew: bool,
+    turns: int, weak: float,
+) -> bool:  # fmt: skip
+    """Solve for the directions ``units`` (n, 2); with ``shift`` together with the positions."""
     variables, edges, sightings = system.variables, system.edges, system.sightings
-    n = len(state)
-    dims = np.empty(len(variables), np.int64)
+    n, num = len(poses), len(variables)
+    state, points = np.empty((n, 4)), landmarks.copy()  # r and t
+    for i in range(n):
+        state[i, 0], state[i, 1] = units[i, 0], units[i, 1]
+        state[i, 2], state[i, 3] = poses[i, 0], poses[i, 1]
+    dims = np.empty(num, np.int64)
     rows = 0
-    for a in range(len(variables)):
-        is_pose = variables[a]['node'] < n
-        dims[a] = (2 if is_pose else 0) + (2 if shift else 0)
+    for a in range(num):
+        i = variables[a]['node']
+        dims[a] = (2 if i < n else 0) + (2 if shift else 0)
         rows += dims[a]
+        # from 0 on, so that g is what the fixed nodes and the priors tell, and headings that get
+        # ever shorter keep their digits
+        if i < n:
+            state[i, 0] = state[i, 1] = state[i, 2] = state[i, 3] = 0.0
+        else:
+            points[i - n, 0] = points[i - n, 1] = 0.0
     fronts, entries, size = lay_out(system.structure, dims)
     place(system.structure, fronts, entries, variables, edges, sightings)
     values = room(system.values, fronts[len(fronts) - 1]['panel'])
     for i in range(len(values)):
         values[i] = 0.0
-    g = np.empty(rows)
+    g, x = np.empty(rows), np.empty(rows)
     for i in range(rows):
         g[i] = 0.0
     _edges(edges, variables, state, values, g, shift)
     if shift:
-        _sightings(sightings, variables, state, landmarks, values, g)
-    _priors(system.priors, variables, state, landmarks, values, g, shift)
+        _sightings(sightings, variables, state, points, values, g)
+    _priors(system.priors, variables, state, points, values, g, shift)
+    weight = 0.0  # of one turn, beside what is fixed
+    for a in range(num):
+        if variables[a]['node'] < n:
+            weight += values[variables[a]['address']] / num
+    for i in range(rows):
+        x[i] = -g[i]
     left, right = room(system.left, size[0]), room(system.right, size[1])
-    if factorise(fronts, entries, values, left, right, g) >= 0:
+    if factorise(fronts, entries, values, left, right, x) >= 0:
         return False
-    solve_upper(fronts, entries, values, g)
+    solve_upper(fronts, entries, values, x)
+    if anew and _directions(variables, x, units)[0] > weak:
+        return True
+    for _ in range(turns):
+        for i in range(rows):
+            x[i] = -g[i]
+        for a in range(num):
+            i, k = variables[a]['node'], variables[a]['scalar']
+            if i < n:
+                x[k] += weight * units[i, 0]
+                x[k + 1] += weight * units[i, 1]
+        solve_lower(fronts, entries, values, x)
+        solve_upper(fronts, entries, values, x)
+        if _directions(variables, x, units)[1] < SETTLED:
+            break
+    return True
+
+
+@part
+def _directions(variables: Records, x: Array, units: Array) -> tuple[float, float]:
+    """Take the directions of the headings in x; the shortest of these, the largest change."""
+    shortest, change = math.inf, 0.0
     for a in range(len(variables)):
         i, k = variables[a]['node'], variables[a]['scalar']
-        if i < n:
-            state[i, 0] -= g[k]
-            state[i, 1] -= g[k + 1]
-    return True
+        if i >= len(units):
+            continue
+        length = math.hypot(x[k], x[k + 1])
+        shortest = min(shortest, length)
+        if length > 0.0:
+            re, im = x[k] / length, x[k + 1] / length
+            change = max(change, abs(re - units[i, 0]) + abs(im - units[i, 1]))
+            units[i, 0], units[i, 1] = re, im
+    return shortest, change
 
 
 @part

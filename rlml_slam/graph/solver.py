@@ -20,6 +20,7 @@ from rlml_slam.graph.initialize import initialize
 from rlml_slam.graph.iterate import Progress, copy, gauss_newton
 from rlml_slam.graph.linearize import linearize
 from rlml_slam.graph.places import nodes_at, tables_at
+from rlml_slam.graph.restart import restart
 from rlml_slam.graph.structure import Ints
 from rlml_slam.graph.system import System, set_up
 from rlml_slam.se2 import Array
@@ -28,6 +29,8 @@ from rlml_slam.types import EdgeKind
 # a start is bad, and one is computed from the edges, above this cost per residual: beyond three
 # sigmas in the root mean square. Nearer ones might be noise, and Gauss-Newton is there sooner.
 BAD_START = 9.0
+# steps of a descent from relaxed headings, after which another start is tried
+EASY = 12
 # costs below this per residual are rounding
 NOTHING = 1e-18
 
@@ -88,6 +91,8 @@ def optimize(graph: Graph, parameters: params.Solver = DEFAULT) -> Solution:
             system_of(graph)  # tells what is wrong
         elif used > len(memory):
             _KEPT.memory = np.empty(used + used // 4)
+        if not end.converged and relaxing != NEVER:
+            end = _restart(graph, at, end, p, relaxing)
         if p.method == 'auto' and not end.converged:
             more = _descend(graph, at, p, NEVER)
             end = more._replace(iterations=end.iterations + more.iterations)
@@ -99,6 +104,19 @@ def optimize(graph: Graph, parameters: params.Solver = DEFAULT) -> Solution:
         start.chi2, end.chi2, start.cost, end.cost, end.iterations, end.converged,
         (time.perf_counter() - began) * 1e3,
     )  # fmt: skip
+
+
+def _restart(
+    graph: Graph, start: Progress, end: Progress, p: params.Solver, relaxing: int
+) -> Progress:
+    """Another try, where the descent began with relaxed headings and got lost all the same."""
+    system = system_of(graph)
+    num = num_residuals(system)
+    if relaxing != ALWAYS and not start.cost > BAD_START * num:
+        return end
+    limits = p.max_iterations, p.relative_tolerance, NOTHING * num
+    more = restart(system, graph.poses, graph.landmarks, *limits)
+    return more._replace(iterations=end.iterations + more.iterations)
 
 
 def _descend(graph: Graph, start: Progress, p: params.Solver, relaxing: int) -> Progress:
@@ -163,8 +181,8 @@ def _descend_from(
         if relax(system, poses, landmarks):
             at = linearize(system, poses, landmarks, True)
             end = gauss_newton(
-                system, poses, landmarks, at[0], at[1], max_iterations, tolerance, floor
-            )
+                system, poses, landmarks, at[0], at[1], min(EASY, max_iterations), tolerance, floor
+            )  # fmt: skip
             if end.cost < cost:
                 return start, end
         copy(kept, poses)
@@ -200,3 +218,4 @@ def warm_up() -> None:
     graph.add_sightings([[0, 0], [2, 0]], [[1.0, 1.0], [-1.0, 1.1]], [np.eye(2)] * 2)
     for method in ('auto', 'dog_leg'):
         optimize(graph, params.Solver(initialization='chordal', method=method))
+    restart(system_of(graph), graph.poses, graph.landmarks, 1, 0.0, 0.0)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
-from made_graphs import loop_graph
+from made_graphs import loop_graph, turned_city
 
 from rlml_slam import se2
 from rlml_slam.errors import SolverError
@@ -28,6 +28,13 @@ def test_chordal_start_is_near_the_truth_where_odometry_is_far():
     far = graph.chi2()
     initialize(graph, 'chordal')
     assert graph.chi2() < 0.1 * far
+
+
+def test_relaxed_headings_that_fade_to_nothing_are_taken_all_the_same():
+    graph, _ = turned_city(3000, 0.7)
+    graph.poses[1:, 2] = start = 2.0
+    initialize(graph, 'chordal')
+    assert not (graph.poses[1:, 2] == start).any()
 
 
 def test_fixed_nodes_are_not_moved():

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
-from made_graphs import loop_graph, shared_graph
+from made_graphs import loop_graph, shared_graph, turned_city
 from scipy import stats
 
 from rlml_slam import params, se2
 from rlml_slam.errors import SolverError
+from rlml_slam.graph.equations import system_of
 from rlml_slam.graph.g2o import read_graph
 from rlml_slam.graph.graph import Graph
+from rlml_slam.graph.initialize import initialize
 from rlml_slam.graph.marginals import Marginals
+from rlml_slam.graph.restart import restart
 from rlml_slam.graph.robust import Loss, Losses, LossKind
 from rlml_slam.graph.solver import optimize
 from rlml_slam.types import EdgeKind
@@ -250,6 +253,25 @@ def test_shared_graph_reaches_its_known_optimum(name, optimum):
     assert solution.chi2_final == pytest.approx(optimum, rel=5e-4)
     assert solution.converged
     assert graph.chi2() == pytest.approx(solution.chi2_final, rel=1e-9)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_headings_that_are_hardly_known_do_not_hide_the_optimum(seed):
+    graph, _ = turned_city(3000, 0.4, seed)
+    optimum = optimize(graph, params.Solver(initialization='none')).chi2_final  # from the truth
+    initialize(graph, 'odometry')
+    assert graph.chi2() > 1e3 * optimum
+    solution = optimize(graph)
+    assert solution.converged
+    assert solution.chi2_final < 1.001 * optimum
+
+
+def test_a_second_start_is_left_where_going_on_is_better():
+    graph, _, _ = loop_graph(seed=2, start_noise=0.1)
+    best = optimize(graph).chi2_final
+    found = restart(system_of(graph), graph.poses, graph.landmarks, 1, 1e-5, 0.0)
+    assert found.cost <= best
+    assert graph.chi2() == pytest.approx(found.chi2, rel=1e-9)
 
 
 @pytest.mark.parametrize('start', ['none', 'odometry', 'auto'])
