@@ -9,6 +9,8 @@ often the one of lower cost.
 
 from __future__ import annotations
 
+import math
+
 from rlml_slam.graph.chordal import relax, relax_jointly
 from rlml_slam.graph.iterate import Progress, gauss_newton
 from rlml_slam.graph.linearize import linearize
@@ -25,18 +27,23 @@ def restart(
     system: System, poses: Array, landmarks: Array, max_iterations: int, tolerance: float,
     floor: float,
 ) -> Progress:  # fmt: skip
-    """The better end of going on from the estimate at hand and from a second start; left there."""
-    best, iterations = None, 0
-    for estimate in ((poses.copy(), landmarks.copy()), _second_start(system, poses, landmarks)):
-        if estimate is None:
+    """Descend from a second start, or on from the estimate at hand where that is the lower one.
+
+    The lowest estimate is left in ``poses`` and ``landmarks``.
+    """
+    first = poses.copy(), landmarks.copy()
+    start = _second_start(system, poses, landmarks)
+    at = linearize(system, *first, False)[0]
+    best, iterations = Progress(math.inf, math.inf, 0, False), 0
+    for estimate in (start, first):
+        if estimate is None or (best.converged and best.cost <= at):
             continue
         cost, chi2 = linearize(system, *estimate, True)
         end = gauss_newton(system, *estimate, cost, chi2, max_iterations, tolerance, floor)
         iterations += end.iterations
-        if best is None or not best.cost <= end.cost:
+        if end.cost <= best.cost:
             best = end
             poses[:], landmarks[:] = estimate
-    assert best is not None
     return best._replace(iterations=iterations)
 
 

@@ -29,7 +29,7 @@ from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.initialize import initialize
 from rlml_slam.graph.solver import warm_up
 from rlml_slam.se2 import Array
-from rlml_slam.tools.bench_graphs import city, warehouse
+from rlml_slam.tools.bench_graphs import POOR_SIGMA, city, warehouse
 from rlml_slam.tools.bench_rivals import Run, Solver, installed, single_thread
 
 SAME = 1.001  # chi2 within this factor of the best is the same optimum
@@ -99,6 +99,7 @@ def _graphs(paths: list[Path], generated: bool) -> Iterator[tuple[str, Graph]]:
     yield from read_graphs(paths)
     if generated:
         yield 'city 10 000', city(10_000)
+        yield 'city 3500, headings off by 0.3 rad', city(3500, sigma=POOR_SIGMA)
         yield 'warehouse 1000', warehouse(1000, 150)
         yield 'warehouse 3300', warehouse(3300, 576)
 

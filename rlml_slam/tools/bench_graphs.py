@@ -15,12 +15,17 @@ from rlml_slam.types import EdgeKind
 # standard deviations of an edge (m, m, rad) and of a sighting per axis (m)
 EDGE_SIGMA = np.array([0.03, 0.03, 0.01])
 SIGHTING_SIGMA = 0.05
+# those of edges that hardly know their heading
+POOR_SIGMA = np.array([0.05, 0.05, 0.3])
 
 
-def city(poses: int = 10_000, closures: float = 1.07, seed: int = 0) -> Graph:
+def city(
+    poses: int = 10_000, closures: float = 1.07, seed: int = 0, sigma: Array = EDGE_SIGMA
+) -> Graph:
     """A drive through a grid of streets; a closure to earlier visits of the same crossing.
 
-    ``closures`` per pose on average. The start is the odometry.
+    ``closures`` per pose on average, edges with the standard deviations ``sigma`` (m, m, rad). The
+    start is the odometry. The streets are those of the seed, whatever the sigma.
     """
     rng = np.random.default_rng(seed)
     truth = _streets(poses, rng)
@@ -32,7 +37,7 @@ def city(poses: int = 10_000, closures: float = 1.07, seed: int = 0) -> Graph:
         num = min(len(earlier), rng.poisson(1.2 * closures))
         pairs += [(int(k), i) for k in rng.choice(earlier, num, replace=False)] if num else []
         visits.setdefault(cell, []).append(i)
-    return _with_edges(truth, np.array(pairs), rng)
+    return _with_edges(truth, np.array(pairs), rng, sigma)
 
 
 def _streets(poses: int, rng: np.random.Generator) -> Array:
@@ -74,15 +79,17 @@ def warehouse(poses: int = 1000, reflectors: int = 150, seed: int = 0) -> Graph:
     return graph
 
 
-def _with_edges(truth: Array, pairs: NDArray[np.int64], rng: np.random.Generator) -> Graph:
+def _with_edges(
+    truth: Array, pairs: NDArray[np.int64], rng: np.random.Generator, sigma: Array = EDGE_SIGMA
+) -> Graph:
     graph = Graph()
     graph.add_poses(truth)
     graph.fixed_poses[0] = True
     i, j = pairs.T
-    noise = EDGE_SIGMA * rng.standard_normal((len(pairs), 3))
+    noise = sigma * rng.standard_normal((len(pairs), 3))
     deltas = se2.compose(se2.between(truth[i], truth[j]), noise)
     kinds = [EdgeKind.ODOMETRY if b == a + 1 else EdgeKind.CLOSURE for a, b in pairs]
-    information = np.broadcast_to(np.diag(EDGE_SIGMA**-2.0), (len(pairs), 3, 3))
+    information = np.broadcast_to(np.diag(sigma**-2.0), (len(pairs), 3, 3))
     graph.add_edges(kinds, pairs, deltas, information)
     initialize(graph, 'odometry')
     return graph

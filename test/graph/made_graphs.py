@@ -11,8 +11,6 @@ import pytest
 from rlml_slam import se2
 from rlml_slam.graph.graph import Graph
 from rlml_slam.graph.robust import Losses
-from rlml_slam.graph.solver import optimize
-from rlml_slam.tools.bench_graphs import city
 from rlml_slam.types import EdgeKind
 
 SHARED_GRAPHS = Path(__file__).resolve().parents[2].parent / 'shared' / 'data' / 'graphs-2d'
@@ -61,22 +59,3 @@ def loop_graph(
             z = seen[k] + noise * 0.03 * rng.standard_normal(2)
             graph.add_sighting(i, int(k), z, np.eye(2) / 0.03**2)
     return graph, truth, points
-
-
-def turned_city(poses: int, sigma: float, seed: int = 0) -> tuple[Graph, np.ndarray]:
-    """A city whose edges are off in heading by ``sigma`` (rad), which they say: (graph, truth)."""
-    rng = np.random.default_rng(seed)
-    streets = city(poses, seed=seed)
-    optimize(streets)
-    truth = streets.poses.copy()
-    noise = np.array([0.05, 0.05, sigma])
-    i, j = streets.edges.nodes.T
-    measured = se2.between(truth[i], truth[j]) + noise * rng.standard_normal((len(i), 3))
-    graph = Graph()
-    graph.add_poses(truth)
-    graph.fixed_poses[0] = True
-    information = np.broadcast_to(np.diag(noise**-2), (len(i), 3, 3))
-    for kind, of_kind in ((EdgeKind.ODOMETRY, j == i + 1), (EdgeKind.CLOSURE, j != i + 1)):
-        pairs = np.stack([i, j], -1)[of_kind]
-        graph.add_edges(kind, pairs, measured[of_kind], information[of_kind])
-    return graph, truth
