@@ -47,7 +47,7 @@ types: env  ## mypy, strict
 config: env  ## write config/*.yaml anew from the declared parameters
 	@for name in default simulator deformable_slam carrier_simulator ekf_slam \
 	  reflector_detector; do \
-	  $(BIN)/python -m rlml_slam.tools.config $$name.yaml >config/.new && \
+	  $(BIN)/python -m rlml_slam.cli.config_file $$name.yaml >config/.new && \
 	  mv config/.new config/$$name.yaml; done
 
 tf: env  ## build tf2_msgs, which the wheels lack, into .venv

@@ -46,7 +46,7 @@ setup(
     zip_safe=False,
     entry_points={
         'console_scripts': [
-            'rlml = rlml_slam.tools.main:main',
+            'rlml = rlml_slam.cli.main:main',
             *(f'{node} = {NAME}.nodes.{node}:main' for node in NODES),
         ],
     },

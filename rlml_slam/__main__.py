@@ -3,7 +3,7 @@
 
 import sys
 
-from rlml_slam.tools.main import main
+from rlml_slam.cli.main import main
 
 if __name__ == '__main__':
     sys.exit(main())

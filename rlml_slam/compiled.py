@@ -16,7 +16,7 @@ import numba
 from llvmlite import ir
 from numba.extending import intrinsic
 
-from rlml_slam.stale_kernels import forget_stale
+from rlml_slam.kernel_cache import forget_stale
 
 F = TypeVar('F', bound=Callable[..., Any])
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 import rlml_slam
 
 OTHER_SYSTEMS = ('deformable', 'ekf')  # compiled when they are first used
-OUTER = ('ros', 'nodes', 'tools')  # tiers without kernels
+OUTER = ('ros', 'nodes', 'cli', 'datasets', 'evaluation', 'report')  # tiers without kernels
 
 
 def core_modules() -> Iterator[str]:

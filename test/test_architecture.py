@@ -6,19 +6,22 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / 'rlml_slam'
-# what a tier may import of the package; `nodes` and `tools` are shells over the other two
+LAB = ROOT / 'rlml_lab'
+# what a tier may import of the package; nodes and commands are shells over the other two
 ALLOWED = {
     'core': {'core'},
     'ros': {'core', 'ros'},
     'nodes': {'core', 'ros', 'nodes'},
-    'tools': {'core', 'ros', 'tools'},
+    'cli': {'core', 'ros', 'cli'},
 }
+CLI = ('cli', 'datasets', 'evaluation', 'report')
 # third-party modules of the core: numbers, and YAML for parameters, worlds and maps; llvmlite is
 # what numba itself is made with
 CORE_NEEDS = {'llvmlite', 'numba', 'numpy', 'scipy', 'yaml'}
@@ -29,9 +32,9 @@ MODULES = sorted(PACKAGE.rglob('*.py'))
 
 def tier(module: str) -> str:
     part = module.split('.')[1] if '.' in module else ''
-    if part == '__main__':
-        return 'tools'  # python -m rlml_slam is the command
-    return part if part in ('ros', 'nodes', 'tools') else 'core'
+    if part == '__main__' or part in CLI:
+        return 'cli'  # python -m rlml_slam is the command
+    return part if part in ('ros', 'nodes') else 'core'
 
 
 def name_of(path: Path) -> str:
@@ -99,6 +102,31 @@ def test_every_file_names_its_licence(path):
     assert path.read_text(encoding='utf-8').startswith('# SPDX-License-Identifier: Apache-2.0\n')
 
 
+def test_folders_import_one_way_at_every_level():
+    """No arrow back and no circle between the files and folders of any folder."""
+    modules = {name_of(p): p for top in (PACKAGE, LAB) for p in top.rglob('*.py')}
+    below: dict[str, dict[str, set[str]]] = {}
+    for name, path in modules.items():
+        for imported in imports(path) & modules.keys():
+            a, b = name.split('.'), imported.split('.')
+            n = next((k for k in range(min(len(a), len(b))) if a[k] != b[k]), None)
+            if n is not None:
+                level = '.'.join(a[:n])
+                below.setdefault(level, {}).setdefault(a[n], set()).add(b[n])
+    for level, graph in below.items():
+        try:
+            tuple(TopologicalSorter(graph).static_order())
+        except CycleError as e:
+            pytest.fail(f'{level or "top"}: {" imports ".join(e.args[1])}')
+
+
+@pytest.mark.parametrize(
+    'folder', sorted({p.parent for top in (PACKAGE, LAB) for p in top.rglob('*.py')}), ids=str
+)
+def test_folder_has_at_most_15_files(folder):
+    assert len([p for p in folder.glob('*.py') if p.name != '__init__.py']) <= 15
+
+
 def test_core_and_commands_import_without_ros():
     """A process in which every ROS module is missing can still do all that is offline."""
     code = f"""
@@ -107,8 +135,9 @@ for name in {ROS_MODULES!r}:
     sys.modules[name] = None
 from rlml_slam import warm_up
 warm_up.import_core()
-import rlml_slam.ros.bag, rlml_slam.ros.convert, rlml_slam.ros.feed, rlml_slam.ros.frames
-from rlml_slam.tools.main import main
+import rlml_slam.ros.bags.bag, rlml_slam.ros.codecs.decode, rlml_slam.ros.sensor_input
+import rlml_slam.ros.codecs.frame_messages
+from rlml_slam.cli.main import main
 sys.exit(main(['replay', '--help']))
 """
     done = subprocess.run(

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import rlml_slam
-from rlml_slam.stale_kernels import forget_stale
+from rlml_slam.kernel_cache import forget_stale
 
 
 @pytest.fixture
@@ -22,7 +22,7 @@ def package(tmp_path):
     (folder / 'kernels.py').write_text(
         'from pathlib import Path\n'
         'from rlml_slam.compiled import kernel\n'
-        'from rlml_slam.stale_kernels import forget_stale\n'
+        'from rlml_slam.kernel_cache import forget_stale\n'
         'forget_stale(Path(__file__).parent)\n'
         'from some.constants import N\n'
         '@kernel\n'

@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import pytest
 
 from rlml_slam import __version__
+from rlml_slam.cli.config_file import FILES, UNREAD, parameter_file
 from rlml_slam.errors import FileFormatError, ParameterError
 from rlml_slam.params import (
     NODES,
@@ -24,7 +25,6 @@ from rlml_slam.params import (
     from_mapping,
     read_yaml,
 )
-from rlml_slam.tools.config import FILES, UNREAD, parameter_file
 
 ROOT = Path(__file__).resolve().parents[1]
 KNOWN = {d.name for of in NODES for d in declarations(of)}
@@ -162,9 +162,9 @@ import sys
 from numba.core.dispatcher import Dispatcher
 from rlml_slam import warm_up
 from rlml_slam.params import Parameters
-from rlml_slam.rlml.slam import Slam
-from rlml_slam.ros.bag import BagReader, choose_topics
-from rlml_slam.ros.feed import Feed
+from rlml_slam.slam.system import Slam
+from rlml_slam.ros.bags.bag import BagReader, choose_topics
+from rlml_slam.ros.sensor_input import Feed
 
 def compiled():
     return {

@@ -22,7 +22,7 @@ from rlml_slam.deformable.window_equations import (
     optimize_window,
 )
 from rlml_slam.errors import InputError, SolverError
-from rlml_slam.matching.association import Associator, Believed
+from rlml_slam.matching.reflectors.association import Associator, Believed
 from rlml_slam.params import Deformable, Reflector
 from rlml_slam.se2 import Array, transform, wrap
 from rlml_slam.types import ANONYMOUS, Detections, Motion, Status

@@ -25,12 +25,12 @@ from rlml_slam.ekf.extraction import Measured
 from rlml_slam.ekf.filter import Filter
 from rlml_slam.ekf.likelihood import SAME_PLACE, log_density
 from rlml_slam.ekf.matching import Matcher
-from rlml_slam.graph.landmark_models import POINT
-from rlml_slam.graph.smoother import BIAS, ROBOT, Sight, Step
-from rlml_slam.matching.hypotheses import GATE, OUTLIER, TOGETHER, UNKNOWN
+from rlml_slam.estimation.landmark_models import POINT
+from rlml_slam.estimation.landmark_tracks import Tracks
+from rlml_slam.estimation.smoother import BIAS, ROBOT, Sight, Step
+from rlml_slam.matching.reflectors.multi_hypothesis import GATE, OUTLIER, TOGETHER, UNKNOWN
 from rlml_slam.motion import STILL
 from rlml_slam.params import EkfParameters
-from rlml_slam.rlml.tracks import Tracks
 from rlml_slam.se2 import Array
 from rlml_slam.types import ANONYMOUS, Motion, Reflectors, Status
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.ekf.association import compatible_ids, mahalanobis2, nearest
-from rlml_slam.graph.landmark_models import Model
+from rlml_slam.estimation.landmark_models import Model
 from rlml_slam.se2 import Array
 from rlml_slam.types import ANONYMOUS
 

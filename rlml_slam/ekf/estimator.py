@@ -20,16 +20,16 @@ from rlml_slam.ekf.extraction import Measured, measure
 from rlml_slam.ekf.filter import Filter
 from rlml_slam.ekf.likelihood import ALIKE
 from rlml_slam.ekf.matching import Matcher
-from rlml_slam.graph.landmark_models import POINT, line_model
-from rlml_slam.graph.smoother import Smoothed, Start, smooth
+from rlml_slam.estimation.health import Evidence, HealthMonitor
+from rlml_slam.estimation.kidnapping_detection import consents
+from rlml_slam.estimation.landmark_models import POINT, line_model
+from rlml_slam.estimation.smoother import Smoothed, Start, smooth
 from rlml_slam.maps.occupancy import OccupancyGrid, render
 from rlml_slam.params import EkfParameters
-from rlml_slam.rlml.confirmation import START_SIGMA, Confirmation
-from rlml_slam.rlml.deferred import SLIP2
-from rlml_slam.rlml.doubt import consents
-from rlml_slam.rlml.grid_fix import Fix
-from rlml_slam.rlml.health import Evidence, HealthMonitor
 from rlml_slam.se2 import Array
+from rlml_slam.slam.front_end.grid_localization import Fix
+from rlml_slam.slam.front_end.map_confirmation import START_SIGMA, Confirmation
+from rlml_slam.slam.landmarks.delayed_association import SLIP2
 from rlml_slam.types import Frame, Observation, Reflectors, Status
 
 MAX_BRANCHES = 32

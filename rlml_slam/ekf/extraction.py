@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from rlml_slam import se2
-from rlml_slam.graph.landmark_models import to_polar
+from rlml_slam.estimation.landmark_models import to_polar
 from rlml_slam.params import EkfParameters
 from rlml_slam.se2 import Array
-from rlml_slam.sensing import lines, spikes
 from rlml_slam.sensing.deskew import sweep_time
+from rlml_slam.sensing.features import lines, spikes
 from rlml_slam.types import ANONYMOUS, Detections, Observation
 
 

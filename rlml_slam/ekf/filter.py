@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.graph.landmark_models import Model
-from rlml_slam.graph.smoother import BIAS, ROBOT, SPEED, TURN
+from rlml_slam.estimation.landmark_models import Model
+from rlml_slam.estimation.smoother import BIAS, ROBOT, SPEED, TURN
 from rlml_slam.se2 import Array
 from rlml_slam.types import Motion
 

@@ -10,9 +10,9 @@ import numpy as np
 from rlml_slam.ekf.association import mahalanobis2
 from rlml_slam.ekf.extraction import Measured
 from rlml_slam.ekf.filter import Filter
-from rlml_slam.rlml.deferred import SPREAD
-from rlml_slam.rlml.tracks import Tracks
+from rlml_slam.estimation.landmark_tracks import Tracks
 from rlml_slam.se2 import Array
+from rlml_slam.slam.landmarks.delayed_association import SPREAD
 
 # [m], [rad] of motion between two looks that tell different things: errors of a sensor, and which
 # one of a group of landmarks it sees, are alike from one look to the next

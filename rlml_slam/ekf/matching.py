@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from rlml_slam.ekf.association import compatible_ids, mahalanobis2, nearest
 from rlml_slam.ekf.extraction import Measured
 from rlml_slam.ekf.filter import Filter
-from rlml_slam.matching.association import Associator, Believed, gate
+from rlml_slam.estimation.landmark_tracks import Tracks
+from rlml_slam.matching.reflectors.association import Associator, Believed, gate
 from rlml_slam.params import EkfParameters
-from rlml_slam.rlml.tracks import Tracks
 from rlml_slam.se2 import Array
 from rlml_slam.types import ANONYMOUS, Status
 

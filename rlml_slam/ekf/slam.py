@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.ekf.estimator import Estimator
-from rlml_slam.graph.smoother import Smoothed
+from rlml_slam.estimation.smoother import Smoothed
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import EkfParameters
 from rlml_slam.se2 import Array
-from rlml_slam.sensing.driven import Driven
+from rlml_slam.sensing.synchronization.synchronized_system import Driven
 from rlml_slam.types import Frame, Observation, Reflectors
 
 

@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.errors import FileFormatError
-from rlml_slam.graph.graph import Graph
-from rlml_slam.graph.initialize import initialize
-from rlml_slam.graph.robust import Losses
-from rlml_slam.graph.table import is_positive_definite
+from rlml_slam.graph.batch.initialization import initialize
+from rlml_slam.graph.model.factor_table import is_positive_definite
+from rlml_slam.graph.model.graph import Graph
+from rlml_slam.graph.model.robust_loss import Losses
 from rlml_slam.se2 import Array, rotation
 from rlml_slam.types import EdgeKind
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rlml_slam.compiled import kernel
 from rlml_slam.errors import FileFormatError, MapError
-from rlml_slam.maps.atomic import write_atomically
+from rlml_slam.maps.atomic_file import write_atomically
 from rlml_slam.se2 import Array, transform
 
 UNKNOWN = -1

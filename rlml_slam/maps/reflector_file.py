@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rlml_slam.errors import FileFormatError, MapError
-from rlml_slam.maps.atomic import write_atomically
+from rlml_slam.maps.atomic_file import write_atomically
 from rlml_slam.types import Reflectors
 
 COLUMNS = (

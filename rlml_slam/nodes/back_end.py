@@ -13,16 +13,16 @@ from sensor_msgs.msg import PointCloud2
 
 from rlml_slam import warm_up
 from rlml_slam.params import Parameters
-from rlml_slam.rlml.closure_table import fates
-from rlml_slam.ros import convert
-from rlml_slam.ros.associated import read_associated
+from rlml_slam.ros.back_end.map_services import MapServices
+from rlml_slam.ros.back_end.mapper import Mapper
+from rlml_slam.ros.codecs import decode
+from rlml_slam.ros.codecs.frame_messages import FrameJoin, Record, read_points, read_record
+from rlml_slam.ros.codecs.reflector_clouds import read_associated
 from rlml_slam.ros.declare import declare
-from rlml_slam.ros.frames import FrameJoin, Record, read_points, read_record
-from rlml_slam.ros.health import HealthPublisher
-from rlml_slam.ros.mapper import Mapper
+from rlml_slam.ros.diagnostics import HealthPublisher
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensors import checked
-from rlml_slam.ros.services import MapServices
+from rlml_slam.slam.closures.closure_table import fates
 
 DEPTH = 200  # of the front end's answers: none may be lost while the map is drawn
 SETTLE_PERIOD = 0.1  # [s] between two looks whether the input has fallen silent
@@ -56,7 +56,7 @@ class BackEndNode(Node):
 
     def on_points(self, msg: PointCloud2) -> None:
         """The end points of its scan."""
-        time = convert.stamp(msg, 'deskewed_points')
+        time = decode.stamp(msg, 'deskewed_points')
         self.take(self.join.add_points(time, read_points(msg)))
 
     def on_associated(self, msg: PointCloud2) -> None:

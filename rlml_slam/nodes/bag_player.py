@@ -15,12 +15,12 @@ from rosgraph_msgs.msg import Clock
 
 from rlml_slam.errors import BagError
 from rlml_slam.params import PlayerParameters
-from rlml_slam.ros import build
-from rlml_slam.ros.bag import BagReader
+from rlml_slam.ros.bags.bag import BagReader
+from rlml_slam.ros.bags.playback import Playback
+from rlml_slam.ros.codecs import encode
+from rlml_slam.ros.codecs.message_types import make_rclpy
 from rlml_slam.ros.declare import declare
-from rlml_slam.ros.messages import make_rclpy
-from rlml_slam.ros.pace import Pace
-from rlml_slam.ros.playback import Playback
+from rlml_slam.ros.playback_clock import Pace
 from rlml_slam.ros.run import run
 
 TICK = 0.002  # [s]
@@ -68,7 +68,7 @@ class BagPlayerNode(Node):
             if not self._pace.is_due((moment - self.bag.start) / SECOND, now):
                 return
             if moment == self._tick_due:
-                self._time.publish(build.clock(make_rclpy, moment))
+                self._time.publish(encode.clock(make_rclpy, moment))
                 self._tick_due += int(SECOND / self.parameters.clock_rate)
             else:
                 self.playback.publish(topic, data)

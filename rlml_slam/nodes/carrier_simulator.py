@@ -14,9 +14,9 @@ from rclpy.node import Node
 
 from rlml_slam.params import CarrierParameters
 from rlml_slam.ros.declare import declare
-from rlml_slam.ros.deformable_simulated import CarrierTopics
-from rlml_slam.ros.pace import Pace
+from rlml_slam.ros.playback_clock import Pace
 from rlml_slam.ros.run import run
+from rlml_slam.ros.systems.carrier_messages import CarrierTopics
 from rlml_slam.simulation.carrier import simulate_carrier
 from rlml_slam.simulation.robot import SECOND
 

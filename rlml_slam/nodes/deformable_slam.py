@@ -14,14 +14,14 @@ from rclpy.node import Node
 from rlml_slam import warm_up
 from rlml_slam.deformable.slam import DeformableSlam
 from rlml_slam.params import DeformableParameters, Parameters
-from rlml_slam.ros import convert
+from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.declare import declare
-from rlml_slam.ros.deformable_answers import EstimatePublisher
-from rlml_slam.ros.deformable_input import VelocityInput
-from rlml_slam.ros.feed import STREAMS
-from rlml_slam.ros.health import HealthPublisher
+from rlml_slam.ros.diagnostics import HealthPublisher
 from rlml_slam.ros.run import run
+from rlml_slam.ros.sensor_input import STREAMS
 from rlml_slam.ros.sensors import RELIABLE, Sensors, checked
+from rlml_slam.ros.systems.carrier_velocity import VelocityInput
+from rlml_slam.ros.systems.deformable_messages import EstimatePublisher
 from rlml_slam.types import Observation
 
 KEPT = 6000  # updates whose cost the diagnostics tell: 10 minutes at 10 Hz
@@ -62,7 +62,7 @@ class DeformableSlamNode(Node):
 
     def start_at(self, msg: PoseWithCovarianceStamped) -> None:
         """Begin anew at a pose of the map."""
-        start = convert.start_pose(msg, self._map_frame)
+        start = decode.start_pose(msg, self._map_frame)
         self.slam.begin_at(start.pose, start.cov)
         self.get_logger().info(f'begins at {np.round(start.pose, 3).tolist()}')
 

@@ -12,18 +12,18 @@ from rclpy.node import Node
 
 from rlml_slam import warm_up
 from rlml_slam.ekf.estimator import Estimator
-from rlml_slam.maps.saved import SavedMap
+from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import EkfParameters
-from rlml_slam.ros import convert
-from rlml_slam.ros.answers import FramePublisher
+from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.declare import declare
-from rlml_slam.ros.ekf_services import EkfServices
-from rlml_slam.ros.feed import STREAMS
-from rlml_slam.ros.health import HealthPublisher
+from rlml_slam.ros.diagnostics import HealthPublisher
+from rlml_slam.ros.front_end.frame_publisher import FramePublisher
+from rlml_slam.ros.map_publisher import TOPICS, MapProducts
 from rlml_slam.ros.odom_frame import OdomFrame
-from rlml_slam.ros.products import TOPICS, MapProducts
 from rlml_slam.ros.run import run
+from rlml_slam.ros.sensor_input import STREAMS
 from rlml_slam.ros.sensors import RELIABLE, Sensors, checked
+from rlml_slam.ros.systems.ekf_services import EkfServices
 from rlml_slam.ros.tf import TransformPublisher
 from rlml_slam.se2 import Array
 from rlml_slam.types import Observation
@@ -62,7 +62,7 @@ class EkfSlamNode(Node):
 
     def start_at(self, msg: PoseWithCovarianceStamped) -> None:
         """Begin anew at a pose of the map."""
-        start = convert.start_pose(msg, self.params.node.map_frame)
+        start = decode.start_pose(msg, self.params.node.map_frame)
         self._begin(start.pose, start.cov, self.map_services.saved)
 
     def restart(self) -> None:

@@ -10,14 +10,14 @@ from rclpy.node import Node
 
 from rlml_slam import warm_up
 from rlml_slam.params import Parameters
-from rlml_slam.rlml.front_end import FrontEnd
-from rlml_slam.ros.answers import FramePublisher
 from rlml_slam.ros.declare import declare
-from rlml_slam.ros.feed import STREAMS
-from rlml_slam.ros.front_end_control import FrontEndControl
-from rlml_slam.ros.health import HealthPublisher
+from rlml_slam.ros.diagnostics import HealthPublisher
+from rlml_slam.ros.front_end.frame_publisher import FramePublisher
+from rlml_slam.ros.front_end.front_end_control import FrontEndControl
 from rlml_slam.ros.run import run
+from rlml_slam.ros.sensor_input import STREAMS
 from rlml_slam.ros.sensors import Sensors
+from rlml_slam.slam.front_end.front_end import FrontEnd
 from rlml_slam.types import Frame, Observation
 
 

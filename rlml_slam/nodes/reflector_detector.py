@@ -11,14 +11,14 @@ from rclpy.node import Node
 
 from rlml_slam import warm_up
 from rlml_slam.params import DetectorParameters, Parameters
-from rlml_slam.ros import build
+from rlml_slam.ros.codecs import encode
+from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
 from rlml_slam.ros.declare import declare
-from rlml_slam.ros.detector_health import DetectorHealth
-from rlml_slam.ros.messages import make_rclpy, rclpy_class
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensors import SENSOR, Sensors
+from rlml_slam.ros.systems.detector_diagnostics import DetectorHealth
 from rlml_slam.sensing.mirror import mirrored_detections
-from rlml_slam.sensing.reflector_detector import detect
+from rlml_slam.sensing.reflectors.reflector_detector import detect
 from rlml_slam.types import Observation
 
 
@@ -51,7 +51,7 @@ class ReflectorDetectorNode(Node):
         if self.sensors.hangs(scan.frame_id):
             seen = mirrored_detections(seen)  # as the laser has them
         if len(scan.intensities):  # without any, nothing was looked at
-            self._publisher.publish(build.detections(make_rclpy, seen, found.intensities))
+            self._publisher.publish(encode.detections(make_rclpy, seen, found.intensities))
         self.health.update(scan, found)
 
     def restart(self) -> None:

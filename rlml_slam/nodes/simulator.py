@@ -16,11 +16,11 @@ from rclpy.node import Node
 from rlml_slam import warm_up
 from rlml_slam.errors import InputError
 from rlml_slam.params import SimulatorParameters
-from rlml_slam.ros import convert
+from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.declare import declare
-from rlml_slam.ros.pace import Pace
+from rlml_slam.ros.playback_clock import Pace
 from rlml_slam.ros.run import run
-from rlml_slam.ros.simulated import SimulatedTopics
+from rlml_slam.ros.systems.simulator_messages import SimulatedTopics
 from rlml_slam.simulation.robot import SECOND
 from rlml_slam.simulation.simulation import START, STEP, Simulation
 from rlml_slam.simulation.world_file import load_world
@@ -52,7 +52,7 @@ class SimulatorNode(Node):
     def on_cmd_vel(self, msg: Any) -> None:
         """Drive as told."""
         try:
-            self.simulation.command(*convert.twist(msg))
+            self.simulation.command(*decode.twist(msg))
         except InputError as e:
             self.get_logger().warning(str(e), throttle_duration_sec=1.0)
 

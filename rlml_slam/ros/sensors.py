@@ -14,11 +14,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from rlml_slam.errors import InputError
 from rlml_slam.params import Parameters
-from rlml_slam.ros.convert import frame
-from rlml_slam.ros.feed import PLACED, STREAMS, USED_BY, Feed, topics_of
-from rlml_slam.ros.messages import rclpy_class
+from rlml_slam.ros.codecs.decode import frame
+from rlml_slam.ros.codecs.message_types import rclpy_class
+from rlml_slam.ros.sensor_input import PLACED, STREAMS, USED_BY, Feed, topics_of
 from rlml_slam.ros.tf import Extrinsics, subscribe_static
-from rlml_slam.sensing.sequence import Sequencer
+from rlml_slam.sensing.synchronization.synchronizer import Sequencer
 from rlml_slam.types import Detections, Observation
 
 TF_PATIENCE = 1_000_000_000  # [ns] of stamps that a sensor's place on /tf_static is waited for

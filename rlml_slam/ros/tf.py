@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from rlml_slam.errors import InputError
-from rlml_slam.ros import build, convert
-from rlml_slam.ros.convert import Transform
-from rlml_slam.ros.messages import make_rclpy, rclpy_class
+from rlml_slam.ros.codecs import decode, encode
+from rlml_slam.ros.codecs.decode import Transform
+from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
 from rlml_slam.se2 import Array
 
 TF_MESSAGE = 'tf2_msgs/msg/TFMessage'
@@ -46,7 +46,7 @@ class Extrinsics:
         R, t = found
         if R[2, 2] < 0.0:
             R = R @ HALF_TURN
-        return np.array([t[0], t[1], convert.yaw(R, f'{base} to {frame}')])
+        return np.array([t[0], t[1], decode.yaw(R, f'{base} to {frame}')])
 
     def hangs(self, base: str, frame: str) -> bool:
         """Whether a sensor is known to hang upside down."""
@@ -103,9 +103,9 @@ class TransformPublisher:
 
     def publish(self, stamp: int, frames: tuple[str, str], T: Array) -> None:
         """Send T (3,) of frames (parent, child) at a stamp [ns]."""
-        message = build.transform(make_rclpy, stamp, frames, T)
+        message = encode.transform(make_rclpy, stamp, frames, T)
         if self._has_tf:
-            message = build.tf_message(make_rclpy, [message])
+            message = encode.tf_message(make_rclpy, [message])
         self._publisher.publish(message)
 
 
@@ -125,7 +125,7 @@ def subscribe_static(node: Any, extrinsics: Extrinsics) -> bool:
     def take(msg: Any) -> None:
         for transform in msg.transforms:  # each by itself: a bad one costs none of the others
             try:
-                extrinsics.add(convert.transforms(transform))
+                extrinsics.add(decode.transforms(transform))
             except InputError as e:
                 node.get_logger().warning(f'not used: {e}')
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from rlml_lab.deformable.replay_note import replay
+from rlml_lab.deformable.scoring import chi2_bounds
+from rlml_slam.cli.support.interface import TOPICS
 from rlml_slam.deformable.experiment import ROWS
-from rlml_slam.deformable.replay_note import replay
-from rlml_slam.deformable.scoring import chi2_bounds
 from rlml_slam.params import DeformableParameters, declarations
-from rlml_slam.tools.interface import TOPICS
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / 'docs' / 'deformable.md').read_text(encoding='utf-8')

@@ -5,10 +5,10 @@ from itertools import islice, pairwise
 import numpy as np
 import pytest
 
+from rlml_lab.deformable.scoring import chi2_bounds
 from rlml_slam.deformable.active import offsets
 from rlml_slam.deformable.bridge import bridge
 from rlml_slam.deformable.gyro_bias import GyroBias
-from rlml_slam.deformable.scoring import chi2_bounds
 from rlml_slam.deformable.slam import DeformableSlam
 from rlml_slam.deformable.suggest import drivable, suggest_twist
 from rlml_slam.deformable.velocity import MAX_KEPT, VelocityHistory
@@ -24,7 +24,7 @@ from rlml_slam.params import (
     Reflector,
 )
 from rlml_slam.se2 import compose, exp, wrap
-from rlml_slam.sensing.sequence import Sequencer
+from rlml_slam.sensing.synchronization.synchronizer import Sequencer
 from rlml_slam.simulation.carrier import simulate_carrier
 from rlml_slam.types import Level, Motion, Observation, Odometry
 

@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rlml_lab.deformable import study_deformable
+from rlml_lab.deformable import study_deformable_window as window_study
+from rlml_lab.deformable.monte_carlo import RowResult, concatenate, run_row, summarize
+from rlml_lab.deformable.replay_note import make_run, read_noise, replay
+from rlml_lab.deformable.simulated_runs import simulate
+from rlml_lab.support.parallel_jobs import each
 from rlml_slam.deformable.experiment import ROWS, Row, draw
-from rlml_slam.deformable.replay_note import make_run, read_noise, replay
-from rlml_slam.deformable.study import RowResult, concatenate, run_row, summarize
-from rlml_slam.deformable.truth import simulate
 from rlml_slam.errors import FileFormatError, ParameterError
-from rlml_slam.tools import study_deformable
-from rlml_slam.tools import study_deformable_window as window_study
-from rlml_slam.tools.study_jobs import each
 
 NOTE = Path(__file__).parents[3] / 'shared' / 'data' / 'deformable-note'
 ACTIVE = 60

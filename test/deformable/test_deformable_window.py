@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from differences import central_differences
 
-from rlml_slam.deformable.scoring import chi2_bounds
+from rlml_lab.deformable.scoring import chi2_bounds
 from rlml_slam.deformable.window import CarrierVelocity, DeformableWindow
 from rlml_slam.deformable.window_equations import carry, motion_covariance, motion_information
 from rlml_slam.errors import InputError

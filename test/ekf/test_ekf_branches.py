@@ -11,7 +11,7 @@ from rlml_slam import se2
 from rlml_slam.ekf.estimator import Estimator
 from rlml_slam.ekf.filter import Filter
 from rlml_slam.ekf.matching import Matcher
-from rlml_slam.graph.landmark_models import POINT
+from rlml_slam.estimation.landmark_models import POINT
 from rlml_slam.params import EkfParameters, from_mapping
 from rlml_slam.types import Detections, Motion, Observation
 

@@ -7,7 +7,7 @@ from differences import central_differences
 
 from rlml_slam import se2
 from rlml_slam.ekf.filter import BIAS, JOINED, ROBOT, SPEED, TURN, WHEELS, Filter
-from rlml_slam.graph.landmark_models import POINT, line_model
+from rlml_slam.estimation.landmark_models import POINT, line_model
 from rlml_slam.types import Motion
 
 POSE, COV = np.array([0.2, -0.1, 0.3]), np.diag([0.01, 0.02, 0.005])

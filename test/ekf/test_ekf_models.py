@@ -6,7 +6,7 @@ import pytest
 from differences import central_differences
 
 from rlml_slam import se2
-from rlml_slam.graph.landmark_models import POINT, line_innovation, line_model, to_polar
+from rlml_slam.estimation.landmark_models import POINT, line_innovation, line_model, to_polar
 
 # random, near 0 and near pi
 POSES = [(0.3, -0.7, 0.4), (2.0, 1.0, 1e-7), (-1.0, 0.5, np.pi - 1e-7), (0.1, 0.2, -2.6)]
@@ -85,7 +85,7 @@ def test_the_note_s_jz_has_one_wrong_sign():
 
 def test_the_note_s_line_landmark_follows_the_robot_s_error():
     """Its range and bearing, made with a pose that is 0.5 m off along the wall, fit that pose."""
-    from rlml_slam.sensing.lines import nearest_point, range_and_bearing
+    from rlml_slam.sensing.features.lines import nearest_point, range_and_bearing
 
     true, wrong = np.array([1.0, 0.0, 0.0]), np.array([1.5, 0.0, 0.0])
     seen = np.array([[2.0, 0.5 * np.pi]])  # a wall along x, 2 m to the left

@@ -10,8 +10,8 @@ from scipy.stats import chi2
 from rlml_slam import se2
 from rlml_slam.ekf.filter import ROBOT, SPEED, TURN, Filter
 from rlml_slam.ekf.slam import EkfSlam
-from rlml_slam.graph.landmark_models import POINT, Model
-from rlml_slam.graph.smoother import Sight, Start, Step, _Problem, smooth
+from rlml_slam.estimation.landmark_models import POINT, Model
+from rlml_slam.estimation.smoother import Sight, Start, Step, _Problem, smooth
 from rlml_slam.params import EkfParameters, from_mapping
 from rlml_slam.types import Motion
 

@@ -8,7 +8,7 @@ import os
 import pytest
 
 from rlml_slam.errors import MapError
-from rlml_slam.maps.atomic import write_atomically
+from rlml_slam.maps.atomic_file import write_atomically
 
 
 def test_bytes_are_on_the_disk_before_the_name_and_the_name_after(tmp_path, monkeypatch):

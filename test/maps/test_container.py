@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from rlml_slam.errors import FileFormatError, MapError
-from rlml_slam.maps import container
-from rlml_slam.maps.container import Content
+from rlml_slam.maps import map_container
+from rlml_slam.maps.map_container import Content
 
 OLD, NEW = (
     Content(
@@ -35,8 +35,8 @@ def same(a, b):
 
 
 def test_what_was_written_is_read(tmp_path):
-    path = container.write(tmp_path / 'deep' / 'a.rlml', NEW)
-    same(container.read(path), NEW)
+    path = map_container.write(tmp_path / 'deep' / 'a.rlml', NEW)
+    same(map_container.read(path), NEW)
     assert sorted(p.name for p in path.parent.iterdir()) == ['a.rlml']
     # other tools open it
     with zipfile.ZipFile(path) as archive:
@@ -45,21 +45,21 @@ def test_what_was_written_is_read(tmp_path):
 
 
 def test_equal_maps_are_equal_files(tmp_path):
-    a, b = (container.write(tmp_path / name, NEW).read_bytes() for name in 'ab')
+    a, b = (map_container.write(tmp_path / name, NEW).read_bytes() for name in 'ab')
     assert a == b
 
 
 def test_map_before_stays(tmp_path):
-    path = container.write(tmp_path / 'a.rlml', OLD)
-    container.write(path, NEW)
-    same(container.read(path), NEW)
-    same(container.read(f'{path}.previous'), OLD)
+    path = map_container.write(tmp_path / 'a.rlml', OLD)
+    map_container.write(path, NEW)
+    same(map_container.read(path), NEW)
+    same(map_container.read(f'{path}.previous'), OLD)
 
 
 @pytest.mark.parametrize('seed', range(4))
 def test_damage_anywhere_is_refused_and_the_map_before_named(tmp_path, seed):
-    path = container.write(tmp_path / 'a.rlml', OLD)
-    container.write(path, NEW)
+    path = map_container.write(tmp_path / 'a.rlml', OLD)
+    map_container.write(path, NEW)
     good, rng = path.read_bytes(), np.random.default_rng(seed)
     for k in range(250):
         bad = bytearray(good)
@@ -67,35 +67,35 @@ def test_damage_anywhere_is_refused_and_the_map_before_named(tmp_path, seed):
             del bad[rng.integers(len(bad)) :]
         elif k % 3 == 1:
             # the header as often as all the rest
-            at = rng.integers(container.SIZE if k % 2 else len(bad))
+            at = rng.integers(map_container.SIZE if k % 2 else len(bad))
             bad[at] ^= 1 << int(rng.integers(8))
         else:
             at = int(rng.integers(len(bad)))
             bad[at : at + 512] = rng.bytes(min(512, len(bad) - at))
         path.write_bytes(bad)
         with pytest.raises(FileFormatError, match=r'a\.rlml.*before it is whole.*previous'):
-            container.read(path)
-    same(container.read(f'{path}.previous'), OLD)
+            map_container.read(path)
+    same(map_container.read(f'{path}.previous'), OLD)
 
 
 def test_every_bit_of_the_header_counts(tmp_path):
-    path = container.write(tmp_path / 'a.rlml', NEW)
+    path = map_container.write(tmp_path / 'a.rlml', NEW)
     good = path.read_bytes()
-    for bit in range(8 * container.SIZE):
+    for bit in range(8 * map_container.SIZE):
         bad = bytearray(good)
         bad[bit // 8] ^= 1 << (bit % 8)
         path.write_bytes(bad)
         with pytest.raises(FileFormatError):
-            container.read(path)
+            map_container.read(path)
 
 
 def test_damaged_map_does_not_replace_the_one_before(tmp_path):
-    path = container.write(tmp_path / 'a.rlml', OLD)
-    container.write(path, NEW)
+    path = map_container.write(tmp_path / 'a.rlml', OLD)
+    map_container.write(path, NEW)
     path.write_bytes(path.read_bytes()[:-1])
-    container.write(path, NEW)
-    same(container.read(path), NEW)
-    same(container.read(f'{path}.previous'), OLD)
+    map_container.write(path, NEW)
+    same(map_container.read(path), NEW)
+    same(map_container.read(f'{path}.previous'), OLD)
 
 
 WRITER = textwrap.dedent("""
@@ -112,7 +112,7 @@ WRITER = textwrap.dedent("""
 
 
 def test_kill_while_saving_never_loses_a_map(tmp_path):
-    path = container.write(tmp_path / 'a.rlml', OLD)
+    path = map_container.write(tmp_path / 'a.rlml', OLD)
     rng = np.random.default_rng(0)
     for _ in range(6):
         with subprocess.Popen(
@@ -125,39 +125,39 @@ def test_kill_while_saving_never_loses_a_map(tmp_path):
                 child.wait(float(rng.uniform(0.0, 0.02)))
             except subprocess.TimeoutExpired:
                 os.kill(child.pid, signal.SIGKILL)
-        found = container.read(path)
+        found = map_container.read(path)
         which = found.description['which']
         assert (found.arrays['poses'] == which).all()
         assert (found.arrays['grid'] == which).all()
-        container.read(f'{path}.previous')
+        map_container.read(f'{path}.previous')
 
 
 def test_unwritable_folder_leaves_the_map(tmp_path, monkeypatch):
-    path = container.write(tmp_path / 'a.rlml', OLD)
+    path = map_container.write(tmp_path / 'a.rlml', OLD)
 
     def full(*_):
         raise OSError(28, 'No space left on device')
 
     monkeypatch.setattr(os, 'fsync', full)
     with pytest.raises(MapError, match='No space left'):
-        container.write(path, NEW)
+        map_container.write(path, NEW)
     monkeypatch.undo()
-    same(container.read(path), OLD)
+    same(map_container.read(path), OLD)
     assert [p.name for p in tmp_path.iterdir()] == ['a.rlml']
 
 
 def test_file_of_another_kind_is_refused(tmp_path):
     with pytest.raises(MapError, match='cannot be read'):
-        container.read(tmp_path / 'none.rlml')
+        map_container.read(tmp_path / 'none.rlml')
     other = tmp_path / 'other.rlml'
     for data in (b'', b'PK\x03\x04 and so on' * 20, b'RLMLMAP'):
         other.write_bytes(data)
         with pytest.raises(FileFormatError, match='not a map'):
-            container.read(other)
+            map_container.read(other)
 
 
 def test_object_is_never_unpickled(tmp_path):
     objects = Content({'bad': np.array([{}], dtype=object)}, {})
     with pytest.raises(ValueError, match=r'[Oo]bject'):
-        container.write(tmp_path / 'a.rlml', objects)
+        map_container.write(tmp_path / 'a.rlml', objects)
     assert list(tmp_path.iterdir()) == []

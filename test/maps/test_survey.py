@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from rlml_slam import se2
+from rlml_slam.cli.map import map_survey
 from rlml_slam.errors import FileFormatError, MapError
 from rlml_slam.maps import reflector_file, survey
 from rlml_slam.maps.survey import Survey
-from rlml_slam.tools import map_survey
 from rlml_slam.types import ANONYMOUS, Reflectors
 
 NAMES = ('id', 'x', 'y', 'diameter')

@@ -7,8 +7,8 @@ from differences import central_differences
 from scipy.stats import chi2
 
 from rlml_slam import se2
-from rlml_slam.matching.association import Associator, Believed, gate
-from rlml_slam.matching.innovations import expected, joint_distance2, pairwise
+from rlml_slam.matching.reflectors.association import Associator, Believed, gate
+from rlml_slam.matching.reflectors.innovations import expected, joint_distance2, pairwise
 from rlml_slam.params import Reflector
 from rlml_slam.types import ANONYMOUS, Detections, Status
 

@@ -11,8 +11,8 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from rlml_slam import se2
-from rlml_slam.matching import pair_votes
-from rlml_slam.matching.constellation import Prior, locate
+from rlml_slam.matching.reflectors import pair_votes
+from rlml_slam.matching.reflectors.constellation import Prior, locate
 from rlml_slam.params import Relocalization
 from rlml_slam.types import Verdict
 

@@ -9,10 +9,10 @@ from differences import central_differences
 from made_rooms import CORRIDOR, ROOM, built, moved, path, scan
 
 from rlml_slam import params, se2
-from rlml_slam.matching import scan_match
-from rlml_slam.matching.scan_match import linearize, match
-from rlml_slam.matching.submap import P_MAX, Submap
-from rlml_slam.matching.thinning import thin
+from rlml_slam.matching.scans import scan_match
+from rlml_slam.matching.scans.scan_match import linearize, match
+from rlml_slam.matching.scans.submap import P_MAX, Submap
+from rlml_slam.matching.scans.voxel_filter import thin
 
 P = params.ScanMatch()
 WEAK = np.diag([1.0, 1.0, 1.0])

@@ -7,8 +7,8 @@ from made_rooms import ROOM, scan
 
 from rlml_slam import params
 from rlml_slam.errors import InputError
-from rlml_slam.matching.submap import P_MAX, P_MIN, STEP, Submap, probability_of, value_of
-from rlml_slam.matching.surfaces import fill
+from rlml_slam.matching.scans.submap import P_MAX, P_MIN, STEP, Submap, probability_of, value_of
+from rlml_slam.matching.scans.surfaces import fill
 
 P = params.Submap(resolution=0.1, p_hit=0.7, p_miss=0.4)
 ORIGIN = np.array([0.05, 0.05])

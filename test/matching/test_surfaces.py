@@ -4,7 +4,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rlml_slam.matching.surfaces import MAX_GAP, constraints, fill
+from rlml_slam.matching.scans.surfaces import MAX_GAP, constraints, fill
 
 
 def line(angle: float, n: int = 9, spacing: float = 0.1) -> np.ndarray:

@@ -18,8 +18,8 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
-from rlml_slam.ros.bag import BagReader
-from rlml_slam.ros.messages import rclpy_class
+from rlml_slam.ros.bags.bag import BagReader
+from rlml_slam.ros.codecs.message_types import rclpy_class
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOM = ROOT / 'bags' / 'room'

@@ -13,18 +13,18 @@ from nav_msgs.srv import GetMap, LoadMap
 from std_srvs.srv import Empty, SetBool, Trigger
 
 from rlml_slam import se2
+from rlml_slam.cli.closures import parse
 from rlml_slam.maps import reflector_file
 from rlml_slam.nodes.back_end import BackEndNode
 from rlml_slam.nodes.front_end import FrontEndNode
 from rlml_slam.params import Parameters
-from rlml_slam.rlml.closure import Closure
-from rlml_slam.rlml.slam import Slam
-from rlml_slam.ros import build, convert
-from rlml_slam.ros.associated import read_reflector_map
-from rlml_slam.ros.feed import Feed
-from rlml_slam.ros.messages import make_rclpy as make
-from rlml_slam.ros.messages import rclpy_class
-from rlml_slam.tools.closures import parse
+from rlml_slam.ros.codecs import decode, encode
+from rlml_slam.ros.codecs.message_types import make_rclpy as make
+from rlml_slam.ros.codecs.message_types import rclpy_class
+from rlml_slam.ros.codecs.reflector_clouds import read_reflector_map
+from rlml_slam.ros.sensor_input import Feed
+from rlml_slam.slam.closures.loop_closure import Closure
+from rlml_slam.slam.system import Slam
 from rlml_slam.types import EdgeKind
 
 SECOND = 1_000_000_000
@@ -65,7 +65,7 @@ def start(live, **values):
 def drive(live, front, back, start=0.0, end=SECONDS):
     """The front end gets the bag's messages; the spinning between them carries the nodes' talk."""
     for stream, msg in room(seconds=end):
-        if convert.stamp(msg, '') < (1.0 + start) * SECOND:
+        if decode.stamp(msg, '') < (1.0 + start) * SECOND:
             continue
         front.sensors.add(stream, msg)
         live.executor.spin_once(timeout_sec=0.0)
@@ -125,13 +125,13 @@ def test_map_to_odom_joins_the_two_estimates(live):
         sent = live.heard[TF[0]]
         return (
             sent
-            and convert.stamp(getattr(sent[-1], 'transforms', [sent[-1]])[0], '') == newest.stamp
+            and decode.stamp(getattr(sent[-1], 'transforms', [sent[-1]])[0], '') == newest.stamp
         )
 
     live.spin_until(is_sent)
-    (got,) = convert.transforms(live.heard[TF[0]][-1])
+    (got,) = decode.transforms(live.heard[TF[0]][-1])
     assert (got.parent, got.child) == ('map', 'odom')
-    T = np.array([*got.t[:2], convert.yaw(got.R, '')])
+    T = np.array([*got.t[:2], decode.yaw(got.R, '')])
     # it waits for no optimisation: one of the corrections, the newest but for a busy machine
     corrections = [np.zeros(3)]
     for heard in live.heard['correction']:
@@ -164,7 +164,7 @@ def test_front_end_that_begins_anew_begins_a_new_map(live):
     drive(live, front, back, end=4.0)
     there = np.array([50.0, 0.0, 0.0])
     front.control.start_at(
-        build.pose_with_covariance(make, SECOND, 'map', there, 1e-4 * np.eye(3))
+        encode.pose_with_covariance(make, SECOND, 'map', there, 1e-4 * np.eye(3))
     )
     drive(live, front, back, start=4.0, end=5.0)
     _, poses = back.mapper.back_end.trajectory()
@@ -252,7 +252,7 @@ def test_saved_map_serves_for_localization(live, tmp_path):
     drive(live, front, back)
     assert back.mapper.back_end.keyframes == []
     stamps, poses = slam.trajectory()
-    got = convert.pose_estimate(live.heard['pose'][-1])
+    got = decode.pose_estimate(live.heard['pose'][-1])
     want = poses[np.flatnonzero(stamps == got.stamp)[0]]
     # the map's reflectors are known to a few millimetres
     np.testing.assert_allclose(se2.between(want, got.pose), 0.0, atol=0.03)
@@ -281,7 +281,7 @@ def test_robot_that_was_carried_away_finds_itself_in_its_map(live, tmp_path):
 
     wrong = se2.compose(front.last.T_map_base, np.array([1.0, -0.8, 2.0]))
     front.control.start_at(
-        build.pose_with_covariance(make, SECOND, 'map', wrong, 1e-4 * np.eye(3))
+        encode.pose_with_covariance(make, SECOND, 'map', wrong, 1e-4 * np.eye(3))
     )
     drive(live, front, back, start=9.0, end=10.0)
     believed = front.last.T_map_base

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from live import DOMAIN
 
-from rlml_slam.maps.saved import SavedMap
+from rlml_slam.cli.main import main
+from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.nodes.back_end import BackEndNode
-from rlml_slam.ros.map_folder import MapFolder
-from rlml_slam.tools.main import main
+from rlml_slam.ros.back_end.map_folder import MapFolder
 from rlml_slam.types import Reflectors
 
 

@@ -4,28 +4,24 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from made_worlds import ROOM, drive, errors, messages, observations
 from test_mapper import Ear
 
 from rlml_slam.errors import FileFormatError, MapError
 from rlml_slam.maps import reflector_file
 from rlml_slam.params import Parameters
-from rlml_slam.rlml import stored_map
-from rlml_slam.rlml.front_end import FrontEnd
-from rlml_slam.rlml.slam import Slam
-from rlml_slam.ros.beliefs import read_belief
-from rlml_slam.ros.convert import pose_estimate
-from rlml_slam.ros.frames import Record
-from rlml_slam.ros.map_folder import MapFolder
-from rlml_slam.ros.mapper import Mapper
+from rlml_slam.ros.back_end.map_folder import MapFolder
+from rlml_slam.ros.back_end.mapper import Mapper
+from rlml_slam.ros.codecs.belief_message import read_belief
+from rlml_slam.ros.codecs.decode import pose_estimate
+from rlml_slam.ros.codecs.frame_messages import Record
+from rlml_slam.slam.front_end.front_end import FrontEnd
+from rlml_slam.slam.store import map_file
+from rlml_slam.slam.system import Slam
 from rlml_slam.types import Detections, Odometry, Scan
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'rlml'))
-from made_worlds import ROOM, drive, errors, messages, observations
 
 PARAMS = Parameters()
 CURVE = drive((0.6, 0.0, 3.0), (0.6, 0.6, 4.0), (0.5, -0.7, 2.0))
@@ -45,7 +41,7 @@ def mapped():
 
 @pytest.fixture
 def folder(mapped, tmp_path):
-    stored_map.save(tmp_path / 'map.rlml', mapped, PARAMS)
+    map_file.save(tmp_path / 'map.rlml', mapped, PARAMS)
     return tmp_path
 
 

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 from rclpy.qos import QoSProfile
 
-from rlml_slam.deformable.scoring import chi2_bounds
+from rlml_lab.deformable import study_deformable_node as study
+from rlml_lab.deformable.scoring import chi2_bounds
 from rlml_slam.deformable.window import CarrierVelocity
 from rlml_slam.errors import InputError
 from rlml_slam.nodes.deformable_slam import DeformableSlamNode
 from rlml_slam.params import Carrier, CarrierParameters
-from rlml_slam.ros import build, convert
-from rlml_slam.ros.deformable_answers import build_velocity, read_features
-from rlml_slam.ros.deformable_simulated import CarrierMessages
-from rlml_slam.ros.messages import make_rclpy as make
+from rlml_slam.ros.codecs import decode, encode
+from rlml_slam.ros.codecs.message_types import make_rclpy as make
+from rlml_slam.ros.systems.carrier_messages import CarrierMessages
+from rlml_slam.ros.systems.deformable_messages import build_velocity, read_features
 from rlml_slam.simulation.carrier import simulate_carrier
-from rlml_slam.tools import study_deformable_node as study
 
 SECOND = 1_000_000_000
 SECONDS = 12
@@ -39,12 +39,12 @@ def arguments(**values):
 
 
 def by_stamp(messages):
-    return {convert.stamp(m, ''): m for m in messages}
+    return {decode.stamp(m, ''): m for m in messages}
 
 
 @pytest.mark.parametrize(('kind', 'ids'), [('train', True), ('conveyor', False)])
 def test_processes_follow_a_carrier_within_their_covariances(kind, ids):
-    """Simulator and node over DDS, as ``rlml study deformable --node`` judges them."""
+    """Simulator and node over DDS, as ``rlml-lab study deformable --node`` judges them."""
     heard = []
     drive = study.run_node(kind, SECONDS / 60.0, 0, ids, 4.0, heard.append)
     # one answer per detections, at most a few of which were lost by best effort
@@ -114,7 +114,7 @@ def test_answers_are_published_at_the_rate_and_stamps_of_the_detections(live):
     stamps = list(by_stamp(live.heard['pose']))
     assert set(np.diff(stamps)) == {SECOND // 10}
     assert stamps[-1] == newest == max(by_stamp(live.heard['features']))
-    got, estimate = convert.pose_estimate(live.heard['pose'][-1]), node.slam.estimate
+    got, estimate = decode.pose_estimate(live.heard['pose'][-1]), node.slam.estimate
     np.testing.assert_allclose(got.pose, estimate.pose, atol=1e-12)
     np.testing.assert_allclose(got.cov, estimate.cov, atol=1e-12)
     found = read_features(live.heard['features'][-1])
@@ -178,7 +178,7 @@ def test_diagnostics_are_ok_where_nothing_is_missing(live):
 def test_velocity_in_the_robots_axes_is_turned_into_the_maps(live):
     node = start_node(live)
     start = np.array([0.0, 0.0, math.pi / 2])
-    node.start_at(build.pose_with_covariance(make, SECOND, 'map', start, np.zeros((3, 3))))
+    node.start_at(encode.pose_with_covariance(make, SECOND, 'map', start, np.zeros((3, 3))))
     ahead = CarrierVelocity(np.array([1.0, 0.0]), 0.2)
     node.velocity.receive(build_velocity(make, SECOND, 'base_link', ahead))
     node.velocity.receive(build_velocity(make, 2 * SECOND, 'map', ahead))
@@ -201,12 +201,12 @@ def test_initial_pose_begins_anew_there(live):
     node = start_node(live)
     feed(node, 10)
     there = np.array([5.0, -2.0, 1.0])
-    node.start_at(build.pose_with_covariance(make, SECOND, 'map', there, 0.04 * np.eye(3)))
+    node.start_at(encode.pose_with_covariance(make, SECOND, 'map', there, 0.04 * np.eye(3)))
     feed_more = [m for topic, m in messages(11) if topic in ('odom', 'reflectors')][-2:]
     for topic, msg in zip(('odom', 'reflectors'), feed_more, strict=True):
         node.sensors.add(topic, msg)
     with pytest.raises(InputError, match="frame_id is 'odom' instead"):
-        node.start_at(build.pose_with_covariance(make, SECOND, 'odom', -there, 0.04 * np.eye(3)))
+        node.start_at(encode.pose_with_covariance(make, SECOND, 'odom', -there, 0.04 * np.eye(3)))
     # the next observation is the first of the new beginning: its motion is not used
     np.testing.assert_allclose(node.slam.estimate.pose, there, atol=1e-9)
     np.testing.assert_allclose(np.diag(node.slam.estimate.cov), 0.04, rtol=0.01)
@@ -227,9 +227,9 @@ def test_empty_detections_move_the_carrier_on(live):
     empty = []
     for topic, msg in islice(messages(25), 20 * 5, None):
         if topic == 'reflectors':
-            seen = convert.detections(msg, convert.Reflector())
+            seen = decode.detections(msg, decode.Reflector())
             none = np.zeros(0)
-            msg = build.detections(make, dataclasses.replace(
+            msg = encode.detections(make, dataclasses.replace(
                 seen, points=np.zeros((0, 2)), cov=np.zeros((0, 2, 2)), diameters=none,
                 ids=none.astype(np.int64),
             ))  # fmt: skip

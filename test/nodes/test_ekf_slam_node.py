@@ -12,9 +12,9 @@ from std_srvs.srv import Trigger
 
 from rlml_slam.errors import InputError
 from rlml_slam.nodes.ekf_slam import EkfSlamNode
-from rlml_slam.ros import build
-from rlml_slam.ros.associated import read_reflector_map
-from rlml_slam.ros.messages import make_rclpy as make
+from rlml_slam.ros.codecs import encode
+from rlml_slam.ros.codecs.message_types import make_rclpy as make
+from rlml_slam.ros.codecs.reflector_clouds import read_reflector_map
 
 
 @pytest.fixture
@@ -48,13 +48,13 @@ def test_every_scan_is_answered_and_the_landmarks_are_published(live, node, tmp_
 
 def test_start_pose_of_another_frame_changes_nothing(live, node):
     there, cov = np.array([5.0, -2.0, 1.0]), 0.04 * np.eye(3)
-    node.start_at(build.pose_with_covariance(make, 0, 'map', there, cov))
+    node.start_at(encode.pose_with_covariance(make, 0, 'map', there, cov))
     assert_allclose(node.estimator.filter.pose, there)
     with pytest.raises(InputError, match="frame_id is 'odom' instead"):
-        node.start_at(build.pose_with_covariance(make, 0, 'odom', np.zeros(3), cov))
+        node.start_at(encode.pose_with_covariance(make, 0, 'odom', np.zeros(3), cov))
     wrong = np.array([[0.1, 0.5, 0.0], [0.5, 0.1, 0.0], [0.0, 0.0, 0.1]])
     with pytest.raises(InputError, match='eigenvalue'):
-        node.start_at(build.pose_with_covariance(make, 0, 'map', np.zeros(3), wrong))
+        node.start_at(encode.pose_with_covariance(make, 0, 'map', np.zeros(3), wrong))
     assert_allclose(node.estimator.filter.pose, there)
 
 

@@ -17,11 +17,11 @@ from live import LATCHED, room
 from rlml_slam import se2
 from rlml_slam.errors import InputError, ParameterError
 from rlml_slam.nodes.front_end import FrontEndNode
-from rlml_slam.ros import build, convert
-from rlml_slam.ros.associated import read_associated
-from rlml_slam.ros.messages import make_rclpy as make
-from rlml_slam.ros.messages import rclpy_class
-from rlml_slam.sensing.sequence import CONFIRM
+from rlml_slam.ros.codecs import decode, encode
+from rlml_slam.ros.codecs.message_types import make_rclpy as make
+from rlml_slam.ros.codecs.message_types import rclpy_class
+from rlml_slam.ros.codecs.reflector_clouds import read_associated
+from rlml_slam.sensing.synchronization.synchronizer import CONFIRM
 from rlml_slam.types import Health, Level, Status
 
 SECOND = 1_000_000_000
@@ -39,7 +39,7 @@ def feed(node, seconds, change=lambda stream, msg: msg):
 
 
 def stamps(sent, stream):
-    return [convert.stamp(m, stream) for s, m in sent if s == stream]
+    return [decode.stamp(m, stream) for s, m in sent if s == stream]
 
 
 @pytest.fixture
@@ -65,12 +65,12 @@ def used(node, stream, what='used'):
 def test_each_scan_gets_a_pose_with_its_own_stamp(live, node):
     sent = feed(node, 3.0)
     live.drain()
-    got = [convert.stamp(m, '') for m in live.heard['pose']]
+    got = [decode.stamp(m, '') for m in live.heard['pose']]
     want = stamps(sent, 'scan')
     assert got == want[: len(got)]
     # the last scan may still wait for odometry
     assert len(want) - 1 <= len(got) <= len(want)
-    assert [convert.stamp(m, '') for m in live.heard['odometry/filtered']] == got
+    assert [decode.stamp(m, '') for m in live.heard['odometry/filtered']] == got
 
 
 def test_local_pose_moves_on_without_jumps_and_with_its_twist(live, node):
@@ -79,7 +79,7 @@ def test_local_pose_moves_on_without_jumps_and_with_its_twist(live, node):
     local = live.heard['odometry/filtered']
     assert {m.header.frame_id for m in local} == {'rlml_local'}
     assert {m.child_frame_id for m in local} == {'base_link'}
-    poses = np.array([convert.planar_pose(m.pose.pose, '') for m in local])
+    poses = np.array([decode.planar_pose(m.pose.pose, '') for m in local])
     steps = np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1)
     speeds = np.array([np.hypot(m.twist.twist.linear.x, m.twist.twist.linear.y) for m in local])
     # 10 Hz scans; an arc is longer than its chord by less than 1 % at these turn rates
@@ -111,7 +111,7 @@ def test_correction_moves_the_map_pose_only(live, node):
     feed(node, 2.0)
     correction = np.array([1.0, -2.0, 0.5])
     stamp = node.last.stamp
-    node.control.correct(build.pose_with_covariance(make, stamp, 'map', correction, np.eye(3)))
+    node.control.correct(encode.pose_with_covariance(make, stamp, 'map', correction, np.eye(3)))
     frame = node.front_end.process(node.last.observation)
     np.testing.assert_allclose(
         frame.T_map_base, se2.compose(correction, frame.T_local_base), atol=1e-12
@@ -122,7 +122,7 @@ def test_correction_tells_how_well_its_frame_is_known_in_the_map(live, node):
     feed(node, 2.0)
     cov = np.diag([0.04, 0.01, 0.02])
     node.control.correct(
-        build.pose_with_covariance(make, node.last.stamp, 'map', np.zeros(3), cov)
+        encode.pose_with_covariance(make, node.last.stamp, 'map', np.zeros(3), cov)
     )
     _, cov_map = node.front_end.in_map(node.last.T_local_base, node.last.cov_local)
     np.testing.assert_allclose(cov_map, cov, atol=1e-12)
@@ -133,7 +133,7 @@ def test_correction_of_an_old_session_means_nothing(live, node, again):
     feed(node, 2.0)
     stamp, observation = node.last.stamp, node.last.observation
     again(node.control)
-    late = build.pose_with_covariance(make, stamp, 'map', np.array([1.0, -2.0, 0.5]), np.eye(3))
+    late = encode.pose_with_covariance(make, stamp, 'map', np.array([1.0, -2.0, 0.5]), np.eye(3))
     node.control.correct(late)
     later = dataclasses.replace(observation, stamp=stamp + SECOND)
     frame = node.control.process(later)
@@ -145,14 +145,14 @@ def test_correction_of_an_old_session_means_nothing(live, node, again):
 
 def start_at_five():
     pose = np.array([5.0, 6.0, 1.0])
-    return build.pose_with_covariance(make, 0, 'map', pose, 0.01 * np.eye(3))
+    return encode.pose_with_covariance(make, 0, 'map', pose, 0.01 * np.eye(3))
 
 
 def test_initialpose_begins_anew_there(live, node):
     feed(node, 2.0)
     start = np.array([5.0, 6.0, 1.0])
     node.control.start_at(
-        build.pose_with_covariance(make, 99 * SECOND, 'map', start, 0.01 * np.eye(3))
+        encode.pose_with_covariance(make, 99 * SECOND, 'map', start, 0.01 * np.eye(3))
     )
     np.testing.assert_allclose(node.front_end.state.pose, start)
 
@@ -161,9 +161,9 @@ def test_initialpose_without_stamp_is_of_now_and_of_another_frame_is_none(live, 
     feed(node, 2.0)
     start, cov = np.array([5.0, 6.0, 1.0]), 0.01 * np.eye(3)
     with pytest.raises(InputError, match="frame_id is 'odom' instead"):
-        node.control.start_at(build.pose_with_covariance(make, SECOND, 'odom', start, cov))
+        node.control.start_at(encode.pose_with_covariance(make, SECOND, 'odom', start, cov))
     assert node.front_end.state.pose[0] < 2.0
-    node.control.start_at(build.pose_with_covariance(make, 0, 'map', start, cov))
+    node.control.start_at(encode.pose_with_covariance(make, 0, 'map', start, cov))
     np.testing.assert_allclose(node.front_end.state.pose, start)
 
 
@@ -171,10 +171,10 @@ def test_initialpose_of_an_earlier_frame_is_moved_on_to_now(live, node):
     feed(node, 2.0)
     live.drain()
     then = live.heard['odometry/filtered'][-5]
-    moved = se2.between(convert.planar_pose(then.pose.pose, ''), node.last.T_local_base)
+    moved = se2.between(decode.planar_pose(then.pose.pose, ''), node.last.T_local_base)
     assert moved[0] > 0.1
-    start, stamp = np.array([5.0, 6.0, 1.0]), convert.stamp(then, '')
-    node.control.start_at(build.pose_with_covariance(make, stamp, 'map', start, 0.01 * np.eye(3)))
+    start, stamp = np.array([5.0, 6.0, 1.0]), decode.stamp(then, '')
+    node.control.start_at(encode.pose_with_covariance(make, stamp, 'map', start, 0.01 * np.eye(3)))
     np.testing.assert_allclose(node.front_end.state.pose, se2.compose(start, moved), atol=1e-9)
 
 
@@ -256,7 +256,7 @@ def live_frames(live):
 
 def test_wrong_frame_is_counted_and_named(live, node):
     def spoil(stream, msg):
-        if stream == 'scan' and convert.stamp(msg, '') > 3 * SECOND:
+        if stream == 'scan' and decode.stamp(msg, '') > 3 * SECOND:
             msg.header.frame_id = 'camera'
         return msg
 
@@ -308,7 +308,7 @@ def test_duplicates_are_counted_once(live, node):
         node.sensors.add(stream, msg)
     for stream in ('odom', 'imu', 'scan', 'reflectors'):
         assert used(node, stream, 'duplicate') >= used(node, stream) > 0
-    poses = [convert.stamp(m, '') for m in live_frames(live)]
+    poses = [decode.stamp(m, '') for m in live_frames(live)]
     assert len(set(poses)) == len(poses)
 
 
@@ -330,7 +330,7 @@ def test_late_and_future_messages_are_counted_and_harmless(live, node):
         after.header.stamp.sec += (last.header.stamp.nanosec + k * 10_000_000) // SECOND
         node.sensors.add(stream, after)
     assert used(node, 'scan', 'future') == 1
-    assert node.last.stamp < convert.stamp(future, 'scan')
+    assert node.last.stamp < decode.stamp(future, 'scan')
 
 
 @pytest.mark.parametrize('sec', [0, -5])
@@ -344,7 +344,7 @@ def test_stamps_that_are_not_positive_are_refused(live, node, sec):
 
 def test_odometry_that_is_not_finite_is_refused(live, node):
     def spoil(stream, msg):
-        if stream == 'odom' and convert.stamp(msg, '') % SECOND == 0:
+        if stream == 'odom' and decode.stamp(msg, '') % SECOND == 0:
             msg.pose.pose.position.x = float('nan')
         return msg
 
@@ -359,7 +359,7 @@ def test_clock_that_jumps_back_begins_anew(live, node):
         node.sensors.add('odom', msg)
     feed(node, 2.0)
     assert used(node, 'scan') >= 15
-    assert convert.stamp(live_frames(live)[-1], '') < 5 * SECOND
+    assert decode.stamp(live_frames(live)[-1], '') < 5 * SECOND
 
 
 # --- the place of the laser -----------------------------------------------------------------
@@ -372,8 +372,8 @@ def test_scans_wait_for_the_place_of_the_laser(live):
     for stream, msg in scans[:10]:
         node.sensors.add(stream, msg)
     assert used(node, 'scan') == 0
-    place = build.transform(make, SECOND, ('base_link', 'laser'), np.array([0.3, 0.1, 0.0]))
-    node.sensors.extrinsics.add(convert.transforms(place))
+    place = encode.transform(make, SECOND, ('base_link', 'laser'), np.array([0.3, 0.1, 0.0]))
+    node.sensors.extrinsics.add(decode.transforms(place))
     for stream, msg in scans[10:]:
         node.sensors.add(stream, msg)
     n = len([1 for s, _ in scans if s == 'scan'])
@@ -386,11 +386,11 @@ def test_scans_wait_for_the_place_of_the_laser(live):
 )
 def test_tf_static_tells_the_place_of_the_laser(live):
     node = live.start(FrontEndNode)
-    place = build.transform(make, SECOND, ('base_link', 'laser'), np.array([0.3, 0.1, 0.0]))
+    place = encode.transform(make, SECOND, ('base_link', 'laser'), np.array([0.3, 0.1, 0.0]))
     publisher = live.ear.create_publisher(
         rclpy_class('tf2_msgs/msg/TFMessage'), '/tf_static', LATCHED
     )
-    publisher.publish(build.tf_message(make, [place]))
+    publisher.publish(encode.tf_message(make, [place]))
     live.spin_until(lambda: node.sensors.extrinsics.pose('base_link', 'laser') is not None)
     np.testing.assert_allclose(node.sensors.extrinsics.pose('base_link', 'laser'), [0.3, 0.1, 0.0])
 
@@ -440,8 +440,8 @@ def test_several_lidars_answer_each_on_their_own(live):
     node = live.start(FrontEndNode, scan_topics=['front', 'rear/scan'], laser_pose=[0.2, 0.0, 0.0])
     node.sensors.stop_waiting()
     assert [node.count_subscribers(t) for t in ('front', 'rear/scan', 'scan')] == [1, 1, 0]
-    place = build.transform(make, SECOND, ('base_link', 'rear'), np.array([0.2, 0.0, np.pi]))
-    node.sensors.extrinsics.add(convert.transforms(make_transforms(place)))
+    place = encode.transform(make, SECOND, ('base_link', 'rear'), np.array([0.2, 0.0, np.pi]))
+    node.sensors.extrinsics.add(decode.transforms(make_transforms(place)))
     live.spin_until(lambda: node.count_subscribers('pose') == 1)
     sent = []
     for stream, msg in room(seconds=4.0):
@@ -535,7 +535,7 @@ def test_bad_input_over_dds_is_counted_in_the_diagnostics(live, node):
     # whatever the scans were, the detections of their instants gave poses
     live.drain()
     assert len(live.heard['pose']) >= scans - 1
-    poses = np.array([convert.planar_pose(m.pose.pose, '') for m in live.heard['pose']])
+    poses = np.array([decode.planar_pose(m.pose.pose, '') for m in live.heard['pose']])
     assert np.isfinite(poses).all()
     assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() < 0.2
 

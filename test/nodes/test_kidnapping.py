@@ -12,8 +12,8 @@ from rlml_slam import se2
 from rlml_slam.nodes.back_end import BackEndNode
 from rlml_slam.nodes.front_end import FrontEndNode
 from rlml_slam.params import Laser, Simulator, SimulatorParameters
-from rlml_slam.ros.messages import make_rclpy as make
-from rlml_slam.ros.simulated import SENSOR_TOPICS, SimulatedMessages
+from rlml_slam.ros.codecs.message_types import make_rclpy as make
+from rlml_slam.ros.systems.simulator_messages import SENSOR_TOPICS, SimulatedMessages
 from rlml_slam.simulation.robot import SECOND
 from rlml_slam.simulation.simulation import START, GroundTruth, Simulation
 from rlml_slam.simulation.world_file import load_world

@@ -16,15 +16,15 @@ from rclpy.serialization import deserialize_message
 from rlml_slam import se2
 from rlml_slam.errors import MapError
 from rlml_slam.maps.occupancy import OccupancyGrid
-from rlml_slam.maps.saved import SavedMap
+from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Parameters
-from rlml_slam.rlml import stored_map
-from rlml_slam.ros import map_folder
-from rlml_slam.ros.associated import read_reflector_map
-from rlml_slam.ros.frames import Record
-from rlml_slam.ros.last_pose import LastPose
-from rlml_slam.ros.map_folder import MapFolder
-from rlml_slam.ros.mapper import Mapper
+from rlml_slam.ros.back_end import map_folder
+from rlml_slam.ros.back_end.last_pose import LastPose
+from rlml_slam.ros.back_end.map_folder import MapFolder
+from rlml_slam.ros.back_end.mapper import Mapper
+from rlml_slam.ros.codecs.frame_messages import Record
+from rlml_slam.ros.codecs.reflector_clouds import read_reflector_map
+from rlml_slam.slam.store import map_file
 from rlml_slam.types import Detections, Frame, Health, Level, Motion, Observation, Reflectors
 
 SECOND = 1_000_000_000
@@ -226,7 +226,7 @@ def drives(mapper, ks, **more):
 def lost(folder):
     """Names and numbers of keyframes of the maps that were kept."""
     return {
-        path.name: len(stored_map.load(path).arrays['pose'])
+        path.name: len(map_file.load(path).arrays['pose'])
         for path in sorted(folder.glob('*.lost-*'))
     }
 
@@ -277,7 +277,7 @@ def test_map_made_here_stays_whole_while_it_is_localized_in(make, ear, tmp_path)
     drives(mapper, range(21, 30), session=2)
     np.testing.assert_array_equal(mapper.back_end.T_map_local, np.zeros(3))
     mapper.save('map')
-    assert len(stored_map.load(tmp_path / 'map.rlml').arrays['pose']) == keys
+    assert len(map_file.load(tmp_path / 'map.rlml').arrays['pose']) == keys
     with pytest.raises(MapError, match='does not change'):
         mapper.revoke('0')
     mapper.localize(False)
@@ -308,7 +308,7 @@ def test_map_without_the_grid_that_cannot_be_drawn(make, ear, tmp_path):
     assert 'no grid: map of 9 x 9 cells' in mapper.save('map')
     saved = MapFolder(str(tmp_path)).load('map')  # nothing of the older one
     assert (len(saved.reflectors), saved.grid) == (5, None)
-    whole = stored_map.saved_map(stored_map.load(tmp_path / 'map.rlml'))
+    whole = map_file.saved_map(map_file.load(tmp_path / 'map.rlml'))
     assert (len(whole.reflectors), whole.grid) == (5, None)
     assert [w for w in ear.warnings if 'no grid' in w] == ['no grid: map of 9 x 9 cells']
 

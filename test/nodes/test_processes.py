@@ -9,8 +9,8 @@ from live import LATCHED, ROOM, ROOT
 from rclpy.qos import QoSProfile
 
 from rlml_slam import se2
-from rlml_slam.ros import convert
-from rlml_slam.ros.bag import BagReader
+from rlml_slam.ros.bags.bag import BagReader
+from rlml_slam.ros.codecs import decode
 
 DEEP = QoSProfile(depth=2000)
 SECOND = 1_000_000_000
@@ -73,9 +73,9 @@ def test_processes_map_a_recording_and_stop_cleanly(live, start):
     for node in nodes:
         code, out = ended(node)
         assert code == 0, out
-    truth = [convert.pose_estimate(m) for m in live.heard['/ground_truth']]
+    truth = [decode.pose_estimate(m) for m in live.heard['/ground_truth']]
     stamps = np.array([t.stamp for t in truth])
-    got = convert.pose_estimate(live.heard['pose'][250])
+    got = decode.pose_estimate(live.heard['pose'][250])
     k = int(np.argmin(np.abs(stamps - got.stamp)))
     assert abs(stamps[k] - got.stamp) < SECOND // 10
     error = se2.between(truth[k].pose, got.pose)

@@ -9,8 +9,8 @@ from live import room
 
 from rlml_slam.nodes.reflector_detector import ReflectorDetectorNode
 from rlml_slam.params import Reflector
-from rlml_slam.ros import convert
-from rlml_slam.ros.cloud import read_cloud
+from rlml_slam.ros.codecs import decode
+from rlml_slam.ros.codecs.point_cloud import read_cloud
 from rlml_slam.types import ANONYMOUS
 
 CLOUD = 'sensor_msgs/msg/PointCloud2'
@@ -22,7 +22,7 @@ def use(node, items):
     scans, markers = [], {}
     for stream, msg in items:
         if stream == 'reflectors':
-            seen = convert.detections(msg, Reflector())
+            seen = decode.detections(msg, Reflector())
             markers[seen.stamp] = seen
             continue
         node.sensors.add(stream, msg)
@@ -43,13 +43,13 @@ def node(live):
 def test_every_scan_gets_its_cloud_with_its_stamp_and_frame(live, node):
     scans, markers = use(node, room(seconds=6.0))
     live.spin_until(lambda: len(live.heard['reflectors']) >= len(scans) - 3)
-    stamps = {convert.stamp(s, 'scan') for s in scans}
+    stamps = {decode.stamp(s, 'scan') for s in scans}
     near = total = 0
     for msg in live.heard['reflectors']:
-        assert convert.stamp(msg, 'reflectors') in stamps
+        assert decode.stamp(msg, 'reflectors') in stamps
         assert msg.header.frame_id == scans[0].header.frame_id
         assert read_cloud(msg).dtype.names == FIELDS
-        seen = convert.detections(msg, Reflector())
+        seen = decode.detections(msg, Reflector())
         assert (seen.ids == ANONYMOUS).all()
         told = markers.get(seen.stamp)
         if told is None or not len(seen):

@@ -10,9 +10,9 @@ import pytest
 
 from rlml_slam.errors import BagError
 from rlml_slam.params import Node
-from rlml_slam.ros import build, convert
-from rlml_slam.ros.bag import BagReader, BagWriter, Topic, choose_topics
-from rlml_slam.ros.messages import make_bag
+from rlml_slam.ros.bags.bag import BagReader, BagWriter, Topic, choose_topics
+from rlml_slam.ros.codecs import decode, encode
+from rlml_slam.ros.codecs.message_types import make_bag
 from rlml_slam.types import Imu
 
 SHARED = Path(__file__).resolve().parents[3] / 'shared' / 'data'
@@ -23,14 +23,14 @@ STORAGES = ['mcap', 'sqlite3']
 def write(path, storage='mcap', n=20):
     with BagWriter(path, storage) as bag:
         bag.add_topic('/tf_static', 'tf2_msgs/msg/TFMessage', latched=True)
-        T = build.transform(make_bag, SECOND, ('base_link', 'laser'), np.array([0.2, 0.0, 0.1]))
-        bag.write('/tf_static', build.tf_message(make_bag, [T]), SECOND)
+        T = encode.transform(make_bag, SECOND, ('base_link', 'laser'), np.array([0.2, 0.0, 0.1]))
+        bag.write('/tf_static', encode.tf_message(make_bag, [T]), SECOND)
         for k in range(n):
             stamp = SECOND + k * 10_000_000
             pose = np.array([0.1 * k, 0.0, 0.0])
-            odom = build.odometry(make_bag, stamp, ('odom', 'base_link'), pose, np.eye(3))
+            odom = encode.odometry(make_bag, stamp, ('odom', 'base_link'), pose, np.eye(3))
             bag.write('/odom', odom, stamp)
-            bag.write('/imu', build.imu(make_bag, Imu(stamp, 0.1 * k), 'imu'), stamp + 1)
+            bag.write('/imu', encode.imu(make_bag, Imu(stamp, 0.1 * k), 'imu'), stamp + 1)
     return path
 
 
@@ -47,7 +47,7 @@ def test_what_was_written_is_read(tmp_path, storage):
         messages = list(bag.messages())
     assert len(messages) == 41
     assert [t for t, _, _ in messages] == sorted(t for t, _, _ in messages)
-    odom = [convert.odometry(m) for _, topic, m in messages if topic == '/odom']
+    odom = [decode.odometry(m) for _, topic, m in messages if topic == '/odom']
     np.testing.assert_allclose([o.pose[0] for o in odom], 0.1 * np.arange(20))
 
 
@@ -154,7 +154,7 @@ def test_any_cloud_is_not_taken_for_reflectors():
     ],
 )
 def test_recorded_bags_are_read(name, topic, count):
-    read = {'scan': convert.scan, 'data': convert.imu, 'odom': convert.odometry}
+    read = {'scan': decode.scan, 'data': decode.imu, 'odom': decode.odometry}
     with BagReader(SHARED / name) as bag:
         values = [read[topic.split('/')[-1]](m) for _, _, m in bag.messages([topic])]
     assert len(values) == count
@@ -241,7 +241,7 @@ def test_ros1_bag_cut_off_gives_what_came_before(tmp_path, share):
 def test_broken_messages_are_skipped_and_counted(tmp_path):
     path = tmp_path / 'bag'
     with BagWriter(path) as bag:
-        good = build.imu(make_bag, Imu(SECOND, 0.1), 'imu')
+        good = encode.imu(make_bag, Imu(SECOND, 0.1), 'imu')
         bag.write('/imu', good, SECOND)
         bag._writer.write(bag._connections['/imu'], SECOND + 1, b'\x00\x01\x00\x00\xff')
         bag.write('/imu', good, SECOND + 2)
@@ -257,7 +257,7 @@ def test_messages_of_unknown_types_are_skipped_and_counted(tmp_path):
             '/secret', 'acme/msg/Secret', msgdef='this is no definition', rihs01='RIHS01_0'
         )
         bag._writer.write(bag._connections['/secret'], SECOND, b'\x00\x01\x00\x00')
-        bag.write('/imu', build.imu(make_bag, Imu(SECOND, 0.1), 'imu'), SECOND)
+        bag.write('/imu', encode.imu(make_bag, Imu(SECOND, 0.1), 'imu'), SECOND)
     with BagReader(path) as bag:
         assert [topic for _, topic, _ in bag.messages()] == ['/imu']
         assert bag.skipped == {'/secret': 1}

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from rlml_slam.errors import FileFormatError
-from rlml_slam.rlml.relocalize import Relocation
-from rlml_slam.ros.last_pose import NEAR, PERIOD, LastPose, verified
+from rlml_slam.ros.back_end.last_pose import NEAR, PERIOD, LastPose, verified
+from rlml_slam.slam.relocalization.scan_relocalization import Relocation
 from rlml_slam.types import Frame, Health, Level, Motion, Observation, Verdict
 
 HERE = np.array([3.0, -1.0, 0.5])

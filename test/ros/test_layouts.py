@@ -13,7 +13,7 @@ from unittest import mock
 import pytest
 import yaml
 
-from rlml_slam.tools.interface import SERVICES, TOPICS
+from rlml_slam.cli.support.interface import SERVICES, TOPICS
 
 ROOT = Path(__file__).resolve().parents[2]
 RVIZ = yaml.safe_load((ROOT / 'config' / 'rlml_slam.rviz').read_text())

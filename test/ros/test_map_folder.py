@@ -6,7 +6,7 @@ import os
 import pytest
 
 from rlml_slam.errors import MapError, NoMapError
-from rlml_slam.ros.map_folder import LOST_KEPT, MapFolder
+from rlml_slam.ros.back_end.map_folder import LOST_KEPT, MapFolder
 
 
 @pytest.mark.parametrize('name', ['', '..', '../hall', '/etc/hall', 'a/../../hall'])

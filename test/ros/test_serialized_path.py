@@ -6,21 +6,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rlml_slam.ros import build
-from rlml_slam.ros.messages import bag_types, make_bag
-from rlml_slam.ros.serialized_path import serialized_path
+from rlml_slam.ros.codecs import encode
+from rlml_slam.ros.codecs.message_types import bag_types, make_bag
+from rlml_slam.ros.codecs.serialized_path import serialized_path
 
 PATH = 'nav_msgs/msg/Path'
 
 
 def message(stamp, frame_id, stamps, poses):
     """The same with an object for each pose."""
-    header = build.header(make_bag, stamp, frame_id)
+    header = encode.header(make_bag, stamp, frame_id)
     each = [
         make_bag(
             'geometry_msgs/msg/PoseStamped',
-            header=build.header(make_bag, int(s), frame_id),
-            pose=build.pose(make_bag, T),
+            header=encode.header(make_bag, int(s), frame_id),
+            pose=encode.pose(make_bag, T),
         )
         for s, T in zip(stamps, poses, strict=True)
     ]

@@ -10,17 +10,18 @@ import pytest
 
 from rlml_slam import se2
 from rlml_slam.errors import InputError
-from rlml_slam.ros import build, convert, tf
-from rlml_slam.ros.convert import Transform
-from rlml_slam.ros.messages import make_bag
+from rlml_slam.ros import tf
+from rlml_slam.ros.codecs import decode, encode
+from rlml_slam.ros.codecs.decode import Transform
+from rlml_slam.ros.codecs.message_types import make_bag
 from rlml_slam.ros.tf import Extrinsics
 
 FLIPPED = np.diag([1.0, -1.0, -1.0])  # half a turn about x
 
 
 def planar(parent, child, pose):
-    message = build.transform(make_bag, 1, (parent, child), np.array(pose))
-    return convert.transforms(message)
+    message = encode.transform(make_bag, 1, (parent, child), np.array(pose))
+    return decode.transforms(message)
 
 
 def test_chain_up_and_down_is_composed():
@@ -83,10 +84,10 @@ def test_bad_static_transform_costs_only_itself(monkeypatch):
     )
     tree = Extrinsics()
     assert tf.subscribe_static(node, tree)
-    bad = build.transform(make_bag, 1, ('base_link', 'camera'), np.zeros(3))
+    bad = encode.transform(make_bag, 1, ('base_link', 'camera'), np.zeros(3))
     bad.transform.rotation.w = 0.0
     good = [
-        build.transform(make_bag, 1, ('base_link', child), np.array([0.3, 0.1, 0.0]))
+        encode.transform(make_bag, 1, ('base_link', child), np.array([0.3, 0.1, 0.0]))
         for child in ('laser', 'imu')
     ]
     hear['/tf_static'](SimpleNamespace(transforms=[good[0], bad, good[1]]))

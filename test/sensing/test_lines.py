@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rlml_slam.params import Ransac
-from rlml_slam.sensing.consensus import find_lines, fit
-from rlml_slam.sensing.lines import extract, nearest_point, range_and_bearing
+from rlml_slam.sensing.features.lines import extract, nearest_point, range_and_bearing
+from rlml_slam.sensing.features.ransac import find_lines, fit
 
 ORIGIN = np.zeros(2)
 

@@ -15,15 +15,15 @@ from numpy.testing import assert_allclose
 from scipy.integrate import quad
 from scipy.optimize import least_squares
 
+from rlml_lab.studies.detector_scenes import Scene, StillLaser, cylinders, room, surface
+from rlml_lab.studies.study_detector import judge_cylinders, judge_hall, judge_rooms, judge_worlds
 from rlml_slam import se2
 from rlml_slam.params import Detector, Laser
-from rlml_slam.sensing.bright_level import is_circular
-from rlml_slam.sensing.bright_spot import Fate
-from rlml_slam.sensing.reflector_detector import detect, threshold
-from rlml_slam.sensing.spot_shape import surface_depth
+from rlml_slam.sensing.reflectors.background_intensity import is_circular
+from rlml_slam.sensing.reflectors.bright_spots import Fate
+from rlml_slam.sensing.reflectors.reflector_detector import detect, threshold
+from rlml_slam.sensing.reflectors.spot_shape import surface_depth
 from rlml_slam.simulation.world import NO_REFLECTOR, Geometry
-from rlml_slam.tools.detector_scenes import Scene, StillLaser, cylinders, room, surface
-from rlml_slam.tools.study_detector import judge_cylinders, judge_hall, judge_rooms, judge_worlds
 from rlml_slam.types import Scan
 
 R2000 = Path(__file__).resolve().parents[3] / 'shared' / 'data' / 'reflector-r2000'
@@ -391,13 +391,13 @@ def test_a_room_has_no_reflector_in_it():
 
 @pytest.fixture(scope='module')
 def recorded():
-    from rlml_slam.ros import convert
-    from rlml_slam.ros.bag import BagReader
+    from rlml_slam.ros.bags.bag import BagReader
+    from rlml_slam.ros.codecs import decode
 
     if not R2000.exists():
         pytest.skip('needs ../shared/data/reflector-r2000')
     with BagReader(R2000 / 'r2000_locate0.bag') as bag:
-        return [convert.scan(m) for _, _, m in bag.messages(['/scan'])]
+        return [decode.scan(m) for _, _, m in bag.messages(['/scan'])]
 
 
 def listed():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rlml_slam.params import Spikes
-from rlml_slam.sensing.spikes import extract, jump_spans, sum_spans
+from rlml_slam.sensing.features.spikes import extract, jump_spans, sum_spans
 from rlml_slam.types import Scan
 
 

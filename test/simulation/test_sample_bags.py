@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rlml_slam.cli import simulate
 from rlml_slam.params import Reflector
-from rlml_slam.ros import convert
-from rlml_slam.ros.bag import BagReader
-from rlml_slam.tools import simulate
+from rlml_slam.ros.bags.bag import BagReader
+from rlml_slam.ros.codecs import decode
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
 README = (BAGS / 'README.md').read_text(encoding='utf-8')
@@ -56,12 +56,12 @@ def test_the_command_still_writes_the_same_messages(bag, tmp_path):
     assert [(time, topic) for time, topic, _ in new] == [(time, topic) for time, topic, _ in old]
     for (_, topic, a), (_, _, b) in zip(new, old, strict=True):
         if topic in ('/odom', '/ground_truth'):
-            pose = convert.odometry(b).pose
-            np.testing.assert_allclose(convert.odometry(a).pose, pose, atol=1e-6)
+            pose = decode.odometry(b).pose
+            np.testing.assert_allclose(decode.odometry(a).pose, pose, atol=1e-6)
         elif topic == '/scan':
             x, y = np.array(a.ranges), np.array(b.ranges)
             # a ray that just misses an edge may hit it on another processor
             assert np.isclose(x, y, rtol=1e-4, atol=0.0, equal_nan=True).mean() > 0.98
         elif topic == '/reflectors':
-            p, q = (convert.detections(m, Reflector()).points for m in (a, b))
+            p, q = (decode.detections(m, Reflector()).points for m in (a, b))
             np.testing.assert_allclose(p, q, atol=1e-4)

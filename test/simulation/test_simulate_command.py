@@ -6,13 +6,13 @@ import json
 import numpy as np
 import pytest
 
+from rlml_slam.cli import simulate
 from rlml_slam.errors import BagError, FileFormatError, ParameterError
 from rlml_slam.params import Reflector, SimulatorParameters, from_mapping
-from rlml_slam.ros import convert
-from rlml_slam.ros.bag import BagReader
+from rlml_slam.ros.bags.bag import BagReader
+from rlml_slam.ros.codecs import decode
 from rlml_slam.simulation.simulation import GroundTruth, Simulation
 from rlml_slam.simulation.world_file import load_world
-from rlml_slam.tools import simulate
 from rlml_slam.types import Detections, Imu, Odometry, Scan
 
 SMALL = ['--duration', '3', '--set', 'laser.beams=90', '--set', 'markers.ids=true']
@@ -46,16 +46,16 @@ def test_the_bag_holds_what_the_simulation_says(tmp_path, capsys, storage):
         assert time == event.time
         if isinstance(true, Odometry):
             assert topic == '/odom'
-            np.testing.assert_allclose(convert.odometry(msg).pose, true.pose, atol=1e-12)
+            np.testing.assert_allclose(decode.odometry(msg).pose, true.pose, atol=1e-12)
         elif isinstance(true, Imu):
-            assert convert.imu(msg) == true
+            assert decode.imu(msg) == true
         elif isinstance(true, Scan):
-            read = convert.scan(msg)
+            read = decode.scan(msg)
             np.testing.assert_array_equal(read.ranges, true.ranges)
             np.testing.assert_array_equal(read.intensities, true.intensities)
             assert (read.stamp, read.frame_id) == (true.stamp, 'laser')
         elif isinstance(true, Detections):
-            read = convert.detections(msg, Reflector())
+            read = decode.detections(msg, Reflector())
             np.testing.assert_allclose(read.points, true.points, rtol=1e-6)  # float32
             np.testing.assert_allclose(read.cov, true.cov, rtol=1e-4, atol=1e-9)
             np.testing.assert_array_equal(read.ids, true.ids)
@@ -63,17 +63,17 @@ def test_the_bag_holds_what_the_simulation_says(tmp_path, capsys, storage):
         else:
             assert isinstance(true, GroundTruth)
             assert topic == '/ground_truth'
-            np.testing.assert_allclose(convert.odometry(msg).pose, true.T_map_base, atol=1e-12)
+            np.testing.assert_allclose(decode.odometry(msg).pose, true.T_map_base, atol=1e-12)
 
 
 def test_the_bag_tells_where_the_laser_and_the_reflectors_are(tmp_path):
     command('room', tmp_path / 'bag', *SMALL)
     with BagReader(tmp_path / 'bag') as reader:
         latched = {topic: msg for _, topic, msg in reader.messages() if topic != '/scan'}
-    (T,) = convert.transforms(latched['/tf_static'])
+    (T,) = decode.transforms(latched['/tf_static'])
     assert (T.parent, T.child) == ('base_link', 'laser')
     np.testing.assert_allclose(T.t, [0.2, 0.0, 0.0])
-    known = convert.detections(latched['/ground_truth_reflectors'], Reflector())
+    known = decode.detections(latched['/ground_truth_reflectors'], Reflector())
     world = load_world('room')
     assert known.frame_id == 'map'
     np.testing.assert_allclose(known.points + world.start[:2], world.reflectors.points, atol=1e-5)
@@ -91,7 +91,7 @@ def test_the_same_arguments_give_the_same_bytes(tmp_path, storage, suffix):
 def test_odometry_carries_the_twist_of_its_steps(tmp_path):
     command('room', tmp_path / 'bag', *SMALL, '--set', 'wheels.b=0', '--set', 'wheels.a=0')
     with BagReader(tmp_path / 'bag') as reader:
-        twists = [convert.twist(m.twist)[0] for _, _, m in reader.messages(['/odom'])]
+        twists = [decode.twist(m.twist)[0] for _, _, m in reader.messages(['/odom'])]
     assert twists[0] == 0.0
     # 1 s of standing, then 0.8 m/s^2 up to 1 m/s
     np.testing.assert_allclose(twists[-20:], 1.0, atol=1e-6)

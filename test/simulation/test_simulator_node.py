@@ -28,8 +28,8 @@ from sensor_msgs.msg import LaserScan, PointCloud2  # noqa: E402
 from rlml_slam.errors import FileFormatError, ParameterError  # noqa: E402
 from rlml_slam.nodes.simulator import SimulatorNode  # noqa: E402
 from rlml_slam.params import Reflector, SimulatorParameters, from_mapping  # noqa: E402
-from rlml_slam.ros import convert  # noqa: E402
-from rlml_slam.ros.pace import Pace  # noqa: E402
+from rlml_slam.ros.codecs import decode  # noqa: E402
+from rlml_slam.ros.playback_clock import Pace  # noqa: E402
 from rlml_slam.simulation.robot import SECOND  # noqa: E402
 from rlml_slam.simulation.simulation import START, GroundTruth, Simulation  # noqa: E402
 from rlml_slam.simulation.world_file import load_world  # noqa: E402
@@ -109,7 +109,7 @@ def make_node(context, wall, **parameters):
 
 
 def ns(msg):
-    return convert.stamp(msg, 'test')
+    return decode.stamp(msg, 'test')
 
 
 def test_the_node_publishes_what_the_simulation_says(context, ear):
@@ -137,13 +137,13 @@ def test_the_node_publishes_what_the_simulation_says(context, ear):
     for topic, messages in want.items():
         assert [ns(m) for m in ear.heard[topic]] == [m.stamp for m in messages]
     for msg, true in zip(ear.heard['scan'], want['scan'], strict=True):
-        np.testing.assert_array_equal(convert.scan(msg).ranges, true.ranges)
+        np.testing.assert_array_equal(decode.scan(msg).ranges, true.ranges)
         assert len(msg.intensities) == 90
     for msg, true in zip(ear.heard['reflectors'], want['reflectors'], strict=True):
-        read = convert.detections(msg, Reflector())
+        read = decode.detections(msg, Reflector())
         np.testing.assert_allclose(read.points, true.points, rtol=1e-5)
     for msg, true in zip(ear.heard['odom'], want['odom'], strict=True):
-        np.testing.assert_allclose(convert.odometry(msg).pose, true.pose, atol=1e-9)
+        np.testing.assert_allclose(decode.odometry(msg).pose, true.pose, atol=1e-9)
         assert (msg.header.frame_id, msg.child_frame_id) == ('odom', 'base_link')
     truth = ear.heard['ground_truth'][-1]
     assert (truth.header.frame_id, truth.child_frame_id) == ('map', 'base_link')
@@ -230,7 +230,7 @@ def test_true_reflectors_are_there_for_who_comes_late(context):
     while not got:
         assert time.monotonic() < end
         executor.spin_once(timeout_sec=0.05)
-    known = convert.detections(got[0], Reflector())
+    known = decode.detections(got[0], Reflector())
     assert known.frame_id == 'map'
     np.testing.assert_array_equal(known.ids, load_world('room').reflectors.ids)
     executor.shutdown()

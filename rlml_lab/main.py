@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command ``rlml-lab``: studies and benchmarks, run from a checkout.
+
+They are not part of what a robot installs; ``make env`` puts the command into ``.venv/bin``.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from rlml_slam.cli.main import Command, Group, Table, main
+
+COMMANDS: Table = {
+    'study': Group(
+        'experiments that answer one question each',
+        {
+            'front-end': Command(
+                'rlml_lab.studies.study_front_end',
+                'each sensor alone and together, faults, kidnapping',
+            ),
+            'worlds': Command(
+                'rlml_lab.studies.study_worlds', 'accuracy and consistency over seeds and worlds'
+            ),
+            'lifelong': Command(
+                'rlml_lab.studies.study_lifelong',
+                'hours in one hall: size of the map and cost of a keyframe',
+            ),
+            'deformable': Command(
+                'rlml_lab.deformable.study_deformable',
+                'deformable-feature SLAM: EKF against NLS over many seeds',
+            ),
+            'ekf': Command(
+                'rlml_lab.ekf.study_ekf',
+                'RLML, the EKF with each extractor and dead reckoning on the same drives',
+            ),
+            'relocalization': Command(
+                'rlml_lab.studies.study_relocalization',
+                'whether reflectors alone tell the place, and whether the verdict is right',
+            ),
+            'lego': Command(
+                'rlml_lab.studies.study_lego',
+                'spikes and EKF on the LEGO robot among cylinders: figures and a picture',
+            ),
+            'repeatability': Command(
+                'rlml_lab.studies.study_repeatability',
+                'how often spikes and lines of a corrected log are seen again',
+            ),
+            'closures': Command(
+                'rlml_lab.studies.study_closures',
+                'whether the loop closures of a log are right, by its relations',
+            ),
+            'detector': Command(
+                'rlml_lab.studies.study_detector',
+                'bias, false detections and reach of the reflector detector',
+            ),
+            'store': Command(
+                'rlml_lab.studies.study_store',
+                'map files that are cut off, flipped, or killed while saved',
+            ),
+            'victoria-park': Command(
+                'rlml_lab.studies.study_victoria_park',
+                'dead reckoning, EKF and RLML among trees, against GPS',
+            ),
+        },
+    ),
+    'bench': Group(
+        'measured speed and quality against other libraries',
+        {
+            'back-end': Command(
+                'rlml_lab.bench.bench_back_end', 'the graph solver against other libraries'
+            ),
+            'front-end': Command(
+                'rlml_lab.bench.bench_front_end', 'CPU time per scan against a scan matcher'
+            ),
+            'incremental': Command(
+                'rlml_lab.bench.bench_incremental', 'the incremental solver against iSAM2'
+            ),
+            'marginals': Command('rlml_lab.bench.bench_marginals', 'covariances against GTSAM'),
+            'robust': Command(
+                'rlml_lab.bench.bench_robust', 'wrong closures in graphs, against GTSAM'
+            ),
+            'live': Command(
+                'rlml_lab.bench.bench_live', 'whether the live nodes keep up with a fast laser'
+            ),
+        },
+    ),
+}
+
+
+def run() -> int:
+    """Run one command line of ``rlml-lab``; the exit code."""
+    return main(
+        None, COMMANDS, 'rlml-lab', 'Studies and benchmarks of rlml_slam, for its developers.'
+    )
+
+
+if __name__ == '__main__':
+    sys.exit(run())

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``rlml call``: the services of a running node, where no ``ros2`` is installed."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+from typing import Any
+
+from rlml_slam.cli.support.service_call import call, told
+from rlml_slam.errors import InputError
+
+SWITCH = {'on': True, 'off': False}
+# service -> type, and the field of its request that takes the argument
+SERVICES = {
+    'save_map': ('std_srvs', 'Trigger', None),
+    'load_map': ('nav_msgs', 'LoadMap', 'map_url'),
+    'reset': ('std_srvs', 'Trigger', None),
+    'relocalize': ('std_srvs', 'Trigger', None),
+    'set_localization_mode': ('std_srvs', 'SetBool', 'data'),
+    'pause_new_measurements': ('std_srvs', 'SetBool', 'data'),
+}
+
+
+def add_parser(subparsers: Any) -> None:
+    """Declare ``rlml call``."""
+    parser = subparsers.add_parser(
+        'call',
+        help='a service of a running node: save_map, relocalize and so on',
+        description='Calls a service of a running node and prints its answer.',
+    )
+    parser.add_argument('service', metavar='SERVICE', choices=SERVICES, help=', '.join(SERVICES))
+    parser.add_argument(
+        'argument', metavar='ARGUMENT', nargs='?',
+        help='of load_map the name of a map, of the two that switch something on or off',
+    )  # fmt: skip
+    parser.add_argument(
+        '--node', metavar='NAME', default='/back_end',
+        help='the running node (default: %(default)s)',
+    )  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> int:
+    """Call it and print what it says."""
+    package, name, field = SERVICES[args.service]
+    fields = {} if field is None else {field: value_of(args.service, field, args.argument)}
+    if field is None and args.argument is not None:
+        raise InputError(f'{args.service} takes no argument')
+    kind = getattr(importlib.import_module(f'{package}.srv'), name)
+    answer = call(args.node, args.service, kind, fields)
+    if name != 'LoadMap':
+        print(told(answer))
+    elif answer.result != kind.Response.RESULT_SUCCESS:
+        raise InputError(f'load_map: {args.node} refused the map, and its log says why')
+    else:
+        print(f'{args.argument}: loaded')
+    return 0
+
+
+def value_of(service: str, field: str, argument: str | None) -> str | bool:
+    """The argument as the request has it; InputError where it is none."""
+    if argument is None:
+        raise InputError(f'{service} needs an argument')
+    if field == 'map_url':
+        return argument
+    if argument not in SWITCH:
+        raise InputError(f'{service}: {argument!r} is neither on nor off')
+    return SWITCH[argument]

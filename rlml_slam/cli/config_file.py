@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``python -m rlml_slam.cli.config_file``: a parameter file with every default."""
+
+from __future__ import annotations
+
+import math
+import sys
+from typing import Any
+
+from rlml_slam.params import (
+    CarrierParameters,
+    Declaration,
+    DeformableParameters,
+    DetectorParameters,
+    EkfParameters,
+    Parameters,
+    SimulatorParameters,
+    declarations,
+)
+
+FILES: dict[str, tuple[type[Any], str]] = {
+    'default.yaml': (Parameters, 'Every parameter of front_end, back_end, slam and `rlml replay`'),
+    'simulator.yaml': (SimulatorParameters, 'Every parameter of the simulator'),
+    'deformable_slam.yaml': (DeformableParameters, 'Every parameter of deformable_slam'),
+    'ekf_slam.yaml': (EkfParameters, 'Every parameter of ekf_slam and `rlml replay --system ekf`'),
+    'reflector_detector.yaml': (DetectorParameters, 'Every parameter of reflector_detector'),
+    'carrier_simulator.yaml': (CarrierParameters, 'Every parameter of carrier_simulator'),
+}
+
+
+# what a node declares, because it shares the group, but does not read: names and groups
+UNREAD: dict[str, tuple[str, ...]] = {
+    'ekf_slam.yaml': (
+        'continue_map', 'restore_pose', 'transform_publish_period',
+        'scan_match', 'loop_closure', 'relocalization', 'solver',
+    ),
+    'deformable_slam.yaml': ('motion.wheels', 'motion.wheels_time'),
+    'reflector_detector.yaml': (
+        'motion.wheels', 'motion.wheels_time',
+        'map_frame', 'odom_frame', 'local_frame', 'use_scan', 'use_reflectors',
+        'reflector_poses_topic', 'mode', 'map_directory', 'map_file_name', 'map_start_pose',
+        'restore_pose', 'continue_map', 'transform_publish_period', 'map_update_interval',
+    ),
+}  # fmt: skip
+
+
+def parameter_file(name: str) -> str:
+    """The text of ``config/<name>``: defaults with meaning, unit and range as comments."""
+    of, what = FILES[name]
+    lines = [
+        '# SPDX-License-Identifier: Apache-2.0',
+        f'# {what} with its default, written by `make config`.',
+        '# Copy what you change into a file of your own: names that it leaves out keep these.',
+        '/**:',
+        '  ros__parameters:',
+    ]
+    group = 'node'
+    for d in declarations(of):
+        if {d.name, d.name.split('.')[0]} & set(UNREAD.get(name, ())):
+            continue
+        if d.group != group:
+            group = d.group
+            lines.append(f'    {group}:')
+        indent = '    ' if group == 'node' else '      '
+        lines.append(f'{indent}# {_comment(d)}')
+        lines.append(f'{indent}{d.field}: {_value(d.default)}')
+    return '\n'.join(lines) + '\n'
+
+
+def _comment(d: Declaration) -> str:
+    unit = f' [{d.unit}]' if d.unit else ''
+    bounds = ''
+    if d.choices:
+        bounds = f' ({" | ".join(d.choices)})'
+    elif math.isfinite(d.low) or math.isfinite(d.high):
+        bounds = f' ({d.low:g} to {d.high:g})'
+    return f'{d.meaning}{unit}{bounds}'
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return f'[{", ".join(_value(v) for v in value)}]'
+    if isinstance(value, str):
+        return f"'{value}'"
+    text = repr(value)
+    # YAML 1.1 takes 1e-06 for a string
+    return text if 'e' not in text or '.' in text else text.replace('e', '.0e')
+
+
+def main() -> None:
+    """Print the file that the argument names."""
+    sys.stdout.write(parameter_file(sys.argv[1]))
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``rlml demo``: simulator, front end and back end as three processes, live over DDS."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rlml_slam.cli.support.live_session import LISTENERS, Source, drive
+from rlml_slam.params import Simulator
+from rlml_slam.report.outputs import make_folder, write_outputs
+from rlml_slam.report.summary import tell
+from rlml_slam.simulation.world import World
+from rlml_slam.simulation.world_file import load_world
+
+RATE = 2.0  # simulated seconds per second: two cores keep up with three processes and a recorder
+GYRO_RATE = 50.0  # [Hz] simulated: more would cost CPU time and tell nothing new
+STILL = 1.0  # [s] simulated: standing before and after the drive
+
+
+def add_parser(subparsers: Any) -> None:
+    """Declare ``rlml demo``."""
+    parser = subparsers.add_parser(
+        'demo', help='simulator, front end and back end live over DDS, then a report'
+    )
+    parser.add_argument(
+        '--out', type=Path, default=Path('out/demo'), metavar='DIR', help='default: %(default)s'
+    )
+    parser.add_argument(
+        '--world', default='hall', help='world of the drive (default: %(default)s)'
+    )
+    parser.add_argument('--seed', type=int, default=0, help='seed of all noise')
+    parser.add_argument(
+        '--rate', type=float, default=RATE, metavar='X',
+        help='simulated seconds per second (default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument('--json', action='store_true', help='print metrics.json and no more')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Drive, listen, write the results, and say what they are."""
+    world = load_world(args.world)
+    # a wrong value is refused here, before three processes start
+    Simulator(world=args.world, seed=args.seed, rate=args.rate)
+    out = make_folder(args.out)
+    if not args.json:
+        print(
+            f'{world.name}: simulator, front end and back end are three processes over DDS, '
+            f'at {args.rate:g} × real time',
+            flush=True,
+        )
+    result = drive(source(args, world), out, args.json)
+    return tell(result, write_outputs(result, out), out, args.json)
+
+
+def source(args: argparse.Namespace, world: World) -> Source:
+    """The simulator in the place of a robot."""
+    length = route_length(world)
+    return Source(
+        f'{world.name}, live',
+        'simulator',
+        {
+            'world': args.world, 'seed': args.seed, 'rate': float(args.rate),
+            'still_time': STILL, 'gyro.rate': GYRO_RATE, 'wait_for_subscribers': LISTENERS,
+        },
+        lambda recorder: recorder.distance / length,
+        # where there is no tf2_msgs, /tf_static cannot tell it
+        {'laser_pose': list(Simulator().laser_pose), 'map_update_interval': 1.0},
+        keeps_map=True,
+    )  # fmt: skip
+
+
+def route_length(world: World) -> float:
+    """Length [m] of the way through the points of the route."""
+    steps = np.diff(np.asarray(world.route, dtype=np.float64)[:, :2], axis=0)
+    return float(np.hypot(steps[:, 0], steps[:, 1]).sum())

@@ -1,0 +1,323 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A node that listens to a live system and makes a Run of what it hears."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
+from nav_msgs.msg import Odometry, Path
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import PointCloud2
+from visualization_msgs.msg import MarkerArray
+
+from rlml_slam.datasets.tum import Trajectory
+from rlml_slam.evaluation.run_record import FrameLog, Run, Truth
+from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.params import Parameters
+from rlml_slam.ros.codecs import decode
+from rlml_slam.ros.codecs.frame_messages import read_record
+from rlml_slam.ros.codecs.message_types import rclpy_class
+from rlml_slam.ros.codecs.reflector_clouds import read_associated, read_reflector_map
+from rlml_slam.ros.codecs.update_message import Told, read_update
+from rlml_slam.ros.sensors import LATCHED
+from rlml_slam.ros.systems.simulator_messages import TRUE_REFLECTORS
+from rlml_slam.se2 import Array
+from rlml_slam.types import Detections, Health, Level, Reflectors, Status
+
+SCAN = ('scan', 'sensor_msgs/msg/LaserScan')
+DEEP = QoSProfile(depth=1000)  # of the small messages, none may be lost
+SENSOR = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+PATIENCE = 15.0  # [s] in which a busy machine may catch up with what was sent
+SETTLE = 0.5  # [s] in which two nodes that are there find each other
+NO_REFLECTORS = Reflectors(
+    np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)),
+    np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0),
+)  # fmt: skip
+
+
+class Recorder(Node):
+    """Collects poses, truth, products and diagnostics; every callback may be called directly.
+
+    ``sensor`` is the (topic, type) whose every message asks for a pose.
+    """
+
+    def __init__(self, sensor: tuple[str, str] = SCAN, **options: Any) -> None:
+        super().__init__('recorder', **options)
+        self._sensor = sensor
+        self.frames = FrameLog()
+        self.true: dict[int, Array] = {}
+        self.latency_ms: list[float] = []
+        self.figures: dict[str, dict[str, str]] = {}
+        self.sensed = 0
+        self.distance = 0.0
+        self._sensor_heard: dict[int, float] = {}
+        self._healths: dict[int, Health] = {}
+        self._answers: dict[int, tuple[Level, float]] = {}
+        self._seen: dict[int, tuple[int, int]] = {}
+        self._updates: list[Told] = []
+        self._began: float | None = None
+        self._heard = 0.0
+        self._path = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)))
+        self._products: dict[str, bytes] = {}
+        self._grid: OccupancyGrid | None = None
+        self._reflectors = NO_REFLECTORS
+        self._true_reflectors: Detections | None = None
+        self._keyframes, self._closures = np.zeros((0, 3)), np.zeros((0, 2, 2))
+        self._last_true: Array | None = None
+        self._listener: Any = None
+        self._settled = time.monotonic() + SETTLE
+        listen = self.create_subscription
+        listen(PoseWithCovarianceStamped, 'pose', self.on_pose, DEEP)
+        listen(PointCloud2, 'frames', self.on_frame, DEEP)
+        listen(PointCloud2, 'reflectors/associated', self.on_associated, DEEP)
+        listen(PointCloud2, 'updates', self.on_update, DEEP)
+        listen(Odometry, 'ground_truth', self.on_truth, DEEP)
+        listen(PointCloud2, TRUE_REFLECTORS, self.on_true_reflectors, LATCHED)
+        listen(PointCloud2, 'reflector_map_points', self.on_reflectors, LATCHED)
+        listen(DiagnosticArray, '/diagnostics', self.on_diagnostics, DEEP)
+        for topic, (kind, _) in self._large().items():
+            # bytes: only the last one of each is ever looked into
+            listen(kind, topic, partial(self.on_product, topic), LATCHED, raw=True)
+
+    def _large(self) -> dict[str, tuple[Any, Callable[[Any], None]]]:
+        """Products that are large: topic, type and callback."""
+        return {
+            'map': (OccupancyGridMsg, self.on_map),
+            'trajectory': (Path, self.on_trajectory),
+            'graph': (MarkerArray, self.on_graph),
+        }
+
+    def is_ready(self) -> bool:
+        """Whether front end and back end are there; from then on the sensor is listened to.
+
+        Its source waits for this listener, so that nobody misses the beginning.
+        """
+        if self._listener is not None:
+            return True
+        now = time.monotonic()
+        if not (self.count_publishers('pose') and self.count_publishers('graph')):
+            self._settled = now + SETTLE
+        if now < self._settled:
+            return False
+        # bytes: the stamp is all that is wanted of a scan
+        topic, kind = self._sensor
+        self._listener = self.create_subscription(
+            rclpy_class(kind), topic, self.on_sensor, SENSOR, raw=True
+        )
+        return True
+
+    def on_sensor(self, data: bytes) -> None:
+        """One serialized message that begins with a header: note when it came."""
+        self.sensed += 1
+        self._sensor_heard[stamp_of(data)] = time.monotonic()
+
+    def on_pose(self, msg: PoseWithCovarianceStamped) -> None:
+        """The front end's answer to a scan."""
+        now = time.monotonic()
+        pose = decode.pose_estimate(msg)
+        self._began = now if self._began is None else self._began
+        self._heard = now
+        self.frames.add_pose(pose.stamp, pose.pose, pose.cov)
+        heard = self._sensor_heard.pop(pose.stamp, None)
+        if heard is not None:
+            self.latency_ms.append((now - heard) * 1e3)
+
+    def on_frame(self, msg: PointCloud2) -> None:
+        """What the front end says of one pose: its level of health, and its cost."""
+        frame = read_record(msg).frame
+        self._answers[frame.stamp] = (frame.health.level, frame.wall_ms)
+
+    def on_associated(self, msg: PointCloud2) -> None:
+        """The detections of one pose: how many, and how many were used."""
+        associated = read_associated(msg)
+        used = int(np.sum(associated.statuses == Status.USED))
+        self._seen[associated.detections.stamp] = (len(associated.statuses), used)
+
+    def on_update(self, msg: PointCloud2) -> None:
+        """What one keyframe did, and its cost."""
+        self._updates.append(read_update(msg))
+
+    def on_truth(self, msg: Odometry) -> None:
+        """Where the robot really is."""
+        pose = decode.planar_pose(msg.pose.pose, 'ground_truth')
+        if self._last_true is not None:
+            self.distance += float(np.hypot(*(pose - self._last_true)[:2]))
+        self._last_true = pose
+        self.true[decode.stamp(msg, 'ground_truth')] = pose
+
+    def on_true_reflectors(self, msg: PointCloud2) -> None:
+        """Where the reflectors really are."""
+        self._true_reflectors = decode.detections(msg, Parameters().reflector, TRUE_REFLECTORS)
+
+    def on_product(self, topic: str, data: bytes) -> None:
+        """The newest map, trajectory or graph, serialized."""
+        self._products[topic] = data
+
+    def on_map(self, msg: OccupancyGridMsg) -> None:
+        """The newest map."""
+        info = msg.info
+        cells = np.frombuffer(msg.data, dtype=np.int8).reshape(info.height, info.width)
+        origin = (info.origin.position.x, info.origin.position.y)
+        self._grid = OccupancyGrid(round(info.resolution, 6), origin, cells)
+
+    def on_trajectory(self, msg: Path) -> None:
+        """The newest optimised trajectory."""
+        stamps = [decode.stamp(p, 'trajectory') for p in msg.poses]
+        poses = [decode.planar_pose(p.pose, 'trajectory') for p in msg.poses]
+        self._path = Trajectory(np.array(stamps, np.int64), np.array(poses).reshape(-1, 3))
+
+    def on_reflectors(self, msg: PointCloud2) -> None:
+        """The newest reflector map."""
+        self._reflectors = read_reflector_map(msg)
+
+    def on_graph(self, msg: MarkerArray) -> None:
+        """The newest keyframes and closures."""
+        for marker in msg.markers:
+            points = np.array([[p.x, p.y] for p in marker.points]).reshape(-1, 2)
+            if marker.ns == 'keyframes':
+                self._keyframes = np.column_stack([points, np.zeros(len(points))])
+            elif marker.ns == 'closure':
+                self._closures = points.reshape(-1, 2, 2)
+
+    def on_diagnostics(self, msg: DiagnosticArray) -> None:
+        """Health of the front end, and the figures of both nodes."""
+        stamp = msg.header.stamp.sec * 1_000_000_000 + msg.header.stamp.nanosec
+        for status in msg.status:
+            name = status.name.rsplit('/')[-1]
+            self.figures[name] = {v.key: v.value for v in status.values}
+            if name == 'front_end':
+                level = status.level[0] if isinstance(status.level, bytes) else status.level
+                reasons = tuple(status.message.split('; ')) if level else ()
+                self._healths[stamp] = Health(Level(min(int(level), 2)), reasons)
+
+    def sent(self) -> int:
+        """Messages of the sensor that its source says it sent; else those that came here."""
+        key = f'{self._sensor[0]} published'
+        told = [int(f[key]) for f in self.figures.values() if key in f]
+        return told[0] if told else self.sensed
+
+    def error(self) -> float | None:
+        """Position error [m] of the newest pose whose truth is known."""
+        for stamp, pose in zip(
+            self.frames.stamps[:-10:-1], self.frames.poses[:-10:-1], strict=True
+        ):
+            if stamp in self.true:
+                return float(np.hypot(*(pose - self.true[stamp])[:2]))
+        return None
+
+    def elapsed(self) -> float:
+        """Seconds of message time from the first pose to the newest."""
+        stamps = self.frames.stamps
+        return (stamps[-1] - stamps[0]) * 1e-9 if stamps else 0.0
+
+    def silence(self, now: float) -> float:
+        """Seconds since the last pose, 0 before the first."""
+        return now - self._heard if self._began is not None else 0.0
+
+    def has_caught_up(self, since: float) -> bool:
+        """Whether all scans came and the newest has its pose, in map and diagnostics as well.
+
+        ``since`` is when the source ended; after PATIENCE the answer is yes in any case.
+        """
+        if time.monotonic() - since > PATIENCE:
+            return True
+        newest = max(self._sensor_heard, default=0)
+        path = self._products.get('trajectory')
+        mapped = stamp_of(path) if path is not None else 0
+        answered = self.frames.stamps[-1] if self.frames.stamps else 0
+        told = max(self._healths, default=0)
+        return self.sensed >= self.sent() and min(mapped, told) >= answered >= newest
+
+    def note(self) -> str:
+        """One line for the progress."""
+        error = self.error()
+        parts = [
+            f'error {100 * error:.1f} cm' if error is not None else 'no pose yet',
+            f'{len(self._reflectors)} reflectors',
+            f'{len(self._updates)} keyframes',
+            f'{sum(u.accepted for u in self._updates)} closures',
+        ]
+        return ', '.join(parts)
+
+    def run(self, name: str) -> Run:
+        """Everything that was heard."""
+        for topic, (kind, take) in self._large().items():
+            if topic in self._products:
+                take(deserialize_message(self._products[topic], kind))
+        stamps = np.array(sorted(self.true), dtype=np.int64)
+        truth = None
+        if len(stamps):
+            path = Trajectory(stamps, np.array([self.true[t] for t in sorted(self.true)]))
+            known = self._true_reflectors
+            truth = (
+                Truth(path, True) if known is None else Truth(path, True, known.ids, known.points)
+            )
+        wall = 0.0 if self._began is None else self._heard - self._began
+        return Run(
+            name, self._log(), self.trajectory(), self._reflectors, self._grid,
+            self._keyframes, self._closures, sum(u.rejected for u in self._updates),
+            np.array([u.wall_ms for u in self._updates]),
+            inputs=self.inputs(), truth=truth, wall_s=wall,
+        )  # fmt: skip
+
+    def _log(self) -> FrameLog:
+        """The poses as published, each with its own health, detections and cost."""
+        log, live = FrameLog(), self.frames
+        for stamp, pose, cov in zip(live.stamps, live.poses, live.covs, strict=True):
+            level, wall_ms = self._answers.get(stamp, (Level.OK, None))
+            log.add_pose(stamp, pose, cov, Health(level, self._reasons(stamp, level)))
+            if wall_ms is not None:
+                log.wall_ms.append(wall_ms)
+            seen, used = self._seen.get(stamp, (0, 0))
+            log.seen.append(seen)
+            log.used.append(used)
+        return log
+
+    def _reasons(self, stamp: int, level: Level) -> tuple[str, ...]:
+        """Those of the diagnostics nearest in time that told the same level."""
+        if level is Level.OK:
+            return ()
+        near = min(
+            (t for t, h in self._healths.items() if h.level is level),
+            key=lambda t: abs(t - stamp), default=None,
+        )  # fmt: skip
+        return () if near is None else self._healths[near].reasons
+
+    def trajectory(self) -> Trajectory:
+        """The newest trajectory, and for the scans before and after it the live poses."""
+        live, path = self.frames.trajectory(), self._path
+        if not len(path):
+            return live
+        head, tail = live.stamps < path.stamps[0], live.stamps > path.stamps[-1]
+        return Trajectory(
+            np.concatenate([live.stamps[head], path.stamps, live.stamps[tail]]),
+            np.concatenate([live.poses[head], path.poses, live.poses[tail]]),
+        )
+
+    def inputs(self, node: str = 'front_end') -> dict[str, dict[str, int]]:
+        """What became of a node's inputs, from its diagnostics."""
+        out: dict[str, dict[str, int]] = {}
+        for key, value in self.figures.get(node, {}).items():
+            stream, _, what = key.partition(' ')
+            if what and value.isdecimal() and stream in ('scan', 'odom', 'imu', 'reflectors'):
+                fate = out.setdefault(stream, {'used': 0, 'late': 0, 'invalid': 0})
+                fate[what] = int(value)
+        return out
+
+
+def stamp_of(data: bytes) -> int:
+    """Stamp [ns] of a serialized message that begins with a header."""
+    # CDR: four bytes of encapsulation, then the header's stamp (int32 sec, uint32 nanosec)
+    order = '<' if data[1] & 1 else '>'
+    sec, nanosec = struct.unpack_from(f'{order}iI', data, 4)
+    return int(sec) * 1_000_000_000 + int(nanosec)

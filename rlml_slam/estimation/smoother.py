@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the robot was by all that was measured, before and after: the filter's steps, smoothed.
+
+The most probable path of the filter's own model: motions with their lasting errors, and each
+measurement of a landmark as the filter took it, with its answer to which one it was. The first
+Gauss-Newton step about the filter's path is the fixed-interval (Rauch-Tung-Striebel) smoother of
+the linearised model; the others linearise about the smoothed path (iterated smoother: Bell 1994),
+which takes out what the filter's early linearisations cost. The normal equations are sparse, so
+memory grows with the steps and measurements alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam import se2
+from rlml_slam.estimation.landmark_models import Model
+from rlml_slam.se2 import Array
+from rlml_slam.types import Motion
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_matrix
+    from scipy.sparse.linalg import SuperLU
+
+BIAS, SPEED, TURN, ROBOT = 3, 4, 5, 6  # after the pose, what gyro and wheels err by; the size
+ITERATIONS = 20
+SETTLED = 1e-6  # [m], [rad] of the largest correction
+LEAST = 1e-3  # share of a step below which a better one is not looked for
+AT_ONCE = 32  # landmarks whose covariances are solved for together
+FLOOR = 1e-6  # least sigma of anything: what is surer is taken for this, to be divided by
+
+
+@dataclass(frozen=True)
+class Sight:
+    """The landmark ``key`` measured as z (2,) with R (2, 2)."""
+
+    key: int
+    z: Array
+    R: Array
+
+
+@dataclass(frozen=True)
+class Step:
+    """What the filter used of one observation: its ``motion`` and what it saw after it.
+
+    ``walk`` and ``kept`` as :meth:`Filter.predict` takes them.
+    """
+
+    motion: Motion
+    walk: float
+    kept: float
+    sights: tuple[Sight, ...] = ()
+
+
+@dataclass(frozen=True)
+class Start:
+    """The robot (6,) before the first step, and its covariance (6, 6)."""
+
+    x: Array
+    P: Array
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """States (n, 6) of the robot after each step, and the landmarks (m, 2) of the ``keys``.
+
+    ``start`` (6,) is the state before the first step, ``covs`` (m, 2, 2) the landmarks' marginal
+    covariances.
+    """
+
+    start: Array
+    states: Array
+    keys: NDArray[np.int64]
+    points: Array
+    covs: Array
+
+
+class _Rows:
+    """Whitened rows of J dx = -e, as they come."""
+
+    def __init__(self) -> None:
+        self._i: list[NDArray[np.int64]] = []
+        self._j: list[NDArray[np.int64]] = []
+        self._v: list[Array] = []
+        self._e: list[Array] = []
+        self._n = 0
+
+    def add(self, cov: Array, e: Array, *blocks: tuple[NDArray[np.int64], Array]) -> None:
+        """Errors e (k, r) of covariances (k, r, r), with (columns (k, c), J (k, r, c)) of each."""
+        k, r = e.shape
+        L = np.linalg.cholesky(cov + FLOOR**2 * np.eye(r))
+        rows = self._n + np.arange(k * r).reshape(k, r)
+        self._e.append(np.linalg.solve(L, e[..., None]).ravel())
+        for columns, J in blocks:
+            shape = (k, r, columns.shape[1])
+            self._v.append(np.linalg.solve(L, J).ravel())
+            self._i.append(np.broadcast_to(rows[:, :, None], shape).ravel())
+            self._j.append(np.broadcast_to(columns[:, None, :], shape).ravel())
+        self._n += k * r
+
+    def errors(self) -> Array:
+        """All errors."""
+        return np.concatenate(self._e)
+
+    def jacobian(self, width: int) -> csc_matrix:
+        """J (rows, width)."""
+        # takes a while to import, which other commands need not wait for
+        from scipy.sparse import csc_matrix
+
+        at = np.concatenate(self._i), np.concatenate(self._j)
+        return csc_matrix((np.concatenate(self._v), at), shape=(self._n, width))
+
+    def step(self, width: int) -> Array:
+        """The dx (width,) of the least squares."""
+        J = self.jacobian(width)
+        return np.asarray(_factor(J).solve(-(J.T @ self.errors())))
+
+    def covariances(self, width: int, first: int) -> Array:
+        """Blocks (m, 2, 2) on the diagonal of (J^T J)^-1, of the last columns from ``first`` on.
+
+        They are the joint information with all else eliminated, inverted (Schur complement).
+        """
+        normal = _factor(self.jacobian(width))
+        out = np.empty(((width - first) // 2, 2, 2))
+        for at in range(0, len(out), AT_ONCE):
+            columns = first + 2 * at + np.arange(2 * min(AT_ONCE, len(out) - at))
+            unit = np.zeros((width, len(columns)))
+            unit[columns, np.arange(len(columns))] = 1.0
+            block = normal.solve(unit)[columns]
+            for k in range(len(columns) // 2):
+                cov = block[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
+                out[at + k] = 0.5 * (cov + cov.T)
+        return out
+
+
+def _factor(J: csc_matrix) -> SuperLU:
+    """Factors of the normal equations J^T J."""
+    # takes a while to import, which other commands need not wait for
+    from scipy.sparse.linalg import splu
+
+    return splu(
+        (J.T @ J).tocsc(), permc_spec='MMD_AT_PLUS_A', diag_pivot_thresh=0.0,
+        options={'SymmetricMode': True},
+    )  # fmt: skip
+
+
+class _Problem:
+    """The model's errors about a path ``x`` (n + 1, 6), the start first, and ``points`` (m, 2)."""
+
+    def __init__(self, start: Start, steps: Sequence[Step], model: Model) -> None:
+        self._start, self._model = start, model
+        motions = [s.motion for s in steps]
+        self._steps = steps
+        self.keys = np.unique([q.key for s in steps for q in s.sights]).astype(np.int64)
+        self._delta, self._bias_gain, self._turn_gain = (
+            np.array([getattr(m, name) for m in motions])
+            for name in ('delta', 'bias_gain', 'turn_gain')
+        )
+        self._cov = np.array([m.cov for m in motions])
+        self._kept = np.array([s.kept for s in steps])
+        self._walk = np.array([s.walk for s in steps])
+        # what IMU and wheels say of the bias, where they do
+        self._told = np.flatnonzero([np.isfinite(m.bias_var) for m in motions])
+        self._bias, self._bias_var, self._bias_turn = (
+            np.array([getattr(motions[k], name) for k in self._told])
+            for name in ('bias', 'bias_var', 'bias_turn')
+        )
+
+    def rows(self, x: Array, points: Array) -> _Rows:
+        """Errors and Jacobians there."""
+        out = _Rows()
+        n = len(x)
+        at = ROBOT * np.arange(n)[:, None] + np.arange(ROBOT)
+        # the start
+        e = x[0] - self._start.x
+        e[2] = se2.wrap(e[2])
+        out.add(self._start.P[None], e[None], (at[:1], np.eye(ROBOT)[None]))
+        self._motions(out, x, at)
+        self._lasting(out, x, at)
+        self._sights(out, x, points, at)
+        return out
+
+    def _motions(self, out: _Rows, x: Array, at: NDArray[np.int64]) -> None:
+        """How each motion differs from the wheels', corrected by what they err by."""
+        before, after = x[:-1], x[1:]
+        delta = (
+            self._delta
+            + self._bias_gain * before[:, BIAS, None]
+            + self._turn_gain * before[:, TURN, None]
+        )
+        scale = np.ones((len(before), 3))
+        scale[:, :2] += before[:, SPEED, None]
+        way = np.concatenate([delta[:, :2], np.zeros((len(delta), 1))], axis=1)
+        e = se2.between(before[:, :3], after[:, :3]) - scale * delta
+        e[:, 2] = se2.wrap(e[:, 2])
+        J_a, J_b = se2.between_jacobians(before[:, :3], after[:, :3])
+        gains = np.stack([scale * self._bias_gain, way, scale * self._turn_gain], axis=-1)
+        J = np.concatenate([J_a, -gains], axis=-1)
+        out.add(self._cov, e, (at[:-1], J), (at[1:, :3], J_b))
+
+    def _lasting(self, out: _Rows, x: Array, at: NDArray[np.int64]) -> None:
+        """The gyro's bias walks, what the wheels err by fades and is renewed."""
+        before, after = x[:-1], x[1:]
+        one = np.ones((len(before), 1, 1))
+        out.add(
+            self._walk[:, None, None], after[:, BIAS, None] - before[:, BIAS, None],
+            (at[:-1, BIAS, None], -one), (at[1:, BIAS, None], one),
+        )  # fmt: skip
+        for k in range(SPEED, TURN + 1):
+            new = (1.0 - self._kept**2) * self._start.P[k, k]
+            e = after[:, k] - self._kept * before[:, k]
+            out.add(
+                new[:, None, None], e[:, None],
+                (at[:-1, k, None], -self._kept[:, None, None]), (at[1:, k, None], one),
+            )  # fmt: skip
+        told = self._told
+        if not len(told):
+            return
+        H = np.stack([np.ones(len(told)), self._bias_turn], axis=-1)[:, None]
+        columns = at[told][:, [BIAS, TURN]]
+        e = (H[:, 0] * x[told][:, [BIAS, TURN]]).sum(axis=1) - self._bias
+        out.add(self._bias_var[:, None, None], e[:, None], (columns, H))
+
+    def _sights(self, out: _Rows, x: Array, points: Array, at: NDArray[np.int64]) -> None:
+        first = ROBOT * len(x)
+        for k, step in enumerate(self._steps, 1):
+            if not step.sights:
+                continue
+            slots = np.searchsorted(self.keys, [q.key for q in step.sights])
+            h, H_r, H_m = self._model.observe(x[k, :3], points[slots])
+            nu = self._model.innovation(np.array([q.z for q in step.sights]), h)
+            columns = first + 2 * slots[:, None] + np.arange(2)
+            robot = np.broadcast_to(at[k, :3], (len(slots), 3))
+            R = np.array([q.R for q in step.sights])
+            out.add(R, -nu, (robot, H_r), (columns, H_m))
+
+
+def smooth(
+    start: Start, steps: Sequence[Step], model: Model, poses: Array, iterations: int = ITERATIONS
+) -> Smoothed:
+    """The path (n,) and the landmarks; ``poses`` (n, 3) are the filter's, to begin with."""
+    problem = _Problem(start, steps, model)
+    x = np.tile(start.x, (len(steps) + 1, 1))
+    x[1:, :3] = poses
+    points = _first_points(problem.keys, steps, model, poses)
+    rows = problem.rows(x, points)
+    cost = float(rows.errors() @ rows.errors())
+    for _ in range(iterations):
+        dx = rows.step(x.size + points.size)
+        share, best = 1.0, rows
+        while True:
+            moved = x + share * dx[: x.size].reshape(x.shape)
+            moved[:, 2] = se2.wrap(moved[:, 2])
+            placed = points + share * dx[x.size :].reshape(points.shape)
+            rows = problem.rows(moved, placed)
+            new = float(rows.errors() @ rows.errors())
+            if new <= cost * (1.0 + 1e-9):
+                break
+            share *= 0.5
+            if share < LEAST:  # nothing on the way is better, or it is no number
+                return _smoothed(problem, best, x, points)
+        x, points, cost = moved, placed, new
+        if np.abs(share * dx).max() < SETTLED:
+            break
+    return _smoothed(problem, rows, x, points)
+
+
+def _smoothed(problem: _Problem, rows: _Rows, x: Array, points: Array) -> Smoothed:
+    """The result, and how sure its landmarks are by the ``rows`` there."""
+    covs = rows.covariances(x.size + points.size, x.size)
+    return Smoothed(x[0], x[1:], problem.keys, points, covs)
+
+
+def _first_points(
+    keys: NDArray[np.int64], steps: Sequence[Step], model: Model, poses: Array
+) -> Array:
+    """Each landmark where it was last seen from."""
+    out = np.zeros((len(keys), 2))
+    for pose, step in zip(poses, steps, strict=True):
+        for q in step.sights:
+            out[np.searchsorted(keys, q.key)] = model.place(pose, q.z[None])[0][0]
+    return out

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What one run of the system left behind, whoever drove it: replay, study or demo.
+
+Everything that is written and drawn is made from a Run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam.datasets.tum import Trajectory
+from rlml_slam.maps.map_container import Content
+from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.se2 import Array
+from rlml_slam.slam.landmarks.reflector_states import ReflectorState
+from rlml_slam.types import Frame, Health, Level, Reflectors, Status
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Ground truth. ``is_map``: it is in the run's own map frame, else it has to be aligned.
+
+    ``reflector_ids`` (m,) and ``reflectors`` (m, 2) [m] are in the same frame.
+    """
+
+    trajectory: Trajectory
+    is_map: bool
+    reflector_ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    reflectors: Array = field(default_factory=lambda: np.zeros((0, 2)))
+
+
+@dataclass
+class FrameLog:
+    """The front end's answers, one entry per frame, without the measurements themselves."""
+
+    stamps: list[int] = field(default_factory=list)
+    poses: list[Array] = field(default_factory=list)
+    covs: list[Array] = field(default_factory=list)
+    levels: list[int] = field(default_factory=list)
+    reasons: list[tuple[str, ...]] = field(default_factory=list)
+    wall_ms: list[float] = field(default_factory=list)
+    seen: list[int] = field(default_factory=list)
+    used: list[int] = field(default_factory=list)
+
+    def add(self, frames: Iterable[Frame]) -> None:
+        """Note the poses as published live, their health and their cost."""
+        for f in frames:
+            self.add_pose(f.stamp, f.T_map_base, f.cov_map, f.health)
+            self.wall_ms.append(f.wall_ms)
+            self.seen.append(len(f.statuses))
+            used = f.statuses == Status.USED
+            self.used.append(int(used.sum()) if len(used) else 0)
+
+    def add_pose(self, stamp: int, pose: Array, cov: Array, health: Health | None = None) -> None:
+        """Note one published pose (3,) with covariance (3, 3)."""
+        self.stamps.append(stamp)
+        self.poses.append(pose)
+        self.covs.append(cov)
+        health = health or Health()
+        self.levels.append(int(health.level))
+        self.reasons.append(health.reasons)
+
+    def trajectory(self) -> Trajectory:
+        """The poses as published live."""
+        return Trajectory(
+            np.array(self.stamps, dtype=np.int64), np.array(self.poses).reshape(-1, 3)
+        )
+
+
+@dataclass
+class Run:
+    """Inputs' fate, estimates, products and cost of one run.
+
+    ``trajectory`` is the optimised one; ``keyframes`` (k, 3) are poses in the map and
+    ``closures`` (c, 2, 2) the ends of the accepted loop closures there, of which
+    ``closure_table`` tells all, empty where nothing is known of them. ``back_end_ms`` (k,)
+    has the cost per keyframe, ``reflector_states`` what has become of the reflectors. ``inputs``
+    counts what became of the messages of each stream, ``topics`` says where in a bag they are.
+    ``problem`` says in one line what ended the run early or what of it is missing, empty without
+    either. ``stored`` is the whole map. ``extra`` goes into metrics.json as it is.
+    """
+
+    name: str
+    frames: FrameLog
+    trajectory: Trajectory
+    reflectors: Reflectors
+    grid: OccupancyGrid | None = None
+    keyframes: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    closures: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
+    rejected: int = 0
+    back_end_ms: Array = field(default_factory=lambda: np.zeros(0))
+    inputs: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    truth: Truth | None = None
+    wall_s: float = 0.0
+    problem: str = ''
+    stored: Content | None = None
+    extra: Mapping[str, Any] = field(default_factory=dict)
+    closure_table: str = ''
+    reflector_states: tuple[ReflectorState, ...] = ()
+    topics: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def duration_s(self) -> float:
+        """Time between the first and the last frame."""
+        stamps = self.frames.stamps
+        return (stamps[-1] - stamps[0]) * 1e-9 if stamps else 0.0
+
+    def health_share(self) -> dict[str, float]:
+        """Share of the frames at each level."""
+        levels = np.array(self.frames.levels)
+        return {
+            level.name: float(np.mean(levels == level)) if len(levels) else 0.0 for level in Level
+        }

@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Minimisation that never climbs: Levenberg-Marquardt and Powell's dog-leg.
+
+The loops are Python around the compiled linearisation, factorisation and solves. Steps are
+measured in the norm of D, the diagonal of H, so metres and radians count by their information.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from rlml_slam.compiled import kernel
+from rlml_slam.graph.batch.gauss_newton import Progress, factor, newton_step
+from rlml_slam.graph.model.linearization import linearize, move
+from rlml_slam.graph.model.packed_system import System
+from rlml_slam.graph.sparse.multifrontal import highest
+from rlml_slam.graph.sparse.symbolic_analysis import Ints, Records
+from rlml_slam.se2 import Array
+
+# a step is accepted if it brings this share of what the model promises
+ENOUGH = 1e-4
+FIRST_DAMPING = 1e-4
+
+
+@kernel
+def curvature(fronts: Records, entries: Records, values: Array, x: Array) -> float:
+    """X^T H x with H, not its factor, in the panels."""
+    total = 0.0
+    own = np.empty(highest(fronts))
+    for s in range(len(fronts) - 1):
+        width, height, at = fronts[s]['width'], fronts[s]['height'], fronts[s]['panel']
+        end = fronts[s + 1]['start']
+        for p in range(fronts[s]['start'], end):
+            i, k = entries[p]['local'], entries[p]['scalar']
+            after = entries[p + 1]['local'] if p + 1 < end else height
+            for r in range(after - i):
+                own[i + r] = x[k + r]
+        for j in range(width):
+            column = 0.5 * values[at + j * height + j] * own[j]
+            for i in range(j + 1, height):
+                column += values[at + j * height + i] * own[i]
+            total += 2.0 * column * own[j]
+    return total
+
+
+@dataclass
+class _State:
+    """An estimate with its cost; moving it is undone by putting the old one back."""
+
+    system: System
+    poses: Array
+    landmarks: Array
+    cost: float
+    chi2: float
+    diagonal: Ints
+
+    def linearize(self) -> Array:
+        """H into the panels; its diagonal, in the order of elimination."""
+        self.cost, self.chi2 = linearize(self.system, self.poses, self.landmarks, True)
+        return np.asarray(self.system.values[self.diagonal])
+
+    def factorise(self, scale: Array, damping: float) -> float:
+        """Factor H + damping D, with more damping until that works; returns the damping used."""
+        values = self.system.values
+        for _ in range(30):
+            values[self.diagonal] += damping * scale
+            if factor(self.system) < 0:
+                return damping
+            damping = max(1e-8, 10.0 * damping)
+            self.linearize()
+        return math.inf
+
+    def attempt(self, step: Array, promised: float) -> float:
+        """Move if that brings enough; the share of the promise that it brings."""
+        before = self.poses.copy(), self.landmarks.copy(), self.system.g.copy()
+        move(self.system.variables, step, self.poses, self.landmarks)
+        cost, chi2 = linearize(self.system, self.poses, self.landmarks, False)
+        ratio = (self.cost - cost) / promised if promised > 0.0 else -1.0
+        if ratio > ENOUGH and math.isfinite(cost):
+            self.cost, self.chi2 = cost, chi2
+        else:
+            self.poses[:], self.landmarks[:], self.system.g[:] = before
+            ratio = min(ratio, 0.0) if math.isfinite(cost) else -1.0
+        return ratio
+
+
+def _state(system: System, poses: Array, landmarks: Array) -> _State:
+    v = system.variables
+    diagonal = np.empty(len(system.g), dtype=np.int64)
+    for r in range(3):
+        has = v['size'] > r
+        diagonal[v['scalar'][has] + r] = v['address'][has] + r * (v['stride'][has] + 1)
+    return _State(system, poses, landmarks, math.inf, math.inf, diagonal)
+
+
+def levenberg_marquardt(
+    system: System,
+    poses: Array,
+    landmarks: Array,
+    max_iterations: int,
+    tolerance: float,
+    floor: float,
+) -> Progress:
+    """Steps of (H + damping D) dx = -g with Nielsen's rule for the damping."""
+    state = _state(system, poses, landmarks)
+    damping, growth, iterations = FIRST_DAMPING, 2.0, 0
+    scale = state.linearize()
+    while iterations < max_iterations:
+        damping = state.factorise(scale, damping)
+        if damping > 1e12:
+            break
+        newton_step(system)
+        step = system.step
+        # model: -2 g dx - dx H dx = -g dx + damping dx D dx
+        promised = float(-system.g @ step + damping * step @ (scale * step))
+        if promised <= tolerance * state.cost + floor:
+            return Progress(state.cost, state.chi2, iterations, True)
+        iterations += 1
+        ratio = state.attempt(step, promised)
+        if ratio > 0.0:
+            damping *= max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
+            growth = 2.0
+        else:
+            damping *= growth
+            growth *= 2.0
+        scale = state.linearize()
+    return Progress(state.cost, state.chi2, iterations, False)
+
+
+def dog_leg(
+    system: System,
+    poses: Array,
+    landmarks: Array,
+    max_iterations: int,
+    tolerance: float,
+    floor: float,
+) -> Progress:
+    """Powell's dog-leg: one factorisation per accepted step, none for a refused one."""
+    state = _state(system, poses, landmarks)
+    radius, iterations = -1.0, 0
+    while iterations < max_iterations:
+        scale = state.linearize()
+        steep = -system.g / scale
+        gain = float(-system.g @ steep)
+        bend = curvature(system.fronts, system.entries, system.values, steep)
+        if state.factorise(scale, 0.0) > 1e12:
+            break
+        promised = newton_step(system)
+        if promised <= tolerance * state.cost + floor:
+            return Progress(state.cost, state.chi2, iterations, True)
+        newton = system.step.copy()
+        if radius < 0.0:
+            radius = math.sqrt(newton @ (scale * newton))
+        ratio = 0.0
+        while ratio <= 0.0 and iterations < max_iterations:
+            step, model = _leg(newton, steep, scale, radius, gain, bend, promised)
+            length = math.sqrt(step @ (scale * step))
+            iterations += 1
+            ratio = state.attempt(step, model)
+            if ratio < 0.25:
+                radius = 0.25 * length
+            elif ratio > 0.75:
+                radius = max(radius, 3.0 * length)
+            if radius * radius <= 1e-3 * (tolerance * state.cost + floor):
+                return Progress(state.cost, state.chi2, iterations, True)
+    return Progress(state.cost, state.chi2, iterations, False)
+
+
+def _leg(
+    newton: Array,
+    steep: Array,
+    scale: Array,
+    radius: float,
+    gain: float,
+    bend: float,
+    promised: float,
+) -> tuple[Array, float]:
+    """(step within ``radius``, the decrease that it promises).
+
+    The Newton step if it fits, else the point where the path from the Cauchy point to it leaves
+    the trust region, else the clipped Cauchy step. ``gain`` = -g steep, ``bend`` = steep H steep.
+    """
+    if newton @ (scale * newton) <= radius * radius:
+        return newton, promised
+    cauchy = gain / bend * steep
+    across = float(cauchy @ (scale * cauchy))
+    if across >= radius * radius:
+        t = radius / math.sqrt(float(steep @ (scale * steep)))
+        return t * steep, 2.0 * t * gain - t * t * bend
+    # |cauchy + b (newton - cauchy)| = radius
+    rest = newton - cauchy
+    a2, a1 = float(rest @ (scale * rest)), float(cauchy @ (scale * rest))
+    b = (-a1 + math.sqrt(max(0.0, a1 * a1 + a2 * (radius * radius - across)))) / a2
+    # -2 g s - s H s for s = p steep + b newton, with H newton = -g
+    p = (1.0 - b) * gain / bend
+    model = 2.0 * (p * gain + b * promised) - (
+        p * p * bend + 2.0 * p * b * gain + b * b * promised
+    )
+    return cauchy + b * rest, model

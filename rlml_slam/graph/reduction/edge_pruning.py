@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Factors that go where there are more of them than a graph needs, rather those that tell little.
+
+The leverage of an edge is the share of what is known of where its pose j is from its pose i that
+comes from itself, h = tr(Q W) / 3 with its information W and the covariance Q of its residual by
+the whole graph (the effective resistance by which Spielman & Srivastava, "Graph sparsification by
+effective resistances", 2011, tell which edges matter). Those of all edges sum up to the number of
+free poses at most, so that of m edges per pose they have 1 / m in the mean: most of what such a
+one tells is known without it. What is left is what was measured: nothing becomes surer than it
+was. The same holds of the sightings of a pose, h = tr(Q W) / 2, of which the least go.
+
+Were it for leverage alone, the edges that stay would lie the more at random the longer new ones
+come in, and the factor of such a graph is nearly full. There, an edge to a pose with many
+neighbours costs little, for that pose separates the others anyway: so what an edge tells counts
+times the square of the number of neighbours of the busier one of its poses. By the number itself
+the factor still grew, by 8 % in an hour of driving in one hall; by its square it does not. Some
+that go tell more than the mean for that; none tells more than it leaves to the others, AT_ONCE.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam.graph.batch.marginals import Marginals
+from rlml_slam.graph.incremental.online_solver import Live
+from rlml_slam.graph.model.factors import chi2, pose_landmark, relative_pose
+from rlml_slam.graph.model.graph import Graph
+from rlml_slam.graph.model.robust_loss import loss
+from rlml_slam.graph.robust.relative_covariance import residual_covs
+from rlml_slam.se2 import Array
+
+# Leverage that an edge which goes may have in any direction, and all that go at a time together.
+# The edges of a cut have one or more in sum: so none is cut through.
+AT_ONCE = 0.5
+
+
+def prune(graph: Graph, may: NDArray[np.bool_], most: int) -> NDArray[np.int64]:
+    """Disable edges of those that ``may`` (e,) go until there are ``most``; which they were (k,).
+
+    More are left where too many would have to go at a time. The estimate is to be the optimum.
+    """
+    e = graph.edges
+    use = np.flatnonzero(e.enabled)
+    if len(use) <= most:
+        return use[:0]
+    nodes = e.nodes[use]
+    neighbours = np.bincount(np.unique(np.sort(nodes), axis=0).ravel())
+    busier = neighbours[nodes].max(axis=1)
+    gone = use[_least(leverages(graph), may[use], len(use) - most, busier**2)]
+    e.enabled[gone] = False
+    return gone
+
+
+def prune_sightings(live: Live, pose: int, most: int) -> NDArray[np.int64]:
+    """The same of the sightings of one pose, from the tree of the live solver."""
+    s = live.graph.sightings
+    use = np.flatnonzero((s.nodes[:, 0] == pose) & s.enabled)
+    if len(use) <= most:
+        return use[:0]
+    h = sighting_leverages(live, pose, use)
+    gone = use[_least(h, np.ones(len(use), dtype=np.bool_), len(use) - most)]
+    s.enabled[gone] = False
+    return gone
+
+
+def _least(
+    h: Array, may: NDArray[np.bool_], num: int, times: NDArray[np.int64] | int = 1
+) -> NDArray[np.int64]:
+    """Of the leverages (k, d, d), up to ``num`` that ``may`` go together, the least first.
+
+    Each counts so many ``times`` (k,).
+    """
+    total, largest = np.trace(h, axis1=1, axis2=2), np.linalg.eigvals(h).real.max(axis=1)
+    order = np.argsort(total * times, kind='stable')
+    order = order[may[order] & (largest[order] < AT_ONCE)]
+    least: NDArray[np.int64] = order[np.cumsum(total[order]) < AT_ONCE * h.shape[1]][:num]
+    return least
+
+
+def leverages(graph: Graph) -> Array:
+    """Q W (k, 3, 3) of all enabled edges, in their order; robust weights count."""
+    e = graph.edges
+    use = np.flatnonzero(e.enabled)
+    i, j = e.nodes[use].T
+    information = e.information[use]
+    residual = relative_pose(graph.poses[i], graph.poses[j], e.measured[use])[0]
+    w = _weights(graph, e.kinds[use], chi2(residual, information))
+    out: Array = residual_covs(graph, Marginals(graph)) @ information * w[:, None, None]
+    return out
+
+
+def sighting_leverages(live: Live, pose: int, sightings: NDArray[np.int64]) -> Array:
+    """Q W (k, 2, 2) of enabled ``sightings`` (k,), all from one ``pose``; robust weights count."""
+    graph, s = live.graph, live.graph.sightings
+    seen, information = s.nodes[sightings, 1], s.information[sightings]
+    who, at = np.unique(seen, return_inverse=True)
+    joint = live.joint([pose], who)
+    residual, J_x, J_m = pose_landmark(
+        graph.poses[np.full(len(seen), pose)], graph.landmarks[seen], s.measured[sightings]
+    )
+    J = np.concatenate([J_x, J_m], axis=2)
+    rows = np.concatenate(
+        [np.tile(np.arange(3), (len(at), 1)), 3 + 2 * at[:, None] + np.arange(2)], axis=1
+    )
+    Q = J @ joint[rows[:, :, None], rows[:, None, :]] @ np.swapaxes(J, 1, 2)
+    w = _weights(graph, s.kinds[sightings], chi2(residual, information))
+    out: Array = Q @ information * w[:, None, None]
+    return out
+
+
+def _weights(graph: Graph, kinds: NDArray[np.int64], s: Array) -> Array:
+    """What the losses leave of factors (k,) with squared norms ``s`` (k,)."""
+    losses = graph.losses.in_order()
+    of = [losses[code] for code in kinds.tolist()]
+    return np.array(
+        [loss(int(one.kind), one.scale, v)[1] for one, v in zip(of, s.tolist(), strict=True)]
+    )

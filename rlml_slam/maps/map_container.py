@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The file of a map: named arrays and a description, with one checksum over all of it.
+
+A header of 64 bytes, then a zip archive, which other tools open as well: ``description.json`` and
+a ``NAME.npy`` for each array (numpy's format, without pickled objects). The header, little-endian:
+
+    8 bytes   ``RLMLMAP`` and the version of this layout
+    8 bytes   length of the archive [bytes]
+    32 bytes  SHA-256 of the archive
+    16 bytes  the first 16 of the SHA-256 of the 48 bytes before
+
+So a file that is too short, too long or changed in any bit is told from a whole one before
+anything of it is used.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import struct
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from rlml_slam.errors import FileFormatError, MapError
+from rlml_slam.maps.atomic_file import write_atomically
+
+MAGIC, VERSION = b'RLMLMAP', 1
+HEAD = struct.Struct('<7sBQ32s')
+SIZE = HEAD.size + 16
+DESCRIPTION = 'description.json'
+PREVIOUS = '.previous'
+PACKED = 1 << 16  # bytes; smaller arrays are not worth a compressor's start
+PLAIN = frozenset('f')  # kinds of numbers that hardly get smaller: measurements
+
+
+class Content(NamedTuple):
+    """Arrays by name, and whatever JSON can tell of them."""
+
+    arrays: Mapping[str, NDArray[Any]]
+    description: Mapping[str, Any]
+
+
+def write(path: str | Path, content: Content) -> Path:
+    """Write a file, whole or not at all; the one that it replaces stays as ``path.previous``.
+
+    At every moment one of the two is whole, whatever happens. Raises MapError if it cannot be
+    written; then the old one is untouched.
+    """
+    path = Path(path)
+    body = _archive(content)
+    head = HEAD.pack(MAGIC, VERSION, len(body), hashlib.sha256(body).digest())
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise MapError(f'{path}: cannot be written: {e.strerror or e}') from e
+    check = hashlib.sha256(head).digest()[:16]
+    write_atomically(path, head, check, body, before=_keep_previous)
+    return path
+
+
+def _keep_previous(path: Path) -> None:
+    """Give the file that is there a second name, in one step: it is never without one.
+
+    A damaged one is not kept in the place of a good one.
+    """
+    previous = path.with_name(path.name + PREVIOUS)
+    if not path.exists() or (previous.exists() and not _is_whole(path)):
+        return
+    second = path.with_name(f'.{path.name}{PREVIOUS}.{os.getpid()}')
+    second.unlink(missing_ok=True)
+    os.link(path, second)
+    os.replace(second, previous)
+
+
+def _is_whole(path: Path) -> bool:
+    try:
+        _body(path)
+    except (MapError, FileFormatError):
+        return False
+    return True
+
+
+def _archive(content: Content) -> memoryview:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, 'w', compresslevel=1) as archive:
+        text = json.dumps(content.description, indent=1, sort_keys=True)
+        archive.writestr(_member(DESCRIPTION), text.encode())
+        for name, array in content.arrays.items():
+            plain = array.dtype.kind in PLAIN or array.nbytes < PACKED
+            member = _member(f'{name}.npy', zipfile.ZIP_STORED if plain else zipfile.ZIP_DEFLATED)
+            with archive.open(member, 'w', force_zip64=array.nbytes > 1 << 30) as f:
+                npy.write_array(f, np.ascontiguousarray(array), allow_pickle=False)
+    return out.getbuffer()
+
+
+def _member(name: str, method: int = zipfile.ZIP_STORED) -> zipfile.ZipInfo:
+    """A member without a date, so that equal maps are equal files."""
+    info = zipfile.ZipInfo(name)
+    info.compress_type = method
+    return info
+
+
+def read(path: str | Path) -> Content:
+    """The content of a file, checked as a whole before anything is used.
+
+    Raises MapError if there is none, FileFormatError saying what is wrong with it and, where there
+    is one, which older file is whole.
+    """
+    path = Path(path)
+    try:
+        return _content(path)
+    except FileFormatError as e:
+        previous = path.with_name(path.name + PREVIOUS)
+        if previous.exists() and _is_whole(previous):
+            raise FileFormatError(f'{e}; the map before it is whole: {previous}') from e
+        raise
+
+
+def _body(path: Path) -> memoryview:
+    """The archive in a file, after all checks."""
+    try:
+        data = memoryview(path.read_bytes())
+    except OSError as e:
+        raise MapError(f'{path}: cannot be read: {e.strerror or e}') from e
+    if bytes(data[:7]) != MAGIC or len(data) < SIZE:
+        raise FileFormatError(f'{path}: not a map, or cut off within its first {SIZE} bytes')
+    head = bytes(data[: HEAD.size])
+    if hashlib.sha256(head).digest()[:16] != data[HEAD.size : SIZE]:
+        raise FileFormatError(f'{path}: damaged: the header does not fit its checksum')
+    _, version, length, checksum = HEAD.unpack(head)
+    if version != VERSION:
+        raise FileFormatError(f'{path}: layout {version}, this program reads {VERSION}')
+    body = data[SIZE:]
+    if len(body) != length:
+        raise FileFormatError(f'{path}: damaged: {len(body)} bytes instead of {length}')
+    if hashlib.sha256(body).digest() != checksum:
+        raise FileFormatError(f'{path}: damaged: the content does not fit its checksum')
+    return body
+
+
+def _content(path: Path) -> Content:
+    body = _body(path)
+    arrays: dict[str, NDArray[Any]] = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(body)) as archive:
+            description = json.loads(archive.read(DESCRIPTION))
+            for name in archive.namelist():
+                if name.endswith('.npy'):
+                    with archive.open(name) as f:
+                        arrays[name.removesuffix('.npy')] = npy.read_array(f, allow_pickle=False)
+    # a checksum that fits says that the file is as it was written, not that we wrote it
+    except (zipfile.BadZipFile, zlib.error, KeyError, ValueError, EOFError, OSError) as e:
+        raise FileFormatError(f'{path}: not a map of this program: {e}') from e
+    return Content(arrays, description)

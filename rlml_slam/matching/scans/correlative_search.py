@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Correlative search: exhaustive in a small window around a prior."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam.compiled import brief, kernel
+from rlml_slam.matching.scans.branch_and_bound import Candidate
+from rlml_slam.matching.scans.submap import LEVELS, P_MAX, P_MIN, Submap
+from rlml_slam.se2 import Array, wrap
+
+
+def window(
+    submap: Submap,
+    points: Array,
+    pose: Array,
+    half_width: float,
+    half_angle: float,
+    whitening: Array | None = None,
+    prior_scale: float = 3.0,
+    share: float = 0.05,
+    stride: int = 1,
+) -> Candidate:
+    """The best pose on a lattice around ``pose`` (3,), ties to the nearest.
+
+    The objective is the mean of M less prior_loss(): where the scan does not tell (along a
+    corridor), the prior does. Without ``whitening`` (3, 3) it is the scan alone.
+
+    ``points`` (n, 2) in the base frame. Shifts are multiples of ``stride`` cells; the angular
+    step moves the mean end point by as much.
+    """
+    spacing = stride * submap.resolution
+    n = round(half_width / spacing)
+    reach = float(np.mean(np.hypot(points[:, 0], points[:, 1]))) if len(points) else 1.0
+    step = min(max(spacing / max(reach, spacing), 0.005 * stride), 0.05 * stride)
+    m = math.ceil(half_angle / step)
+    step = half_angle / m if m else 0.0
+    j, i = submap.corner
+    x, y, theta, total = search_window(
+        submap.values, float(j), float(i), 1.0 / submap.resolution, points, pose, n, stride, m,
+        step, np.zeros((3, 3)) if whitening is None else whitening, prior_scale,
+        share * len(points) * LEVELS / (P_MAX - P_MIN),
+    )  # fmt: skip
+    score = P_MIN + (P_MAX - P_MIN) * total / (LEVELS * max(len(points), 1))
+    return Candidate(np.array([x, y, float(wrap(theta))]), score)
+
+
+@brief
+def prior_loss(x: float, y: float, turn: float, whitening: Array, prior_scale: float) -> float:
+    """Sum over u = whitening @ (x, y, turn) of v^2 / (1 + v^2), v = u_k / prior_scale."""
+    loss = 0.0
+    for h in range(3):
+        u = (whitening[h, 0] * x + whitening[h, 1] * y + whitening[h, 2] * turn) / prior_scale
+        loss += u * u / (1.0 + u * u)
+    return loss
+
+
+@kernel
+def search_window(
+    values: NDArray[np.uint16],
+    corner_j: float,
+    corner_i: float,
+    scale: float,
+    points: Array,
+    pose: Array,
+    n: int,
+    stride: int,
+    m: int,
+    step: float,
+    whitening: Array,
+    prior_scale: float,
+    unit: float,
+) -> tuple[float, float, float, int]:
+    """Exhaustive sum of cell values over (2 n + 1)^2 shifts and 2 m + 1 angles.
+
+    ``unit`` is the sum of cell values that a component far from the prior costs.
+    """
+    width, reach = 2 * n + 1, n * stride
+    rows, columns = values.shape
+    flat = values.reshape(-1)
+    sums = np.empty((width, width), dtype=np.int64)
+    offsets = np.empty(len(points), dtype=np.int64)
+    best, best_distance = -np.inf, 0.0
+    best_a = best_j = best_i = best_sum = 0
+    for a in range(-m, m + 1):
+        c, s = np.cos(pose[2] + a * step), np.sin(pose[2] + a * step)
+        sums[:] = 0
+        inside = 0
+        for k in range(len(points)):
+            px, py = points[k, 0], points[k, 1]
+            u = (pose[0] + c * px - s * py) * scale - corner_j
+            v = (pose[1] + s * px + c * py) * scale - corner_i
+            j, i = int(np.floor(u)) - reach, int(np.floor(v)) - reach
+            if j >= 0 and i >= 0 and j + 2 * reach < columns and i + 2 * reach < rows:
+                offsets[inside] = i * columns + j
+                inside += 1
+            else:
+                add_block(values, j, i, stride, sums)
+        for r in range(width):
+            for q in range(width):
+                shift = (r * columns + q) * stride
+                total = 0
+                for k in range(inside):
+                    total += flat[np.uint64(offsets[k] + shift)]
+                sums[r, q] += total
+        for r in range(width):
+            for q in range(width):
+                di, dj = (r - n) * stride, (q - n) * stride
+                distance = di * di + dj * dj + a * a
+                loss = prior_loss(dj / scale, di / scale, a * step, whitening, prior_scale)
+                value = sums[r, q] - unit * loss
+                if value > best or (value == best and distance < best_distance):
+                    best, best_distance, best_sum = value, distance, sums[r, q]
+                    best_a, best_j, best_i = a, dj, di
+    return pose[0] + best_j / scale, pose[1] + best_i / scale, pose[2] + best_a * step, best_sum
+
+
+@kernel
+def add_block(
+    values: NDArray[np.uint16], j: int, i: int, stride: int, sums: NDArray[np.int64]
+) -> None:
+    """Add the cells (i, j), (i, j + stride) ... of a square to ``sums``; 0 outside the grid."""
+    rows, columns = values.shape
+    width = len(sums)
+    for r in range(width):
+        y = i + r * stride
+        if 0 <= y < rows:
+            for q in range(width):
+                x = j + q * stride
+                if 0 <= x < columns:
+                    sums[r, q] += values[y, x]
+
+
+def warm_up() -> None:
+    """Compile the kernels with the signatures that are used at run time."""
+    submap = Submap()
+    points = np.array([[1.0, 0.5], [-0.5, 1.0], [0.3, -0.8]])
+    submap.insert(points, np.zeros(2))
+    window(submap, points, np.zeros(3), 0.1, 0.1)

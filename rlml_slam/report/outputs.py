@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The files of a run; each appears whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rlml_slam.datasets.tum import Trajectory, write_tum
+from rlml_slam.errors import MapError
+from rlml_slam.evaluation.metrics import judge, metrics
+from rlml_slam.evaluation.run_record import Run
+from rlml_slam.maps import map_container, reflector_file
+from rlml_slam.maps.atomic_file import write_atomically
+from rlml_slam.maps.occupancy import UNKNOWN, OccupancyGrid, save
+from rlml_slam.slam.landmarks.reflector_states import state_table
+
+
+def write_outputs(run: Run, folder: str | Path) -> dict[str, Any]:
+    """Write all results and pictures of a run into a folder; the figures of metrics.json.
+
+    trajectory.tum, front_end.tum, map.rlml, map.pgm, map.yaml, reflectors.csv,
+    reflector_states.csv and closures.csv depend on the data alone: two replays give the same
+    bytes. Raises MapError if the folder cannot be written.
+    """
+    folder = make_folder(folder)
+    write_tum(folder / 'trajectory.tum', run.trajectory)
+    write_tum(folder / 'front_end.tum', run.frames.trajectory())
+    save(run.grid if run.grid is not None else unknown_grid(run.trajectory), folder / 'map')
+    reflector_file.save(run.reflectors, folder / 'reflectors.csv')
+    if run.stored is not None:
+        map_container.write(folder / 'map.rlml', run.stored)
+    if run.closure_table:
+        write_atomically(folder / 'closures.csv', run.closure_table.encode())
+    if run.reflector_states:
+        table = state_table(run.reflector_states)
+        write_atomically(folder / 'reflector_states.csv', table.encode())
+    judged = judge(run)
+    figures = metrics(run, judged)
+    write_atomically(folder / 'metrics.json', (json.dumps(figures, indent=2) + '\n').encode())
+    write_report(run, judged, figures, folder)
+    return figures
+
+
+def make_folder(folder: str | Path) -> Path:
+    """The folder, made if need be; MapError if nothing can be written there."""
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise MapError(f'{folder}: cannot be made: {e.strerror}') from e
+    if not os.access(folder, os.W_OK):
+        raise MapError(f'{folder}: cannot be written')
+    return folder
+
+
+def write_report(run: Run, judged: Any, figures: dict[str, Any], folder: Path) -> None:
+    """Pictures as PNG, and report.html that carries the same ones inside."""
+    # matplotlib takes half a second to import, which other commands need not wait for
+    from rlml_slam.report.pictures import draw
+    from rlml_slam.report.report import report_html
+
+    pictures = draw(run, judged)
+    for name, png in pictures.items():
+        write_atomically(folder / f'{name}.png', png)
+    html = report_html(run, figures, pictures)
+    write_atomically(folder / 'report.html', html.encode())
+
+
+def unknown_grid(trajectory: Trajectory) -> OccupancyGrid:
+    """A map without any knowledge, around the trajectory: what a run without scans has.
+
+    Cells of 5 cm, or larger ones where more than 2000 of them would lie side by side.
+    """
+    xy = trajectory.poses[:, :2] if len(trajectory) else np.zeros((1, 2))
+    low, high = np.floor(xy.min(axis=0) - 1.0), np.ceil(xy.max(axis=0) + 1.0)
+    resolution = max(0.05, float((high - low).max()) / 2000.0)
+    columns, rows = np.round((high - low) / resolution).astype(int)
+    cells = np.full((rows, columns), UNKNOWN, dtype=np.int8)
+    return OccupancyGrid(resolution, (float(low[0]), float(low[1])), cells)

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Saved maps: files of one folder, never outside of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rlml_slam.errors import MapError, NoMapError
+from rlml_slam.maps import map_container, occupancy, reflector_file, survey
+from rlml_slam.maps.saved_map import SavedMap
+from rlml_slam.maps.survey import Survey
+from rlml_slam.slam.store import map_file
+
+LOST = '.lost-'
+LOST_KEPT = 10  # maps: a robot that begins anew every day must not fill its disk
+SUFFIXES = ('.rlml', '.yaml', '.csv', '.pgm')
+
+
+class MapFolder:
+    """The folder of the parameter ``map_directory``."""
+
+    def __init__(self, directory: str) -> None:
+        self._folder = Path(directory).expanduser().resolve()
+
+    def path(self, name: str) -> Path:
+        """The path of a map without its suffixes; MapError if it lies outside of the folder."""
+        name = name.removeprefix('file://')
+        for suffix in SUFFIXES:
+            name = name.removesuffix(suffix)
+        path = (self._folder / name).resolve()
+        if not name or path == self._folder or not path.is_relative_to(self._folder):
+            raise MapError(f'map {name!r} is not inside of map_directory, {self._folder}')
+        return path
+
+    def survey(self, name: str) -> Survey | None:
+        """Surveyed reflectors; None without a name. MapError or FileFormatError if unusable."""
+        if not name:
+            return None
+        path = (self._folder / name).resolve()
+        if not path.is_relative_to(self._folder):
+            raise MapError(f'survey {name!r} is not inside of map_directory, {self._folder}')
+        return survey.load(path)
+
+    def save(self, name: str, saved: SavedMap) -> Path:
+        """Write name.csv, and name.pgm with name.yaml where there is a grid.
+
+        Without one, those of an older map of the name are removed: they would be read with this.
+        """
+        path = self.path(name)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as e:
+            raise MapError(f'{path.parent}: cannot be made: {e.strerror}') from e
+        reflector_file.save(saved.reflectors, path.with_name(path.name + '.csv'))
+        if saved.grid is not None:
+            occupancy.save(saved.grid, path)
+            return path
+        for suffix in ('.yaml', '.pgm'):
+            old = path.with_name(path.name + suffix)
+            try:
+                old.unlink(missing_ok=True)
+            except OSError as e:
+                raise MapError(f'{old}: of an older map, cannot be removed: {e.strerror}') from e
+        return path
+
+    def whole(self, name: str) -> Path:
+        """The path of the one file that has everything of a map."""
+        path = self.path(name)
+        return path.with_name(path.name + '.rlml')
+
+    def lost(self, name: str, seconds: int) -> Path:
+        """The path of a map that nothing leads back to, made until a time."""
+        return self.whole(f'{name}{LOST}{seconds}')
+
+    def forget_lost(self, name: str) -> list[Path]:
+        """Remove all but the newest LOST_KEPT of these; those that were removed, oldest first.
+
+        Raises MapError where one cannot be.
+        """
+        path = self.path(name)
+        begin = path.name + LOST
+        try:
+            lost = [file for file in path.parent.glob('*.rlml') if file.name.startswith(begin)]
+            lost.sort(key=lambda file: (file.stat().st_mtime_ns, file.name))
+            for file in lost[:-LOST_KEPT]:
+                file.unlink()
+                file.with_name(file.name + map_container.PREVIOUS).unlink(missing_ok=True)
+        except OSError as e:
+            raise MapError(f'{begin}…: an old one cannot be removed: {e.strerror}') from e
+        return lost[:-LOST_KEPT]
+
+    def load(self, name: str) -> SavedMap:
+        """Read name.rlml where it is there, else name.csv and name.yaml; a suffix says which.
+
+        NoMapError names the files that are not there; MapError or FileFormatError says what is
+        wrong with which file.
+        """
+        path, whole = self.path(name), self.whole(name)
+        table = path.with_name(path.name + '.csv')
+        files = [whole, table]
+        if name.endswith(SUFFIXES):
+            files = [whole] if name.endswith('.rlml') else [table]
+        found = next((file for file in files if file.exists()), None)
+        if found is None:
+            raise NoMapError(
+                f'{path.parent}: there is no {" and no ".join(f.name for f in files)}'
+            )
+        if found == whole:
+            return map_file.saved_map(map_file.load(whole))
+        reflectors = reflector_file.load(table)
+        meta = path.with_name(path.name + '.yaml')
+        return SavedMap(reflectors, occupancy.load(meta) if meta.exists() else None)

@@ -1,0 +1,331 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bags: rosbag2 folders and files (sqlite3, mcap) and ROS 1 bags are read, rosbag2 is written.
+
+Nothing here needs a ROS installation. A message that cannot be read never costs the others.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import struct
+import tempfile
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
+
+from rosbags.interfaces import ConnectionExtRosbag1, MessageDefinitionFormat, Nodetype, Qos
+from rosbags.interfaces import QosDurability as Durability
+from rosbags.interfaces import QosHistory as History
+from rosbags.interfaces import QosLiveliness as Liveliness
+from rosbags.interfaces import QosReliability as Reliability
+from rosbags.interfaces import QosTime as Span
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag2 import Reader as Reader2
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+from rlml_slam.errors import BagError
+from rlml_slam.params import Node
+from rlml_slam.ros.bags.bag_recovery import Salvage
+from rlml_slam.ros.codecs.fast_decode import READERS
+from rlml_slam.ros.codecs.message_types import bag_types
+from rlml_slam.ros.sensor_input import STREAMS, USED_BY, topics_of
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a bag: name, type (ROS 2 spelling) and number of messages."""
+
+    name: str
+    msgtype: str
+    count: int
+
+
+class BagReader:
+    """A bag opened for reading, as a context manager.
+
+    ``topics`` by name; ``start`` and ``end`` [ns] of the recording; ``skipped`` counts, by topic,
+    the messages that ``messages`` left out because their type is unknown or they are broken;
+    ``damage`` says in one line what is wrong with a bag that could only be read in part (then
+    in the order of its file), empty for a sound one.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.skipped: Counter[str] = Counter()
+        self.damage = ''
+        self._types: dict[str, Any] = {}
+        self._todays: dict[str, bool] = {}
+        if not self.path.exists():
+            raise BagError(f'{path}: no such bag')
+        self.is_ros1 = self.path.suffix == '.bag' and not self.path.is_dir()
+        self._reader = self._open()
+        self.topics = {
+            name: Topic(name, info.msgtype or '', info.msgcount)
+            for name, info in self._reader.topics.items()
+        }
+        self.start = int(self._reader.start_time)
+        self.end = int(self._reader.end_time)
+
+    def _open(self) -> Any:
+        """The library's reader, or, for a bag that it refuses, what can be salvaged of it."""
+        try:
+            reader: Any = (Reader1 if self.is_ros1 else Reader2)(self.path)
+            reader.open()
+        except Exception as e:  # the library lets struct.error, KeyError and others through
+            try:
+                reader = Salvage(self.path)
+            except (ValueError, OSError):
+                raise BagError(f'{self.path}: not a readable bag: {_line(e)}') from e
+            self.damage = f'{self.path}: {reader.damage or _line(e)}'
+        return reader
+
+    def __enter__(self) -> BagReader:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._reader.close()
+
+    def count(self, topics: Collection[str] | None = None) -> int:
+        """Number of messages of the topics (all if None), as the bag's index says."""
+        return sum(t.count for t in self.topics.values() if topics is None or t.name in topics)
+
+    def is_latched(self, topic: str) -> bool:
+        """Whether late subscribers got the topic's last message as well."""
+        if topic.endswith('tf_static'):
+            return True
+        for c in self._reader.connections:
+            if c.topic != topic:
+                continue
+            if isinstance(c.ext, ConnectionExtRosbag1):
+                return bool(c.ext.latching)
+            offered = c.ext.offered_qos_profiles
+            return any(q.durability == Durability.TRANSIENT_LOCAL for q in offered)
+        return False
+
+    def messages(
+        self, topics: Collection[str] | None = None, whole: bool = True
+    ) -> Iterator[tuple[int, str, Any]]:
+        """Yield (log time [ns], topic, message) in log time order.
+
+        Where they need not be ``whole``, messages have the fields at least that ros/convert.py
+        reads. Raises BagError where the bag is damaged, after all that came before the damage.
+        """
+        for time, connection, raw in self._raw(topics):
+            types = self._typestore(connection)
+            if types is None:
+                self.skipped[connection.topic] += 1
+                continue
+            try:
+                message = None if whole else self._brief(connection, raw)
+                if message is None:
+                    read = types.deserialize_ros1 if self.is_ros1 else types.deserialize_cdr
+                    message = read(raw, connection.msgtype)
+            except Exception:  # a broken payload: whatever the generated code stumbles over
+                self.skipped[connection.topic] += 1
+                continue
+            yield time, connection.topic, message
+
+    def _brief(self, connection: Any, raw: bytes) -> Any:
+        """The message as far as it is needed, None where only the library can read it."""
+        read = READERS.get(connection.msgtype)
+        if read is None or self.is_ros1 or not self._is_todays(connection):
+            return None
+        try:
+            return read(raw)
+        except (ValueError, struct.error):
+            return None
+
+    def serialized(
+        self, topics: Collection[str] | None = None
+    ) -> Iterator[tuple[int, str, bytes]]:
+        """Like ``messages``, but as bytes that ROS 2 publishes as they are.
+
+        Types whose fields are others than Jazzy's are skipped.
+        """
+        for time, connection, raw in self._raw(topics):
+            topic, msgtype = connection.topic, connection.msgtype
+            if not self._is_todays(connection):
+                self.skipped[topic] += 1
+                continue
+            if not self.is_ros1:
+                yield time, topic, bytes(raw)
+                continue
+            try:
+                data = bytes(bag_types().ros1_to_cdr(raw, msgtype))
+            except Exception:  # a broken payload, as in messages
+                self.skipped[topic] += 1
+                continue
+            yield time, topic, data
+
+    def _is_todays(self, connection: Any) -> bool:
+        """Whether the type in the bag has the fields of today's; a type of others is believed."""
+        msgtype = connection.msgtype
+        if msgtype not in self._todays:
+            types, today = self._typestore(connection), bag_types()
+            if msgtype in today.fielddefs:
+                same = types is not None and _layout(types, msgtype) == _layout(today, msgtype)
+            else:
+                same = not self.is_ros1
+            self._todays[msgtype] = same
+        return self._todays[msgtype]
+
+    def _raw(self, topics: Collection[str] | None) -> Iterator[tuple[int, Any, bytes]]:
+        wanted = [c for c in self._reader.connections if topics is None or c.topic in topics]
+        if not wanted:
+            return
+        count = 0
+        try:
+            for connection, time, raw in self._reader.messages(connections=wanted):
+                count += 1
+                yield int(time), connection, raw
+        except GeneratorExit:
+            raise
+        except Exception as e:
+            raise BagError(f'{self.path}: damaged after {count} messages: {_line(e)}') from e
+
+    def _typestore(self, connection: Any) -> Any:
+        """Types of a connection's messages, None if they are unknown."""
+        if connection.msgtype not in self._types:
+            self._types[connection.msgtype] = self._learn(connection)
+        return self._types[connection.msgtype]
+
+    def _learn(self, connection: Any) -> Any:
+        if connection.msgdef.format == MessageDefinitionFormat.NONE:
+            standard = get_typestore(Stores.ROS1_NOETIC) if self.is_ros1 else bag_types()
+            return standard if connection.msgtype in standard.fielddefs else None
+        # a store of its own, so that one strange definition cannot clash with the others
+        types = get_typestore(Stores.EMPTY)
+        try:
+            if connection.msgdef.format == MessageDefinitionFormat.MSG:
+                types.register(get_types_from_msg(connection.msgdef.data, connection.msgtype))
+            else:
+                types.register(get_types_from_idl(connection.msgdef.data))
+        except Exception:
+            return None
+        return types
+
+
+def _layout(types: Any, msgtype: str) -> Any:
+    """The fields of a type, with those of its parts in place of their names."""
+    if msgtype == 'std_msgs/msg/Header':  # that of ROS 1 has a counter, which is left out
+        return msgtype
+
+    def part(description: Any) -> Any:
+        kind, what = description
+        if kind == Nodetype.NAME:
+            return _layout(types, what)
+        return (kind, what) if kind == Nodetype.BASE else (kind, part(what[0]), what[1])
+
+    return [(name, part(description)) for name, description in types.fielddefs[msgtype][1]]
+
+
+def _line(error: Exception) -> str:
+    text = str(error).strip().splitlines()
+    return text[0] if text else type(error).__name__
+
+
+def choose_topics(topics: Mapping[str, Topic], node: Node) -> dict[str, str]:
+    """Which topic of a bag feeds which stream of the sequencer (keys of STREAMS).
+
+    By the parameter's name, else by that name inside a namespace, else the only topic of the
+    type. Streams that the parameters switch off are left out. Raises BagError, listing the
+    topics, if several fit or if there is neither a scan nor a reflector stream.
+    """
+    chosen: dict[str, str] = {}
+    for stream, (parameter, msgtype, fallback) in STREAMS.items():
+        if not getattr(node, USED_BY[stream]):
+            continue
+        name = topics_of(node, stream)[0].strip('/')
+        typed = [t.name for t in topics.values() if t.msgtype == msgtype and t.count]
+        fitting = (
+            [t for t in typed if t.strip('/') == name]
+            or [t for t in typed if t.endswith(f'/{name}')]
+            or (typed if fallback else [])
+        )
+        if len(fitting) > 1:
+            raise BagError(
+                f'several topics fit {stream}: {", ".join(sorted(fitting))}; '
+                f'name one with the parameter {parameter}'
+            )
+        if fitting:
+            chosen[stream] = fitting[0]
+    if not chosen.keys() & {'scan', 'reflectors', 'reflector_poses'}:
+        listed = ', '.join(f'{t.name} ({t.msgtype})' for t in topics.values()) or 'nothing'
+        raise BagError(f'no scan and no reflectors in the bag, which has {listed}')
+    return chosen
+
+
+_FOREVER = Span(2147483647, 4294967295)
+LATCHED = Qos(
+    History.KEEP_LAST, 1, Reliability.RELIABLE, Durability.TRANSIENT_LOCAL,
+    _FOREVER, _FOREVER, Liveliness.AUTOMATIC, _FOREVER, False,
+)  # fmt: skip
+
+
+class BagWriter:
+    """A new rosbag2 folder, as a context manager: it appears whole or, after an error, not at all.
+
+    The same messages in the same order give the same bytes.
+    """
+
+    def __init__(self, path: str | Path, storage: Literal['mcap', 'sqlite3'] = 'mcap') -> None:
+        self.path = Path(path)
+        if self.path.exists():
+            raise BagError(f'{path}: exists already and is not overwritten')
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._folder = Path(tempfile.mkdtemp(prefix='.bag-', dir=self.path.parent))
+            plugin = StoragePlugin.MCAP if storage == 'mcap' else StoragePlugin.SQLITE3
+            self._writer = Writer(self._folder / self.path.name, version=9, storage_plugin=plugin)
+            self._writer.open()
+        except OSError as e:
+            raise BagError(f'{path}: cannot be written: {e.strerror}') from e
+        self._connections: dict[str, Any] = {}
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def add_topic(self, topic: str, msgtype: str, latched: bool = False) -> None:
+        """Announce a topic; ``latched`` ones are offered transient local."""
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(
+                topic, msgtype, typestore=bag_types(),
+                offered_qos_profiles=[LATCHED] if latched else (),
+            )  # fmt: skip
+
+    def write(self, topic: str, message: Any, log_time: int) -> None:
+        """Append a message made by ``messages.make_bag``; unannounced topics are added."""
+        msgtype = message.__msgtype__
+        self.add_topic(topic, msgtype)
+        data = bag_types().serialize_cdr(message, msgtype)
+        try:
+            self._writer.write(self._connections[topic], int(log_time), data)
+        except OSError as e:
+            raise BagError(f'{self.path}: cannot be written: {e.strerror}') from e
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            if kind is None:
+                self._writer.close()
+                os.rename(self._folder / self.path.name, self.path)
+            else:
+                self._writer.abort()
+        except OSError as e:
+            raise BagError(f'{self.path}: cannot be written: {e.strerror}') from e
+        finally:
+            shutil.rmtree(self._folder, ignore_errors=True)

@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages become core types. Fields are read by name, whoever made the message.
+
+So the same functions read rclpy's messages and those that rosbags reads from ROS 1 and ROS 2
+bags. Each raises InputError that names topic and field where a message cannot be believed; what
+can be judged only in context (order of stamps, known frames) is left to the sequencer.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam.errors import InputError
+from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.params import Reflector
+from rlml_slam.ros.codecs.point_cloud import column, read_cloud
+from rlml_slam.se2 import Array
+from rlml_slam.types import ANONYMOUS, Detections, Imu, Odometry, Scan
+
+MAX_TILT = 0.35  # [rad] a larger roll or pitch is not a planar pose
+MIN_UPRIGHT = math.cos(MAX_TILT)
+_PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # (x, y, yaw) of ROS's 6 x 6 covariances
+MAX_VARIANCE = 1e6  # [m^2], [rad^2] of a start: from 1e9 or so, updates lose all their digits
+_ROUNDING = 1e-9  # of the largest variance
+FARTHEST = 1e4  # [m] beyond any laser
+_NEAR = 1e-3  # [m] nearer than this a bearing has no meaning
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """A pose (3,) with covariance (3, 3) in ``frame_id`` at a stamp."""
+
+    stamp: int
+    frame_id: str
+    pose: Array
+    cov: Array
+
+
+@dataclass(frozen=True)
+class Transform:
+    """Where ``child`` sits in ``parent``: ``R`` (3, 3) and ``t`` (3,) of T_parent_child."""
+
+    parent: str
+    child: str
+    R: Array
+    t: Array
+
+
+def frame(frame_id: str) -> str:
+    """A frame id without the leading slash that ROS 1 allowed."""
+    return frame_id.lstrip('/')
+
+
+def stamp(msg: Any, topic: str) -> int:
+    """The header's stamp [ns]; InputError if it is zero or negative."""
+    t = msg.header.stamp
+    ns = int(t.sec) * 1_000_000_000 + int(t.nanosec)
+    if ns <= 0:
+        raise InputError(f'{topic}: header.stamp is {ns} ns')
+    return ns
+
+
+def scan(msg: Any, topic: str = 'scan') -> Scan:
+    """LaserScan; ranges are passed on as they are, NaN and Inf included.
+
+    A range_max of Inf says that the driver does not know it, not that Inf is a range.
+    """
+    ranges = np.array(msg.ranges, dtype=np.float32)
+    intensities = np.array(msg.intensities, dtype=np.float32)
+    if intensities.size and intensities.shape != ranges.shape:
+        raise InputError(f'{topic}: {len(intensities)} intensities for {len(ranges)} ranges')
+    return Scan(
+        stamp(msg, topic),
+        frame(msg.header.frame_id),
+        float(msg.angle_min),
+        float(msg.angle_increment),
+        float(msg.time_increment),
+        float(msg.range_min),
+        min(float(msg.range_max), FARTHEST),
+        ranges,
+        intensities,
+    )
+
+
+def odometry(msg: Any, topic: str = 'odom') -> Odometry:
+    """Odometry: its planar pose."""
+    return Odometry(stamp(msg, topic), planar_pose(msg.pose.pose, f'{topic}: pose'))
+
+
+def imu(msg: Any, topic: str = 'imu', up: Array | None = None) -> Imu:
+    """Imu: the yaw rate about the base z axis, which is ``up`` (3,) in the IMU's frame."""
+    if msg.angular_velocity_covariance[0] == -1.0:
+        raise InputError(f'{topic}: angular_velocity is marked as not measured')
+    w = msg.angular_velocity
+    rate = w.z if up is None else float(up @ [w.x, w.y, w.z])
+    if not np.isfinite(rate):
+        raise InputError(f'{topic}: angular_velocity is not finite')
+    return Imu(stamp(msg, topic), float(rate))
+
+
+def detections(msg: Any, noise: Reflector, topic: str = 'reflectors') -> Detections:
+    """PointCloud2 of reflectors in the sensor's frame; an empty cloud is "looked and saw none".
+
+    x, y are required; id, diameter, sigma_range [m] and sigma_bearing [rad] are optional, and
+    ``noise`` stands in for the sigmas where they are missing, NaN or not positive. Points that
+    are not finite are absent points in a cloud that is not dense, and an error in a dense one.
+    """
+    cloud = read_cloud(msg, topic)
+    missing = {'x', 'y'} - set(cloud.dtype.names or ())
+    if missing and len(cloud):
+        raise InputError(f'{topic}: cloud has no field {", ".join(sorted(missing))}')
+    points = np.stack([column(cloud, 'x', np.nan), column(cloud, 'y', np.nan)], -1)
+    finite = np.isfinite(points).all(-1)
+    if msg.is_dense and not finite.all():
+        raise InputError(f'{topic}: {np.sum(~finite)} points of a dense cloud are not finite')
+    ids = column(cloud, 'id', ANONYMOUS)[finite]
+    known = np.isfinite(ids) & (ids >= 0)
+    diameters = column(cloud, 'diameter', np.nan)[finite]
+    sigma_r = _positive(column(cloud, 'sigma_range', np.nan)[finite], noise.sigma_range)
+    sigma_b = _positive(column(cloud, 'sigma_bearing', np.nan)[finite], noise.sigma_bearing)
+    points = points[finite]
+    return Detections(
+        stamp(msg, topic),
+        frame(msg.header.frame_id),
+        points,
+        polar_covariance(points, sigma_r, sigma_b, noise.sigma_fallback),
+        np.where(known, ids, ANONYMOUS).astype(np.int64),
+        _positive(diameters, np.nan),
+    )
+
+
+def detections_of_poses(msg: Any, noise: Reflector, topic: str = 'reflector_poses') -> Detections:
+    """PoseArray of anonymous reflectors; only the positions are read."""
+    points = np.array([[p.position.x, p.position.y] for p in msg.poses], dtype=np.float64)
+    points = points.reshape(-1, 2)
+    if not np.isfinite(points).all():
+        raise InputError(f'{topic}: a position is not finite')
+    n = len(points)
+    sigma_r, sigma_b = np.full(n, noise.sigma_range), np.full(n, noise.sigma_bearing)
+    return Detections(
+        stamp(msg, topic),
+        frame(msg.header.frame_id),
+        points,
+        polar_covariance(points, sigma_r, sigma_b, noise.sigma_fallback),
+        np.full(n, ANONYMOUS, dtype=np.int64),
+        np.full(n, np.nan),
+    )
+
+
+def _positive(values: Array, otherwise: float) -> Array:
+    return np.where(np.isfinite(values) & (values > 0.0), values, otherwise)
+
+
+def polar_covariance(points: Array, sigma_r: Array, sigma_b: Array, fallback: float) -> Array:
+    """R diag(sigma_r^2, (r sigma_b)^2) R^T (n, 2, 2), R the rotation by the bearing.
+
+    At the sensor itself, where there is no bearing, it is fallback^2 I.
+    """
+    r = np.hypot(points[:, 0], points[:, 1])
+    near = r < _NEAR
+    u = points / np.where(near, 1.0, r)[:, None]
+    t = np.stack([-u[:, 1], u[:, 0]], -1)
+    cov = (sigma_r**2)[:, None, None] * u[:, :, None] * u[:, None, :]
+    cov += ((r * sigma_b) ** 2)[:, None, None] * t[:, :, None] * t[:, None, :]
+    cov[near] = fallback**2 * np.eye(2)
+    return cov
+
+
+def pose_estimate(msg: Any, topic: str = 'pose') -> PoseEstimate:
+    """PoseWithCovarianceStamped or Odometry: planar pose and covariance."""
+    cov = _planar_covariance(msg, topic)
+    return PoseEstimate(
+        stamp(msg, topic),
+        frame(msg.header.frame_id),
+        planar_pose(msg.pose.pose, f'{topic}: pose'),
+        0.5 * (cov + cov.T),
+    )
+
+
+def start_pose(msg: Any, map_frame: str, topic: str = 'initialpose') -> PoseEstimate:
+    """The pose_estimate to begin at: stamp 0 means now, an empty frame_id ``map_frame``.
+
+    InputError also for any other frame, and for a covariance that is not symmetric positive
+    semidefinite or has a variance above MAX_VARIANCE.
+    """
+    in_frame, map_frame = frame(msg.header.frame_id), frame(map_frame)
+    if in_frame not in ('', map_frame):
+        raise InputError(f'{topic}: header.frame_id is {in_frame!r} instead of {map_frame!r}')
+    cov, where = _planar_covariance(msg, topic), f'{topic}: pose.covariance'
+    most = float(np.diag(cov).max())
+    if most > MAX_VARIANCE:
+        raise InputError(f'{where} has a variance of {most:.3g}, above {MAX_VARIANCE:.3g}')
+    if np.abs(cov - cov.T).max() > _ROUNDING * most:
+        raise InputError(f'{where} is not symmetric')
+    cov = 0.5 * (cov + cov.T)
+    least = float(np.linalg.eigvalsh(cov)[0])
+    if least < -_ROUNDING * most:
+        raise InputError(f'{where} has the eigenvalue {least:.3g}, below 0')
+    t = msg.header.stamp
+    time = 0 if int(t.sec) == int(t.nanosec) == 0 else stamp(msg, topic)
+    pose = planar_pose(msg.pose.pose, f'{topic}: pose')
+    return PoseEstimate(time, map_frame, pose, cov)
+
+
+def _planar_covariance(msg: Any, topic: str) -> Array:
+    """(3, 3) of x, y and yaw as it is told: finite, without a negative variance."""
+    full = np.asarray(msg.pose.covariance, dtype=np.float64)
+    cov = np.array(full.reshape(6, 6)[_PLANAR])
+    if not np.isfinite(cov).all() or (np.diag(cov) < 0.0).any():
+        raise InputError(f'{topic}: pose.covariance is not a covariance')
+    return cov
+
+
+def twist(msg: Any, topic: str = 'cmd_vel') -> tuple[float, float]:
+    """Speed [m/s] and turn rate [rad/s] of a Twist or TwistStamped."""
+    t = getattr(msg, 'twist', msg)
+    v, w = float(t.linear.x), float(t.angular.z)
+    if not np.isfinite([v, w]).all():
+        raise InputError(f'{topic}: twist is not finite')
+    return v, w
+
+
+def transforms(msg: Any, topic: str = '/tf_static') -> list[Transform]:
+    """The transforms of a TFMessage, or the one of a TransformStamped."""
+    out = []
+    for m in msg.transforms if hasattr(msg, 'transforms') else [msg]:
+        where = f'{topic}: {m.header.frame_id} to {m.child_frame_id}'
+        v = m.transform.translation
+        t = np.array([v.x, v.y, v.z], dtype=np.float64)
+        if not np.isfinite(t).all():
+            raise InputError(f'{where}: translation is not finite')
+        R = rotation_matrix(m.transform.rotation, where)
+        out.append(Transform(frame(m.header.frame_id), frame(m.child_frame_id), R, t))
+    return out
+
+
+def planar_pose(pose: Any, where: str) -> Array:
+    """(x, y, yaw) of a Pose; z and a small tilt are left out, a large tilt is an InputError."""
+    x, y = float(pose.position.x), float(pose.position.y)
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise InputError(f'{where}.position is not finite')
+    return np.array([x, y, yaw(rotation_matrix(pose.orientation, where), where)])
+
+
+def yaw(R: NDArray[np.float64], where: str) -> float:
+    """Angle of a rotation (3, 3) about z; InputError if it tilts by more than MAX_TILT."""
+    if R[2, 2] < MIN_UPRIGHT:
+        tilt = np.degrees(np.arccos(np.clip(R[2, 2], -1.0, 1.0)))
+        raise InputError(f'{where} is not planar: it tilts by {tilt:.0f} degrees')
+    return math.atan2(R[1, 0], R[0, 0])
+
+
+def rotation_matrix(q: Any, where: str) -> Array:
+    """R (3, 3) of a quaternion of about unit length; InputError otherwise."""
+    x, y, z, w = float(q.x), float(q.y), float(q.z), float(q.w)
+    norm = math.hypot(x, y, z, w)
+    if not abs(norm - 1.0) < 0.01:  # also true for NaN
+        raise InputError(f'{where}: quaternion has the length {norm:.3g} instead of 1')
+    x, y, z, w = x / norm, y / norm, z / norm, w / norm
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def occupancy_grid(msg: Any, topic: str) -> OccupancyGrid | None:
+    """An OccupancyGrid that is not turned; None where it has no cells."""
+    info, cells = msg.info, np.asarray(msg.data, dtype=np.int8)
+    rows, columns = int(info.height), int(info.width)
+    if rows * columns == 0:
+        return None
+    x, y = float(info.origin.position.x), float(info.origin.position.y)
+    resolution = float(info.resolution)
+    if len(cells) != rows * columns or not (resolution > 0.0 and np.isfinite(resolution + x + y)):
+        raise InputError(f'{topic}: {len(cells)} cells do not fill {rows} x {columns} of a map')
+    if abs(float(info.origin.orientation.z)) > 1e-6:
+        raise InputError(f'{topic}: a map that is turned cannot be used')
+    # the message has 32 bits for it, of 0.05 m as well
+    return OccupancyGrid(round(resolution, 7), (x, y), cells.reshape(rows, columns))

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A front end's frame on its way to the back end, as clouds that RViz shows as well.
+
+``frames`` has one point, the local pose, whose fields are all figures of the frame, exactly.
+``deskewed_points`` are the end points of its scan, ``reflectors/associated`` its detections, both
+in the base frame. The back end sees no sensor: it works on what the front end saw.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from rlml_slam.errors import InputError
+from rlml_slam.motion import compose_motion
+from rlml_slam.ros.codecs import encode
+from rlml_slam.ros.codecs.decode import stamp
+from rlml_slam.ros.codecs.message_types import Make
+from rlml_slam.ros.codecs.point_cloud import build_cloud, read_cloud
+from rlml_slam.ros.codecs.reflector_clouds import Associated
+from rlml_slam.se2 import Array
+from rlml_slam.types import Frame, Health, Level, Motion, Observation
+
+MAX_BEHIND = 20  # frames that may overtake one whose points or detections are still on their way
+
+# x, y, z for RViz; odom_pose is NaN without odometry; the health's reasons are on /diagnostics
+RECORD = np.dtype(
+    [
+        ('x', '<f4'), ('y', '<f4'), ('z', '<f4'),
+        ('session', '<u4'), ('has_points', 'u1'), ('has_detections', 'u1'),
+        ('T_local_base', '<f8', (3,)), ('cov_local', '<f8', (9,)),
+        ('T_map_base', '<f8', (3,)), ('cov_map', '<f8', (9,)),
+        ('odom_pose', '<f8', (3,)), ('origin', '<f8', (2,)),
+        ('delta', '<f8', (3,)), ('cov', '<f8', (9,)), ('known', 'u1'),
+        ('bias_gain', '<f8', (3,)), ('bias', '<f8'), ('bias_var', '<f8'),
+        ('level', 'u1'), ('scan_score', '<f8'), ('scan_used', 'u1'), ('chi2', '<f8'),
+        ('doubtful', 'u1'), ('jumped', 'u1'),
+        ('iterations', '<i4'), ('wall_ms', '<f8'),
+    ]
+)  # fmt: skip
+POINT = np.dtype([('x', '<f4'), ('y', '<f4'), ('z', '<f4')])
+_FRAME = ('T_local_base', 'cov_local', 'T_map_base', 'cov_map')
+_FIGURES = ('scan_score', 'scan_used', 'doubtful', 'jumped', 'chi2', 'iterations', 'wall_ms')
+_MOTION = ('delta', 'cov', 'known', 'bias_gain', 'bias', 'bias_var')
+
+
+@dataclass(frozen=True)
+class Record:
+    """A frame without its points and detections, and which of the two it has.
+
+    ``session`` is another one when the front end began anew: so did its local frame. A frame that
+    is ``paused`` tells where the robot is, and nothing of the map.
+    """
+
+    session: int
+    frame: Frame
+    has_points: bool
+    has_detections: bool
+    paused: bool = False
+
+
+def build_record(make: Make, frame: Frame, session: int, local_frame: str) -> Any:
+    """PointCloud2 of one point with every figure of the frame."""
+    observation = frame.observation
+    r = np.zeros(1, dtype=RECORD)
+    r['x'], r['y'] = frame.T_local_base[:2]
+    r['session'] = session
+    r['has_points'] = observation.points is not None
+    r['has_detections'] = observation.detections is not None
+    r['odom_pose'] = np.nan if observation.odom_pose is None else observation.odom_pose
+    r['origin'] = np.nan if observation.origin is None else observation.origin
+    r['level'] = int(frame.health.level)
+    for names, source in ((_FRAME, frame), (_FIGURES, frame), (_MOTION, observation.motion)):
+        for name in names:
+            r[name] = np.reshape(getattr(source, name), r[name].shape)
+    return build_cloud(make, encode.header(make, frame.stamp, local_frame), r)
+
+
+def read_record(msg: Any, topic: str = 'frames') -> Record:
+    """The inverse of build_record; InputError if it is another kind of cloud."""
+    cloud = read_cloud(msg, topic)
+    missing = set(RECORD.names or ()) - set(cloud.dtype.names or ())
+    if missing or len(cloud) != 1:
+        raise InputError(f'{topic}: not one frame; missing {", ".join(sorted(missing)) or "none"}')
+    r, time = cloud[0], stamp(msg, topic)
+
+    def array(name: str) -> Array:
+        value = np.array(r[name], dtype=np.float64)
+        return value.reshape(3, 3) if value.size == 9 else value
+
+    motion = Motion(
+        array('delta'),
+        array('cov'),
+        bool(r['known']),
+        array('bias_gain'),
+        float(r['bias']),
+        float(r['bias_var']),
+    )
+    odom_pose = None if np.isnan(r['odom_pose']).any() else array('odom_pose')
+    origin = None if np.isnan(r['origin']).any() else array('origin')
+    none = np.zeros(0, dtype=np.int64)
+    frame = Frame(
+        time,
+        Observation(time, motion, origin=origin, odom_pose=odom_pose),
+        array('T_local_base'),
+        array('cov_local'),
+        array('T_map_base'),
+        array('cov_map'),
+        none,
+        none,
+        health=Health(Level(int(r['level']))),
+        scan_score=float(r['scan_score']),
+        scan_used=bool(r['scan_used']),
+        doubtful=bool(r['doubtful']),
+        jumped=bool(r['jumped']),
+        chi2=float(r['chi2']),
+        iterations=int(r['iterations']),
+        wall_ms=float(r['wall_ms']),
+    )
+    if not (np.isfinite(frame.T_local_base).all() and np.isfinite(frame.cov_local).all()):
+        raise InputError(f'{topic}: the pose is not finite')
+    return Record(int(r['session']), frame, bool(r['has_points']), bool(r['has_detections']))
+
+
+def build_points(make: Make, time: int, base_frame: str, points: Array) -> Any:
+    """PointCloud2 of points (n, 2)."""
+    cloud = np.zeros(len(points), dtype=POINT)
+    cloud['x'], cloud['y'] = points[:, 0], points[:, 1]
+    return build_cloud(make, encode.header(make, time, base_frame), cloud)
+
+
+def read_points(msg: Any, topic: str = 'deskewed_points') -> Array:
+    """Points (n, 2)."""
+    cloud = read_cloud(msg, topic)
+    return np.stack([cloud['x'], cloud['y']], -1).astype(np.float64)
+
+
+class FrameJoin:
+    """Records, points and detections of one stamp become frames again, in the records' order.
+
+    While ``paused``, so are the frames, and their motion is added to that of the next one.
+    ``incomplete`` counts frames whose points or detections did not come.
+    """
+
+    def __init__(self) -> None:
+        self._records: deque[Record] = deque()
+        self._points: dict[int, Array] = {}
+        self._associated: dict[int, Associated] = {}
+        self._pending: Motion | None = None
+        self.paused = False
+        self.incomplete = 0
+
+    def add_points(self, time: int, points: Array) -> list[Record]:
+        """End points of a scan."""
+        self._points[time] = points
+        return self._complete()
+
+    def add_associated(self, associated: Associated) -> list[Record]:
+        """Detections with their landmarks."""
+        self._associated[associated.detections.stamp] = associated
+        return self._complete()
+
+    def add_record(self, record: Record) -> list[Record]:
+        """A frame without its points and detections; returns records whose frames are whole."""
+        self._records.append(record)
+        return self._complete()
+
+    def _complete(self) -> list[Record]:
+        out = []
+        while self._records:
+            head, time = self._records[0], self._records[0].frame.stamp
+            whole = (not head.has_points or time in self._points) and (
+                not head.has_detections or time in self._associated
+            )
+            if not whole and len(self._records) <= MAX_BEHIND:
+                break
+            self.incomplete += not whole
+            self._records.popleft()
+            frame = self._whole(head.frame, self._points.get(time), self._associated.get(time))
+            self._forget(time)
+            paused = self.paused  # once: a service sets it in a thread of its own
+            self._pending = frame.observation.motion if paused else None
+            out.append(replace(head, frame=frame, paused=paused))
+        return out
+
+    def _whole(self, frame: Frame, points: Array | None, seen: Associated | None) -> Frame:
+        motion = frame.observation.motion
+        observation = replace(
+            frame.observation,
+            motion=motion if self._pending is None else compose_motion(self._pending, motion),
+            points=points,
+            detections=None if seen is None else seen.detections,
+        )
+        if seen is None:
+            return replace(frame, observation=observation)
+        return replace(
+            frame, observation=observation, landmarks=seen.landmarks, statuses=seen.statuses
+        )
+
+    def _forget(self, time: int) -> None:
+        """What belongs to this frame or an earlier one; later stamps may be another session's."""
+        parts: tuple[dict[int, Any], ...] = (self._points, self._associated)
+        for of in parts:
+            for old in [t for t in of if t <= time]:
+                del of[old]

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reflectors between the nodes, as clouds that RViz shows: detections and the map.
+
+``reflectors/associated`` has the detections of one pose, in the base frame, with what the front
+end made of each; ``reflector_map_points`` is the map's reflectors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam.errors import InputError
+from rlml_slam.ros.codecs import encode
+from rlml_slam.ros.codecs.decode import frame, stamp
+from rlml_slam.ros.codecs.message_types import Make
+from rlml_slam.ros.codecs.point_cloud import build_cloud, read_cloud
+from rlml_slam.se2 import Array
+from rlml_slam.types import Detections, Frame, Reflectors
+
+# z = 0 for RViz; landmark is the front end's key, id the reflector's own; both -1 for none
+_PLACED = [
+    ('x', '<f4'), ('y', '<f4'), ('z', '<f4'),
+    ('cov_xx', '<f4'), ('cov_xy', '<f4'), ('cov_yy', '<f4'),
+    ('landmark', '<i4'), ('id', '<i4'), ('diameter', '<f4'),
+]  # fmt: skip
+ASSOCIATED = np.dtype([*_PLACED, ('status', '<i4')])
+MAPPED = np.dtype([*_PLACED, ('sightings', '<i4')])
+
+
+@dataclass(frozen=True)
+class Associated:
+    """Detections (n) in the base frame, their landmarks (n,) and statuses (n,)."""
+
+    detections: Detections
+    landmarks: NDArray[np.int64]
+    statuses: NDArray[np.int64]
+
+
+def build_associated(make: Make, result: Frame, base_frame: str) -> Any:
+    """PointCloud2 of the detections of a frame, which must have some (or an empty set)."""
+    d = result.observation.detections
+    assert d is not None
+    cloud = _placed(ASSOCIATED, d, result.landmarks)
+    cloud['status'] = result.statuses
+    return build_cloud(make, encode.header(make, result.stamp, base_frame), cloud)
+
+
+def build_reflector_map(make: Make, stamp: int, map_frame: str, reflectors: Reflectors) -> Any:
+    """PointCloud2 of a map's reflectors."""
+    cloud = _placed(MAPPED, reflectors, reflectors.keys)
+    cloud['sightings'] = reflectors.sightings
+    return build_cloud(make, encode.header(make, stamp, map_frame), cloud)
+
+
+def _placed(
+    dtype: np.dtype[np.void], of: Detections | Reflectors, landmarks: NDArray[np.int64]
+) -> NDArray[np.void]:
+    cloud = np.zeros(len(of), dtype=dtype)
+    cloud['x'], cloud['y'] = of.points[:, 0], of.points[:, 1]
+    cloud['cov_xx'], cloud['cov_xy'] = of.cov[:, 0, 0], of.cov[:, 0, 1]
+    cloud['cov_yy'] = of.cov[:, 1, 1]
+    cloud['landmark'], cloud['id'], cloud['diameter'] = landmarks, of.ids, of.diameters
+    return cloud
+
+
+def read_associated(msg: Any, topic: str = 'reflectors/associated') -> Associated:
+    """The inverse of build_associated; InputError if it is another kind of cloud."""
+    cloud = _read(msg, ASSOCIATED, topic)
+    points, cov = _places(cloud)
+    return Associated(
+        Detections(
+            stamp(msg, topic),
+            frame(msg.header.frame_id),
+            points,
+            cov,
+            cloud['id'].astype(np.int64),
+            cloud['diameter'].astype(np.float64),
+        ),
+        cloud['landmark'].astype(np.int64),
+        cloud['status'].astype(np.int64),
+    )
+
+
+def read_reflector_map(msg: Any, topic: str = 'reflector_map_points') -> Reflectors:
+    """The inverse of build_reflector_map; InputError if it is another kind of cloud."""
+    cloud = _read(msg, MAPPED, topic)
+    points, cov = _places(cloud)
+    return Reflectors(
+        cloud['landmark'].astype(np.int64),
+        points,
+        cov,
+        cloud['id'].astype(np.int64),
+        cloud['sightings'].astype(np.int64),
+        cloud['diameter'].astype(np.float64),
+    )
+
+
+def _read(msg: Any, dtype: np.dtype[np.void], topic: str) -> NDArray[np.void]:
+    cloud = read_cloud(msg, topic)
+    missing = set(dtype.names or ()) - set(cloud.dtype.names or ())
+    if missing:
+        raise InputError(f'{topic}: cloud has no field {", ".join(sorted(missing))}')
+    return cloud
+
+
+def _places(cloud: NDArray[np.void]) -> tuple[Array, Array]:
+    """Points (n, 2) and covariances (n, 2, 2)."""
+    cov = np.empty((len(cloud), 2, 2))
+    cov[:, 0, 0], cov[:, 1, 1] = cloud['cov_xx'], cloud['cov_yy']
+    cov[:, 0, 1] = cov[:, 1, 0] = cloud['cov_xy']
+    return np.stack([cloud['x'], cloud['y']], -1).astype(np.float64), cov

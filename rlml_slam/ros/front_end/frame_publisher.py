@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the front end publishes of a frame: poses for the robot, everything for the back end."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+
+from rlml_slam import se2
+from rlml_slam.params import Node
+from rlml_slam.ros.codecs import encode
+from rlml_slam.ros.codecs.frame_messages import build_points, build_record
+from rlml_slam.ros.codecs.markers import detection_markers
+from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
+from rlml_slam.ros.codecs.reflector_clouds import build_associated
+from rlml_slam.se2 import Array
+from rlml_slam.types import Detections, Frame
+
+CLOUD = 'sensor_msgs/msg/PointCloud2'
+TOPICS = {
+    'pose': ('geometry_msgs/msg/PoseWithCovarianceStamped', 10),
+    'odometry/filtered': ('nav_msgs/msg/Odometry', 10),
+    'deskewed_points': (CLOUD, 50),
+    'reflectors/associated': (CLOUD, 50),
+    'reflectors/statuses': ('visualization_msgs/msg/MarkerArray', 5),
+    'frames': (CLOUD, 50),
+}
+SHORT = 0.005  # [s] steps of several lidars: too short to tell a speed
+
+
+class FramePublisher:
+    """Publishes frames; ``begin_session`` tells the back end that the local frame is a new one."""
+
+    def __init__(self, node: Any, params: Node) -> None:
+        self._p = params
+        self._publishers = {
+            topic: node.create_publisher(rclpy_class(kind), topic, depth)
+            for topic, (kind, depth) in TOPICS.items()
+        }
+        self.begin_session()
+
+    def begin_session(self) -> None:
+        """From now on, the local frame is another one; no two processes share a number."""
+        self.session = time.time_ns() // 1000 % 2**32
+        self._last: Frame | None = None
+        self._twisted = (np.zeros(3), np.zeros((3, 3)))
+
+    def publish(self, frame: Frame) -> None:
+        """Send everything of one frame, stamped as the frame."""
+        p, observation, make = self._p, frame.observation, make_rclpy
+        self._publishers['pose'].publish(
+            encode.pose_with_covariance(
+                make, frame.stamp, p.map_frame, frame.T_map_base, frame.cov_map
+            )
+        )
+        twist, twist_cov = self._twist(frame)
+        frames = (p.local_frame, p.base_frame)
+        self._publishers['odometry/filtered'].publish(
+            encode.odometry(
+                make, frame.stamp, frames, frame.T_local_base, frame.cov_local, twist, twist_cov
+            )
+        )
+        if observation.points is not None:
+            points = build_points(make, frame.stamp, p.base_frame, observation.points)
+            self._publishers['deskewed_points'].publish(points)
+        if observation.detections is not None:
+            associated = build_associated(make, frame, p.base_frame)
+            self._publishers['reflectors/associated'].publish(associated)
+            self._show_statuses(frame, observation.detections)
+        record = build_record(make, frame, self.session, p.local_frame)
+        self._publishers['frames'].publish(record)
+        self._last = frame
+
+    def _show_statuses(self, frame: Frame, detections: Detections) -> None:
+        """The detections in colour, where somebody looks at them."""
+        publisher = self._publishers['reflectors/statuses']
+        if publisher.get_subscription_count() > 0:
+            publisher.publish(
+                detection_markers(
+                    make_rclpy, frame.stamp, self._p.base_frame, detections.points, frame.statuses
+                )
+            )
+
+    def _twist(self, frame: Frame) -> tuple[Array, Array]:
+        """Body twist since the last frame, with the covariance of the motion model.
+
+        A place that was found anew is no motion: the twist before it goes on.
+        """
+        dt = 0.0 if self._last is None else (frame.stamp - self._last.stamp) * 1e-9
+        if self._last is not None and dt >= SHORT and not frame.jumped:
+            step = se2.log(se2.between(self._last.T_local_base, frame.T_local_base))
+            self._twisted = (step / dt, frame.observation.motion.cov / dt**2)
+        return self._twisted

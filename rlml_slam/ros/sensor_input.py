@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages of the sensors go into the system: the one way for live nodes and for bags."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Generic, Protocol, TypeVar
+
+from rlml_slam.errors import InputError
+from rlml_slam.params import Node, Parameters
+from rlml_slam.ros.codecs import decode
+from rlml_slam.ros.codecs.decode import frame
+from rlml_slam.ros.tf import Extrinsics
+from rlml_slam.se2 import Array
+from rlml_slam.sensing.mirror import mirrored_detections, mirrored_scan
+from rlml_slam.sensing.synchronization.synchronizer import Inputs
+from rlml_slam.types import Detections, Imu, Odometry, Scan
+
+Out = TypeVar('Out')
+# stream of the sequencer -> parameter with the topic's name, type, whether the only topic of the
+# type may stand in. Any PointCloud2 or PoseArray may be something else than reflectors.
+STREAMS: Mapping[str, tuple[str, str, bool]] = {
+    'scan': ('scan_topic', 'sensor_msgs/msg/LaserScan', True),
+    'odom': ('odom_topic', 'nav_msgs/msg/Odometry', True),
+    'imu': ('imu_topic', 'sensor_msgs/msg/Imu', True),
+    'reflectors': ('reflectors_topic', 'sensor_msgs/msg/PointCloud2', False),
+    'reflector_poses': ('reflector_poses_topic', 'geometry_msgs/msg/PoseArray', False),
+}
+USED_BY = {
+    'scan': 'use_scan', 'odom': 'use_odom', 'imu': 'use_imu',
+    'reflectors': 'use_reflectors', 'reflector_poses': 'use_reflectors',
+}  # fmt: skip
+PLACED = ('scan', 'reflectors', 'reflector_poses')  # streams whose sensor has to have a place
+
+
+def topics_of(node: Node, stream: str) -> tuple[str, ...]:
+    """Names of the topics of a stream: one, but of as many scans as there are lidars."""
+    several = tuple(filter(None, node.scan_topics)) if stream == 'scan' else ()
+    return several or (str(getattr(node, STREAMS[stream][0])),)
+
+
+class Target(Protocol[Out]):
+    """A Sequencer, whose answers are observations, or a Slam, whose answers are frames."""
+
+    def set_sensor_pose(self, frame_id: str, T_base_sensor: Array) -> None:
+        """Where a sensor sits."""
+
+    def add_odometry(self, sample: Odometry) -> list[Out]:
+        """One wheel odometry sample."""
+
+    def add_imu(self, sample: Imu) -> list[Out]:
+        """One IMU sample."""
+
+    def add_scan(self, scan: Scan) -> list[Out]:
+        """One sweep."""
+
+    def add_detections(self, detections: Detections) -> list[Out]:
+        """The reflectors of one instant."""
+
+
+class Feed(Generic[Out]):
+    """Converts the messages of the streams (keys of STREAMS) and hands them to a target.
+
+    ``extrinsics`` is filled by the caller from /tf_static; a sensor that it does not know gets
+    the parameters ``laser_pose`` and ``laser_upside_down``. A message that cannot be believed is
+    counted in ``inputs``; only a clock that jumped back raises InputError.
+    """
+
+    def __init__(self, params: Parameters, target: Target[Out], inputs: Inputs) -> None:
+        self._p = params
+        self._target = target
+        self._inputs = inputs
+        self.extrinsics = Extrinsics()
+        self._placed = {params.node.base_frame}
+
+    def add(self, stream: str, msg: Any) -> list[Out]:
+        """One message of a stream; what became ready by it."""
+        try:
+            if stream in PLACED:
+                self.is_placed(msg)
+            sample = self._converted(stream, msg)
+        except InputError as e:
+            name = 'reflectors' if stream == 'reflector_poses' else stream
+            self._inputs.count(name, 'invalid', str(e))
+            return []
+        if isinstance(sample, Scan):
+            return self._target.add_scan(sample)
+        if isinstance(sample, Detections):
+            return self._target.add_detections(sample)
+        if isinstance(sample, Imu):
+            return self._target.add_imu(sample)
+        return self._target.add_odometry(sample)
+
+    def is_placed(self, msg: Any) -> bool:
+        """Whether the place of the message's sensor is known; InputError if it is not planar."""
+        sensor = frame(msg.header.frame_id)
+        if sensor not in self._placed:
+            pose = self.extrinsics.pose(self._p.node.base_frame, sensor)
+            if pose is None:
+                return False
+            self._target.set_sensor_pose(sensor, pose)
+            self._placed.add(sensor)
+        return True
+
+    def hangs(self, sensor: str) -> bool:
+        """Whether a sensor hangs upside down, by /tf_static or else by the parameter."""
+        base = self._p.node.base_frame
+        if sensor == base or self.extrinsics.up(base, sensor) is None:
+            return sensor != base and self._p.node.laser_upside_down
+        return self.extrinsics.hangs(base, sensor)
+
+    def _converted(self, stream: str, msg: Any) -> Odometry | Imu | Scan | Detections:
+        noise = self._p.reflector
+        if stream == 'scan':
+            scan = decode.scan(msg)
+            return mirrored_scan(scan) if self.hangs(scan.frame_id) else scan
+        if stream == 'odom':
+            return decode.odometry(msg)
+        if stream == 'imu':
+            up = self.extrinsics.up(self._p.node.base_frame, frame(msg.header.frame_id))
+            return decode.imu(msg, up=up)
+        read = decode.detections if stream == 'reflectors' else decode.detections_of_poses
+        seen = read(msg, noise)
+        return mirrored_detections(seen) if self.hangs(seen.frame_id) else seen

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""/diagnostics of reflector_detector once a second: what was found and what was rejected."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+
+from rlml_slam.ros.codecs import encode
+from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
+from rlml_slam.ros.diagnostics import PERIOD
+from rlml_slam.ros.sensors import Sensors
+from rlml_slam.sensing.reflectors.reflector_detector import Found
+from rlml_slam.types import Health, Level, Scan
+
+
+class DetectorHealth:
+    """Counts scans, reflectors and the bright spots that are none, by the reason."""
+
+    def __init__(self, node: Any, sensors: Sensors) -> None:
+        self._name = node.get_fully_qualified_name().lstrip('/')
+        self._sensors = sensors
+        self.counts: Counter[str] = Counter()
+        self._reported = 0
+        self._stamp = 0
+        self._last = 0
+        self._publisher = node.create_publisher(
+            rclpy_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', 10
+        )
+        # steady: with simulated time, silence of /clock must be told as well
+        node.create_timer(PERIOD, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def update(self, scan: Scan, found: Found) -> None:
+        """One scan and what it held."""
+        self._stamp, self._last = scan.stamp, len(found)
+        self.counts['scans'] += 1
+        self.counts['scans without intensities'] += not len(scan.intensities)
+        self.counts['reflectors'] += len(found)
+        self.counts.update({f'rejected: {f.name.lower()}': n for f, n in found.rejected.items()})
+
+    def health(self) -> Health:
+        """OK, or DEGRADED with the reason."""
+        if not self.counts['scans']:
+            return Health(Level.DEGRADED, ('no scan yet',))
+        if self.counts['scans'] == self._reported:
+            return Health(Level.DEGRADED, ('no new scan',))
+        if self.counts['scans without intensities'] == self.counts['scans']:
+            return Health(Level.DEGRADED, ('scans have no intensities',))
+        return Health()
+
+    def publish(self) -> None:
+        """Send the status."""
+        figures: dict[str, object] = dict(self.counts)
+        figures['reflectors in the last scan'] = self._last
+        inputs = self._sensors.sequencer.inputs
+        for stream, counts in inputs.totals().items():
+            figures |= {f'{stream} {what}': n for what, n in counts.items()}
+        if inputs.last_error:
+            figures['last refused input'] = inputs.last_error
+        message = encode.diagnostics(make_rclpy, self._stamp, self._name, self.health(), figures)
+        self._reported = self.counts['scans']
+        self._publisher.publish(message)

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Landmarks extracted from a scan: spikes and RANSAC lines."""

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reflectors in a scan: bright enough for their range, and of the shape that reflectors have."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rlml_slam import se2
+from rlml_slam.params import Detector
+from rlml_slam.se2 import Array
+from rlml_slam.sensing.reflectors.background_intensity import is_circular, levels
+from rlml_slam.sensing.reflectors.bright_spots import (
+    BEAM,
+    BEARING,
+    COLUMNS,
+    DIAMETER,
+    FATE,
+    PEAK,
+    RANGE,
+    VAR_BEARING,
+    VAR_RANGE,
+    WIDTH,
+    Fate,
+    find,
+)
+from rlml_slam.sensing.reflectors.spot_settings import settings_of
+from rlml_slam.sensing.reflectors.spot_shape import surface_depth
+from rlml_slam.types import ANONYMOUS, Detections, Scan
+
+SAME = 0.1  # [m] between two sightings of one reflector in one sweep
+
+
+@dataclass(frozen=True)
+class Found:
+    """Reflectors of a scan in the frame of the laser at the time of their own beams.
+
+    ``points`` (n, 2) [m], ``cov`` (n, 2, 2) [m^2]; ``diameters`` (n,) [m], NaN for flat ones;
+    ``beams`` (n,) [0, number of beams) of their middles; ``widths`` (n,) [m] as seen;
+    ``intensities`` (n,) of their brightest beams. ``rejected`` counts other bright spots by Fate.
+    """
+
+    points: Array
+    cov: Array
+    diameters: Array
+    beams: Array
+    widths: Array
+    intensities: Array
+    rejected: dict[Fate, int] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def at_stamp(self, scan: Scan, T_base_laser: Array, sweep: Array) -> Detections:
+        """The same as anonymous detections in the frame of the laser at the scan's stamp.
+
+        ``sweep`` (3,) is the motion of base during the whole sweep, at constant twist: what beam
+        k of n saw is moved by T_base_laser^-1 exp(k / n log(sweep)) T_base_laser. What a laser
+        that turned saw with its first and again with its last beams is told once.
+        """
+        share = self.beams / max(len(scan.ranges), 1)
+        moved = se2.exp(share[:, None] * se2.log(sweep))
+        T = se2.between(T_base_laser, se2.compose(moved, T_base_laser))
+        R = se2.rotation(T[:, 2])
+        points = np.einsum('nij,nj->ni', R, self.points) + T[:, :2]
+        cov = np.einsum('nij,njk,nlk->nil', R, self.cov, R)
+        apart = np.linalg.norm(points[:, None] - points, axis=-1)
+        again = (apart < SAME) & (share[:, None] - share > 0.5)
+        once = ~again.any(axis=1)
+        ids = np.full(int(once.sum()), ANONYMOUS, dtype=np.int64)
+        return Detections(
+            scan.stamp, scan.frame_id, points[once], cov[once], ids, self.diameters[once]
+        )
+
+
+def detect(scan: Scan, params: Detector) -> Found:
+    """The reflectors of a scan; none where it has no intensities."""
+    n = len(scan.ranges)
+    if len(scan.intensities) != n or n == 0 or scan.angle_increment == 0.0:
+        return _found(scan, np.zeros((0, COLUMNS)))
+    ranges, bright, limit = levels(scan, params)
+    rows = find(
+        ranges, bright, limit,
+        float(scan.angle_min), float(scan.angle_increment), is_circular(scan),
+        settings_of(params),
+    )  # fmt: skip
+    return _found(scan, rows)
+
+
+def threshold(scan: Scan, params: Detector) -> Array:
+    """Intensity (n,) that a reflector's brightest beam exceeds; 0 where nothing returned."""
+    return levels(scan, params)[2]
+
+
+def _found(scan: Scan, rows: Array) -> Found:
+    fates = rows[:, FATE].astype(np.int64)
+    counts = np.bincount(fates, minlength=len(Fate))
+    rejected = {fate: int(counts[fate]) for fate in Fate if fate and counts[fate]}
+    rows = rows[fates == Fate.FOUND]
+    u = np.stack([np.cos(rows[:, BEARING]), np.sin(rows[:, BEARING])], -1)
+    t = np.stack([-u[:, 1], u[:, 0]], -1)
+    r = rows[:, RANGE]
+    cov = rows[:, VAR_RANGE, None, None] * u[:, :, None] * u[:, None, :]
+    cov += (r**2 * rows[:, VAR_BEARING])[:, None, None] * t[:, :, None] * t[:, None, :]
+    return Found(
+        r[:, None] * u, cov, rows[:, DIAMETER], rows[:, BEAM] % max(len(scan.ranges), 1),
+        rows[:, WIDTH], rows[:, PEAK], rejected,
+    )  # fmt: skip
+
+
+def warm_up() -> None:
+    """Compile the kernels."""
+    surface_depth(0.0, 0.1, 0.1)
+    ones = np.ones(3, np.float32)
+    detect(Scan(1, '', 0.0, 0.1, 0.0, 0.1, 2.0, ones, ones), Detector())

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The shape of a bright spot: where its centre is, and whether it is flat rather than round."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rlml_slam.compiled import kernel, part
+from rlml_slam.se2 import Array
+from rlml_slam.sensing.reflectors.spot_edges import angle_of
+from rlml_slam.sensing.reflectors.spot_settings import Settings
+
+PROFILE = 7  # samples of a beam's profile on either side of its middle
+BESIDE = 5  # beams on either side of a spot that tell what it lies in
+ROUGH = 0.1  # share of its width by which a reflector's surface may be off its shape
+CURVED = 5  # beams that tell a shape
+FLATTER = 16.0  # chi^2 by which a thing is flat rather than round: 4 sigma
+SUNK = 0.5  # radius by which a cylinder is out of the line of what is beside it at least
+
+
+@part
+def is_flat(
+    first: int,
+    last: int,
+    r: float,
+    bearing: float,
+    beams: int,
+    spread: float,
+    radius: float,
+    ranges: Array,
+    bright: Array,
+    limit: Array,
+    angle_min: float,
+    increment: float,
+    circular: bool,
+    settings: Settings,
+) -> bool:
+    """Whether what is bright is a part of a flat surface rather than a cylinder.
+
+    It is where its own ranges tell, ``spread`` being what a cylinder leaves of them; or where it
+    lies in a surface that goes on straight at both sides, as paint and glare do: a cylinder
+    stands out of what it is fixed to.
+    """
+    footprint = r * settings.divergence
+    _, flat = centre_of(
+        0.0, first, last, r, bearing, ranges, bright, limit, angle_min, increment, footprint
+    )
+    variance = settings.sigma_range**2
+    better = spread - flat - (ROUGH * radius) ** 2
+    if beams >= CURVED and (beams - 1) * better > FLATTER * variance:
+        return True
+    n = len(ranges)
+    # the line through two returns on each side, far enough not to be of a post or a plate that
+    # the reflector is a part of
+    x, y = np.empty(4), np.empty(4)
+    m = 0
+    spacing = r * abs(increment)
+    clear = max(int(settings.separation / spacing - 0.5 * (last - first)) + 1, 2)
+    for side in (-1, 1):
+        outer = first if side < 0 else last
+        met = 0
+        for k in range(clear, clear + BESIDE):
+            j = outer + side * k
+            if not circular and not 0 <= j < n:
+                return False
+            if ranges[j % n] <= 0.0:
+                continue
+            off = angle_of(j, n, angle_min, increment) - bearing
+            x[m], y[m] = ranges[j % n] * math.sin(off), ranges[j % n] * math.cos(off)
+            met, m = met + 1, m + 1
+            if met == 2:
+                break
+        if met < 2:
+            return False
+    mx, my = np.mean(x), np.mean(y)
+    slope = np.sum((x - mx) * (y - my)) / np.sum((x - mx) ** 2)
+    off_line = y - my - slope * (x - mx)
+    if np.sum(off_line**2) > FLATTER * variance:
+        return False
+    return bool(abs(my - slope * mx - r) < SUNK * radius)
+
+
+@part
+def centre_of(
+    radius: float,
+    first: int,
+    last: int,
+    r: float,
+    bearing: float,
+    ranges: Array,
+    bright: Array,
+    limit: Array,
+    angle_min: float,
+    increment: float,
+    footprint: float,
+) -> tuple[float, float]:
+    """Range of the centre, and the variance that beams leave about it and a tilt."""
+    n = len(ranges)
+    power = mean = squares = 0.0
+    sx = sy = sxx = sxy = syy = 0.0
+    for k in range(first, last + 1):
+        j = k % n
+        if not bright[j] > limit[j]:
+            continue
+        off = angle_of(k, n, angle_min, increment) - bearing
+        x = r * math.sin(off)
+        y = ranges[j] * math.cos(off) + surface_depth(x, 0.5 * footprint, radius)
+        # by power: a beam that met the edge alone may have mixed it with what is behind
+        w = bright[j]
+        power += w
+        squares += w * w
+        mean += w * y
+        y -= r
+        sx += w * x
+        sy += w * y
+        sxx += w * x * x
+        sxy += w * x * y
+        syy += w * y * y
+    sxx -= sx * sx / power
+    sxy -= sx * sy / power
+    syy -= sy * sy / power
+    if sxx > 0.0 and radius == 0.0:
+        syy -= sxy * sxy / sxx  # a flat one may be tilted
+    freedom = power - squares / power
+    return mean / power, max(syy, 0.0) / freedom if freedom > 0.0 else 0.0
+
+
+@kernel
+def surface_depth(x: float, half: float, radius: float) -> float:
+    r"""How far before its centre a cylinder's surface is to a beam that passes ``x`` beside it.
+
+    With s(t) = sqrt(radius^2 - t^2), a beam measures the mean of s weighted by the power that
+    comes back: the beam's profile times the cosine s / radius, sum w s^2 / sum w s. The profile
+    is a raised cosine, half of its peak at ``half`` from the middle. That is s(x) for a thin beam
+    and 0.849 radius for a wide one.
+    """
+    if radius <= 0.0:
+        return 0.0
+    top = area = 0.0
+    for k in range(-PROFILE, PROFILE + 1):
+        share = k / (PROFILE + 1.0)
+        s = radius * radius - (x + 2.0 * half * share) ** 2
+        if s > 0.0:
+            w = 1.0 + math.cos(math.pi * share)
+            top += w * s
+            area += w * math.sqrt(s)
+    return top / area if area > 0.0 else 0.0

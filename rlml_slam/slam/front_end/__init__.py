@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pose of every scan by odometry, reflectors and submaps."""

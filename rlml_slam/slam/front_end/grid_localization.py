@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fixes of the pose in the grid of a saved map: the scan term of eq. 2 with a map that is frozen.
+
+Between two fixes the scans hold the pose relative to the front end's own submaps, so one fix per
+keyframe's distance says all: nearer ones would see the same errors of the same walls again.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from rlml_slam import se2
+from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.matching.reflectors.association import gate
+from rlml_slam.matching.scans import scan_information, voxel_filter
+from rlml_slam.matching.scans.scan_match import match
+from rlml_slam.params import Parameters
+from rlml_slam.se2 import Array
+from rlml_slam.slam.front_end.joint_state import JointState
+from rlml_slam.slam.relocalization.scan_relocalization import possible, submap_of
+
+OUTLIER = 0.9999  # probability of the gate of a fix against the prior
+FEW = 4  # every so many-th beam of a scan that does not fit is followed through the grid
+POSE = np.arange(3)
+
+
+@dataclass(frozen=True)
+class Fix:
+    """One match against the grid: its score, whether it moved the pose and held all of it.
+
+    It ``contradicts`` where the scan does not fit what the grid knows there.
+    """
+
+    score: float
+    used: bool = False
+    held: bool = False
+    contradicts: bool = False
+
+
+class SavedGrid:
+    """The grid; ``fix`` updates a state with a scan where the robot has moved on."""
+
+    def __init__(self, grid: OccupancyGrid, params: Parameters) -> None:
+        self._p = params
+        self._submap = submap_of(grid, params.submap)
+        self._floor = np.zeros((3, 3))
+        self._floor[[0, 1, 2], [0, 1, 2]] = params.submap.grid_bias2
+        self._gate = [gate(OUTLIER, dof) for dof in (1, 2, 3)]
+        self._last: Array | None = None
+
+    def is_due(self, pose: Array) -> bool:
+        """Whether the pose (3,) is as far from the last fix as a keyframe from the last."""
+        if self._last is None:
+            return True
+        step, p = se2.between(self._last, pose), self._p.back_end
+        far = math.hypot(step[0], step[1]) >= p.minimum_travel_distance
+        return far or abs(float(step[2])) >= p.minimum_travel_heading
+
+    def fix(self, state: JointState, points: Array) -> Fix:
+        """Match end points (n, 2), base frame, and update the state if they fit there."""
+        p = self._p.scan_match
+        points = voxel_filter.thin(points, p.voxel, p.max_points)
+        prior, cov = state.pose, state.pose_cov
+        strength = np.asarray(np.linalg.inv(cov + self._floor), dtype=np.float64)
+        found = match(self._submap, points, prior, strength, p, searched=False)
+        if found.score < p.good_score:
+            searched = match(self._submap, points, prior, strength, p)
+            found = searched if searched.score > found.score else found
+        if found.score < p.min_score:
+            may_be = possible(self._submap, points[::FEW], found.pose, found.score, p.good_score)
+            return Fix(found.score, contradicts=may_be < p.min_score)
+        information = scan_information.information(self._submap, points, found.pose, p)
+        # the error of the map at this place, which more beams do not lower
+        information = np.asarray(
+            np.linalg.solve(np.eye(3) + information @ self._floor, information), dtype=np.float64
+        )
+        values, axes = np.linalg.eigh(0.5 * (information + information.T))
+        keep = values > 1e-6
+        root = (axes[:, keep] * np.sqrt(values[keep])).T
+        offset = found.pose - prior
+        offset[2] = se2.wrap(offset[2])
+        v = root @ offset
+        d2 = float(v @ np.linalg.solve(root @ cov @ root.T + np.eye(len(v)), v))
+        if not len(v) or d2 > self._gate[len(v) - 1]:
+            return Fix(found.score)
+        state.apply(POSE, root, np.eye(len(v)), v)
+        self._last = state.pose
+        weakest = self._p.health.weak_sigma**-2
+        return Fix(found.score, True, len(v) == 3 and float(values[0]) >= weakest)

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two overlapping submaps: scans are matched against the older one and inserted into both."""
+
+from __future__ import annotations
+
+import math
+from typing import TypeAlias
+
+import numpy as np
+
+from rlml_slam import params, se2
+from rlml_slam.matching.scans import voxel_filter
+from rlml_slam.matching.scans.submap import Submap
+from rlml_slam.se2 import Array
+from rlml_slam.slam.front_end.joint_state import JointState
+
+# Walls run along and across the way that robots drive: a grid turned against them spreads its
+# rounding over a wall, where one along them would shift the whole wall by up to half a cell.
+GRID_TURN = 0.53
+
+Placed: TypeAlias = tuple[Array, Array]  # end points and sensor origin in the submap's frame
+
+
+class Submaps:
+    """The front end's submaps; the anchor of submap k is slot k of the joint state."""
+
+    def __init__(self, parameters: params.Submap) -> None:
+        self._p = parameters
+        self._maps: list[Submap] = []
+        self._open: list[list[Placed]] = []  # of each submap, scans that are still to be carved
+        self._last: Array | None = None
+        self.bias = np.zeros((3, 3))
+        self.bias[[0, 1, 2], [0, 1, 2]] = parameters.bias2
+
+    @property
+    def target(self) -> Submap | None:
+        """The submap that scans are matched against, None before the first scan."""
+        if not self._maps:
+            return None
+        self._carve(0)
+        return self._maps[0]
+
+    def insert(self, state: JointState, points: Array, origin: Array) -> bool:
+        """Insert end points and sensor origin (base frame) where the robot has moved enough.
+
+        The grids change by the next :meth:`settle`, and before anyone looks at them.
+        """
+        pose = state.pose
+        if self._last is not None:
+            step = se2.between(self._last, pose)
+            if (
+                math.hypot(step[0], step[1]) < self._p.min_travel
+                and abs(step[2]) < self._p.min_turn
+            ):
+                return False
+        self._last = pose
+        self._turn_over(state)
+        points = voxel_filter.thin(points, self._p.resolution, self._p.max_points)
+        for slot, scans in enumerate(self._open):
+            T = se2.between(state.anchor(slot), pose)
+            scans.append((se2.transform(T, points), se2.transform(T, origin[None])[0]))
+        return True
+
+    def forget(self) -> None:
+        """Begin anew with the next scan."""
+        self._maps, self._open, self._last = [], [], None
+
+    def settle(self) -> None:
+        """Carve the scan that was inserted last: this takes longest, and no pose needs it.
+
+        The newer submap is not looked at yet: it may be a scan behind, so that both have their
+        turns on different frames where not every frame is inserted.
+        """
+        due = bool(self._open and self._open[0])
+        for slot in range(len(self._open)):
+            self._carve(slot, keep=int(due and slot > 0))
+
+    def _carve(self, slot: int, keep: int = 0) -> None:
+        """Carve the scans of a submap but the newest ``keep``."""
+        scans = self._open[slot]
+        while len(scans) > keep:
+            self._maps[slot].insert(*scans.pop(0))
+
+    def _turn_over(self, state: JointState) -> None:
+        """Retire a full submap, begin the next one at half of it."""
+        if len(self._maps) > 1 and self._inserted(0) >= self._p.size:
+            del self._maps[0], self._open[0]
+            state.move_anchor(1, 0)
+        if not self._maps or (len(self._maps) == 1 and self._inserted(0) >= self._p.size // 2):
+            state.clone_pose(len(self._maps), GRID_TURN, self.bias)
+            self._maps.append(Submap(self._p))
+            self._open.append([])
+
+    def _inserted(self, slot: int) -> int:
+        """Scans of a submap, carved or not."""
+        return self._maps[slot].insertions + len(self._open[slot])
+
+    def cells(self) -> int:
+        """Allocated grid cells, for the memory report."""
+        return int(np.sum([m.values.size for m in self._maps]))

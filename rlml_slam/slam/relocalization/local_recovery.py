@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Looks for a scan that does not fit where odometry led: there may be one place close by.
+
+Odometry that slips, jumps or has a wrong stamp misleads by what the robot does in a second or so,
+which is more than the search around its prior covers, and far less than being carried away. What
+fits as usual, and nowhere else as far as that, is a scan of this submap and odometry was wrong.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rlml_slam.matching.scans import branch_and_bound
+from rlml_slam.matching.scans.scan_match import ScanMatchResult, match
+from rlml_slam.matching.scans.submap import Submap
+from rlml_slam.params import Parameters
+from rlml_slam.se2 import Array
+from rlml_slam.slam.relocalization.scan_relocalization import MAX_SECOND, SPREAD
+
+REACH = 1.0  # [m] half width of the search: about a second of driving
+TURN = 1.0  # [rad] and of turning
+# Share of the usual score. Of scans in their place, one in fifty of a real log has less; in a
+# wrong place of the same room, with some of its walls where others are, three quarters are common.
+AS_USUAL = 0.9
+NEAR = np.diag(1.0 / SPREAD**2)  # a weak prior at the place found: odometry is no evidence here
+
+
+def second_look(
+    submap: Submap,
+    points: Array,
+    guess: Array,
+    usual: float,
+    p: Parameters,
+    turn: float = TURN,
+) -> ScanMatchResult | None:
+    """The only place near ``guess`` (3,), submap frame, where a scan fits as it should.
+
+    ``points`` (n, 2) are thinned end points in the base frame, ``usual`` is the score of scans
+    lately, ``turn`` [rad] how far off the heading may be. None where nothing fits, or a second
+    place about as well. The result leaves nothing of the prior: its weight is zero.
+    """
+    least = max(AS_USUAL * usual, p.loop_closure.min_score)
+    found = branch_and_bound.wide(
+        branch_and_bound.Pyramid(submap), points, guess, REACH, turn, MAX_SECOND * least,
+        second_share=MAX_SECOND,
+    )  # fmt: skip
+    if found.best is None or found.second is not None:
+        return None
+    result = match(submap, points, found.best.pose, NEAR, p.scan_match, searched=False)
+    return replace(result, prior_weight=0.0) if result.score >= least else None

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where in a whole map a scan was taken, without any idea beforehand; or that it cannot be told.
+
+Every place and heading is searched by branch and bound. The best place counts only where it fits
+well, no other place fits nearly as well, and the scan holds it in every direction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam import params, se2
+from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.matching.scans import branch_and_bound, scan_information, voxel_filter
+from rlml_slam.matching.scans.scan_match import UNKNOWN, match
+from rlml_slam.matching.scans.submap import P_MAX, P_MIN, Submap, value_of
+from rlml_slam.params import Parameters
+from rlml_slam.se2 import Array
+from rlml_slam.types import Verdict
+
+SEARCHED = 150  # end points of the search; all of them count when its places are compared
+SPREAD = np.array([0.5, 0.5, 0.2])  # [m, m, rad] a refined place lies within this of the found one
+# Share of the best score that the next place may reach. Stricter than a closure's, which other
+# edges may contradict: in a truly symmetric hall, the scores of twins differ by up to 7 %.
+MAX_SECOND = 0.85
+# A map that was saved knows occupied and free alone. The cells beside a wall, which a beam hits as
+# often where the wall lies near their border, have become free: given back half of the wall's.
+BESIDE = 0.5
+WALL = 0.25  # probability from which a cell of the map may stop a beam
+OPEN_SIGMA = 0.5  # [m] a scan that leaves a direction wider than this does not tell the place
+
+
+@dataclass(frozen=True)
+class Relocation:
+    """The verdict, and why in words; ``pose`` (3,) and ``cov`` (3, 3), map frame, of the best.
+
+    ``score`` and ``second`` are mean hit probabilities at the best place and the next best one, 0
+    where there is none. The pose is None where no place fits.
+    """
+
+    verdict: Verdict
+    why: str
+    pose: Array | None = None
+    cov: Array | None = None
+    score: float = 0.0
+    second: float = 0.0
+
+
+def relocalize(
+    grid: OccupancyGrid | None, points: Array | None, p: Parameters, complete: bool = True
+) -> Relocation:
+    """Search ``points`` (n, 2), end points in the base frame, in a grid of the map frame.
+
+    Where the map is not ``complete``, what it lacks at the next best place may be there.
+    """
+    if grid is None or not is_mapped(grid):
+        return Relocation(Verdict.IMPOSSIBLE, 'there is no map of scans yet')
+    if points is None or len(points) < p.scan_match.min_points:
+        return Relocation(Verdict.IMPOSSIBLE, 'the newest frame has no usable scan')
+    submap = submap_of(grid, p.submap)
+    points = voxel_filter.thin(points, p.scan_match.voxel, p.scan_match.max_points)
+    few = voxel_filter.thin(points, p.scan_match.voxel, SEARCHED)
+    middle = 0.5 * (submap.bounds[:2] + submap.bounds[2:])
+    # a robot stands inside of what it has seen
+    reach = 0.5 * float(np.max(submap.bounds[2:] - submap.bounds[:2]))
+    found = branch_and_bound.wide(
+        branch_and_bound.Pyramid(submap), few, np.array([*middle, 0.0]), reach, np.pi,
+        separation_angle=2.0 * SPREAD[2],
+    )  # fmt: skip
+    places = [
+        _refined(submap, points, c.pose, p) for c in (found.best, found.second) if c is not None
+    ]
+    places.sort(key=lambda place: -place[1])
+    least = p.loop_closure.min_score
+    if not places or places[0][1] < least:
+        score = places[0][1] if places else 0.0
+        why = f'no place fits: the best has a score of {score:.2f}, {least:.2f} is asked for'
+        return Relocation(Verdict.IMPOSSIBLE, why, score=score)
+    pose, score = places[0]
+    second = places[1][1] if len(places) > 1 else 0.0
+    if not complete and second:
+        second = possible(submap, points, places[1][0], second, score)
+    cov = _covariance(submap, points, pose, p)
+    sigma = float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]))
+    verdict, why = Verdict.UNIQUE, f'score {score:.2f}, the next best place {second:.2f}'
+    if second > MAX_SECOND * score:
+        verdict, why = Verdict.AMBIGUOUS, f'two places fit alike: {score:.2f} and {second:.2f}'
+    elif sigma > OPEN_SIGMA:
+        verdict, why = Verdict.AMBIGUOUS, f'the scan leaves a direction open by {sigma:.1f} m'
+    return Relocation(verdict, why, pose, cov, score, second)
+
+
+def is_mapped(grid: OccupancyGrid) -> bool:
+    """Whether there is anything in the grid that a scan could fit."""
+    return bool((grid.cells > 0).any())
+
+
+def scan_fits(grid: OccupancyGrid, points: Array, poses: Array, p: Parameters) -> Array:
+    """Scores (q, 2) of ``points`` (n, 2), end points in the base frame, at or near poses (q, 3).
+
+    The second of each is what the score may be where parts of the place are not mapped.
+    """
+    submap = submap_of(grid, p.submap)
+    points = voxel_filter.thin(points, p.scan_match.voxel, p.scan_match.max_points)
+    places = [_refined(submap, points, pose, p) for pose in poses]
+    best = max(score for _, score in places)
+    return np.array([[s, possible(submap, points, pose, s, best)] for pose, s in places])
+
+
+def submap_of(grid: OccupancyGrid, parameters: params.Submap) -> Submap:
+    """A grid of the map as a submap in the map frame; unknown cells stay unknown."""
+    submap = Submap(parameters)
+    submap.resolution = grid.resolution
+    known = np.clip(grid.cells.astype(np.float64), 0.0, 100.0) / 100.0
+    if not ((grid.cells > 0) & (grid.cells < 100)).any():
+        known = np.maximum(known, BESIDE * _beside(known))
+    submap.values = np.where(
+        (grid.cells < 0) & (known == 0.0),
+        np.uint16(0),
+        value_of(P_MIN + (P_MAX - P_MIN) * known),
+    )
+    x, y = (round(v / grid.resolution) for v in grid.origin)
+    submap.corner = (x, y)
+    return submap
+
+
+def _beside(cells: Array) -> Array:
+    """Largest of the four neighbours of each cell (rows, columns)."""
+    padded = np.pad(cells, 1)
+    sides = (padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:])
+    return np.asarray(np.maximum.reduce(sides))
+
+
+def _refined(submap: Submap, points: Array, near: Array, p: Parameters) -> tuple[Array, float]:
+    """Pose and score of a place by scan matching, which the search's lattice only comes near."""
+    weak = np.diag(1.0 / SPREAD**2)
+    result = match(submap, points, near, weak, p.scan_match, searched=False)
+    return result.pose, result.score
+
+
+def possible(submap: Submap, points: Array, pose: Array, score: float, best: float) -> float:
+    """The score at a pose if end points where nothing is mapped fitted as at the best place.
+
+    A map in the making has one half of a symmetric hall before the other: that the known half
+    fits better says nothing. An end point behind a wall of the map does not fit in any case.
+    """
+    ends = se2.transform(pose, points)
+    reach = float(np.hypot(points[:, 0], points[:, 1]).max())
+    share = np.linspace(0.0, 1.0, max(2, int(reach / submap.resolution)))
+    # the laser is near enough to the base for this
+    way = pose[:2] + share[None, :, None] * (ends - pose[:2])[:, None, :]
+    walls = _values(submap, way) > value_of(WALL)
+    free = (_values(submap, ends) == 0) & ~walls.any(axis=1)
+    return score + float(np.mean(free)) * max(best - UNKNOWN, 0.0)
+
+
+def _values(submap: Submap, points: Array) -> NDArray[np.uint16]:
+    """Cell values (...) at points (..., 2), 0 outside."""
+    (j, i), (rows, columns) = submap.corner, submap.values.shape
+    cells = np.floor(points / submap.resolution).astype(np.int64) - (j, i)
+    inside = ((cells >= 0) & (cells < (columns, rows))).all(axis=-1)
+    out = np.zeros(points.shape[:-1], dtype=np.uint16)
+    out[inside] = submap.values[cells[inside][:, 1], cells[inside][:, 0]]
+    return out
+
+
+def _covariance(submap: Submap, points: Array, pose: Array, p: Parameters) -> Array:
+    """Of the pose, with the error of the map that more beams do not lower."""
+    information = scan_information.information(submap, points, pose, p.scan_match)
+    # a direction that the scan leaves open still needs a regular covariance
+    regular = information + np.diag([1e-2, 1e-2, 1e-2])
+    return np.asarray(np.linalg.inv(regular) + np.diag(p.loop_closure.floor2), dtype=np.float64)

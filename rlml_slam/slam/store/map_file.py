@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A whole map as a file: keyframes, scans, submaps, graph, reflectors, parameters, products.
+
+What maps/container.py writes, by name; n keyframes, m landmarks, lengths in metres and radians:
+
+    pose (n, 3), pose_fixed (n,), landmark (m, 2), landmark_fixed (m,)     the estimate
+    edge_…, sighted_…, pose_prior_…, landmark_prior_… with nodes, measured,
+        information, kinds (graph.table.FactorKind), enabled               the factors
+    key_stamp [ns], key_local, key_cov, key_scan_stamp, key_looked, key_origin, key_points (n,)
+        -1 where there is no scan, else how many of ``points`` (p, 2) are its  keyframes and scans
+    submap_…                        the grids that scans are matched against, cells in one row
+    reflector_…, sighting           reflectors by key; `reflector_gone` have left the map;
+                                    `reflector_map` and `reflector_cov` are what a robot
+                                    localizes with
+    survey_ids, survey_points, survey_diameters     the survey whose frame the map has, if any
+    closure…, path, path_motion     records of closures, the path of all frames
+    grid (rows, columns)            the occupancy grid, where there are scans
+
+The description has the parameters that the map was made with, and the grid's origin.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam import __version__
+from rlml_slam.errors import FileFormatError, MapError, SolverError
+from rlml_slam.graph.model.factor_table import FactorKind, FactorTable
+from rlml_slam.graph.model.graph import Graph
+from rlml_slam.maps import map_container
+from rlml_slam.maps.map_container import Content
+from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.maps.saved_map import SavedMap
+from rlml_slam.maps.survey import Survey
+from rlml_slam.params import Parameters
+from rlml_slam.slam.back_end.back_end import BackEnd
+from rlml_slam.slam.closures.loop_closure import Closure
+from rlml_slam.slam.keyframes import Keyframe
+from rlml_slam.types import Reflectors
+
+FORMAT, VERSION = 'rlml_slam map', 1
+COLUMNS = ('nodes', 'measured', 'information', 'kinds', 'enabled')
+MADE = ('keys', 'ids', 'sightings', 'diameters')
+Arrays = Mapping[str, NDArray[Any]]
+
+
+def parameters_of(content: Content) -> Parameters:
+    """Those that a map was made with; what this program does not know is left out."""
+    told = content.description['parameters']
+    groups: dict[str, Any] = {}
+    for group in dataclasses.fields(Parameters):
+        kind: Any = type(group.default)
+        known = {f.name for f in dataclasses.fields(kind)}
+        values = told.get(group.name, {})
+        groups[group.name] = kind(**{k: v for k, v in values.items() if k in known})
+    return Parameters(**groups)
+
+
+def tables(graph: Graph) -> dict[str, FactorTable]:
+    """The tables of a graph, as they are called in the file."""
+    return {
+        'edge': graph.edges, 'sighted': graph.sightings,
+        'pose_prior': graph.pose_priors, 'landmark_prior': graph.landmark_priors,
+    }  # fmt: skip
+
+
+def content_of(back_end: BackEnd, params: Parameters, grid: OccupancyGrid | None) -> Content:
+    """The map as it is now. Raises MapError if there is none."""
+    if not back_end.keyframes:
+        raise MapError('there is no map yet')
+    graph, found = back_end.graph, back_end.reflectors()
+    arrays: dict[str, NDArray[Any]] = {
+        'pose': graph.poses, 'pose_fixed': graph.fixed_poses,
+        'landmark': graph.landmarks, 'landmark_fixed': graph.fixed_landmarks,
+        **arrays_of(back_end.keyframes), **back_end.scans.arrays(),
+        **back_end.reflector_graph.arrays(), **back_end.path.arrays(),
+        'reflector_map': found.points, 'reflector_cov': found.cov,
+        **{f'reflector_map_{name}': getattr(found, name) for name in MADE},
+    }  # fmt: skip
+    for name, table in tables(graph).items():
+        for column in COLUMNS:
+            arrays[f'{name}_{column}'] = getattr(table, column)
+    description: dict[str, Any] = {
+        'format': FORMAT,
+        'version': VERSION,
+        'program': __version__,
+        'parameters': dataclasses.asdict(params),
+    }
+    plant = back_end.plant
+    if plant is not None and plant.found:
+        arrays |= {f'survey_{name}': array for name, array in plant.survey._asdict().items()}
+    if grid is not None:
+        arrays['grid'] = grid.cells
+        description['grid'] = {'resolution': grid.resolution, 'origin': list(grid.origin)}
+    return Content(arrays, description)
+
+
+def arrays_of(keys: list[Keyframe]) -> dict[str, NDArray[Any]]:
+    """The keyframes and their scans, as the file has them."""
+    points = [k.points for k in keys if k.points is not None]
+    return {
+        'key_stamp': np.array([k.stamp for k in keys], dtype=np.int64),
+        'key_scan_stamp': np.array([k.scan_stamp for k in keys], dtype=np.int64),
+        'key_looked': np.array([k.looked for k in keys]),
+        'key_jumped': np.array([k.jumped for k in keys]),
+        'key_local': np.array([k.T_local for k in keys]),
+        'key_cov': np.array([k.cov_local for k in keys]),
+        'key_origin': np.array([np.zeros(2) if k.origin is None else k.origin for k in keys]),
+        'key_points': np.array([-1 if k.points is None else len(k.points) for k in keys]),
+        'points': np.concatenate([np.zeros((0, 2), dtype=np.float32), *points]),
+    }
+
+
+def save(path: str | Path, back_end: BackEnd, params: Parameters) -> Path:
+    """Write the map as it is now; the one before stays beside it. Raises MapError."""
+    return map_container.write(path, content_of(back_end, params, back_end.occupancy_grid()))
+
+
+def load(path: str | Path) -> Content:
+    """A file that is whole and of this kind; MapError or FileFormatError says what is wrong."""
+    content = map_container.read(path)
+    kind, version = (content.description.get(k) for k in ('format', 'version'))
+    if kind != FORMAT or version != VERSION:
+        raise FileFormatError(f'{path}: {kind} {version}, this program reads {FORMAT} {VERSION}')
+    return content
+
+
+def saved_map(content: Content) -> SavedMap:
+    """What a robot localizes in."""
+    a, d = content.arrays, content.description
+    reflectors = Reflectors(
+        a['reflector_map_keys'], a['reflector_map'], a['reflector_cov'], a['reflector_map_ids'],
+        a['reflector_map_sightings'], a['reflector_map_diameters'],
+    )  # fmt: skip
+    if 'grid' not in a:
+        return SavedMap(reflectors)
+    x, y = d['grid']['origin']
+    return SavedMap(reflectors, OccupancyGrid(float(d['grid']['resolution']), (x, y), a['grid']))
+
+
+def survey_of(content: Content) -> Survey | None:
+    """The survey whose frame the map has, None where the map has a frame of its own."""
+    a = content.arrays
+    if 'survey_points' not in a:
+        return None
+    return Survey(a['survey_ids'], a['survey_points'], a['survey_diameters'])
+
+
+def restore(content: Content, back_end: BackEnd) -> None:
+    """Let an empty back end go on with the map.
+
+    Raises FileFormatError if its parts disagree, MapError if it has another survey's frame.
+    """
+    a = content.arrays
+    try:
+        fill(back_end.graph, a)
+        back_end.start_from(_keyframes(a), a, survey_of(content))
+    except (KeyError, IndexError, ValueError, SolverError) as e:
+        raise FileFormatError(f'the parts of the map do not fit together: {e}') from e
+
+
+def revoked(content: Content, number: int) -> tuple[Content, Closure]:
+    """A map without one of its loop closures, solved anew, and what became of that.
+
+    Raises SolverError if there is no such one.
+    """
+    params = parameters_of(content)
+    back_end = BackEnd(params)
+    restore(content, back_end)
+    closure = back_end.revoke(number)
+    grid = back_end.occupancy_grid() if 'grid' in content.arrays else None
+    out = content_of(back_end, params, grid)
+    kept = {name: content.arrays[name] for name in ('path', 'path_motion')}
+    return Content({**out.arrays, **kept}, out.description), closure
+
+
+def fill(graph: Graph, a: Arrays) -> None:
+    """The saved nodes and factors into an empty graph."""
+    graph.add_poses(a['pose'])
+    graph.poses[:] = a['pose']  # to the last bit, which wrapping an angle again may change
+    graph.fixed_poses[:] = a['pose_fixed']
+    graph.add_landmarks(a['landmark'])
+    graph.fixed_landmarks[:] = a['landmark_fixed']
+    n, m = len(a['pose']), len(a['landmark'])
+    sizes = {'edge': (n, n), 'sighted': (n, m), 'pose_prior': (n,), 'landmark_prior': (m,)}
+    for name, table in tables(graph).items():
+        nodes, measured, information, kinds, enabled = (a[f'{name}_{c}'] for c in COLUMNS)
+        table.append(
+            [FactorKind(k) for k in kinds.tolist()], nodes, measured, information, sizes[name]
+        )
+        table.enabled[:] = enabled
+
+
+def _keyframes(a: Arrays) -> list[Keyframe]:
+    counts = a['key_points']
+    ends = np.cumsum(np.maximum(counts, 0))
+    rows = zip(
+        a['pose'], counts.tolist(), ends.tolist(), a['key_stamp'].tolist(), a['key_local'],
+        a['key_cov'], a['key_origin'], a['key_scan_stamp'].tolist(), strict=True,
+    )  # fmt: skip
+    out = []
+    for k, (_, count, end, stamp, T_local, cov, origin, scan_stamp) in enumerate(rows):
+        points = a['points'][end - count : end].copy() if count >= 0 else None
+        place = origin.copy() if count >= 0 else None
+        # files of older versions lack them
+        looked, jumped = (
+            bool(a[name][k]) if name in a else False for name in ('key_looked', 'key_jumped')
+        )
+        out.append(
+            Keyframe(
+                k, stamp, T_local.copy(), cov.copy(), points, place, scan_stamp, looked, jumped
+            )
+        )
+    return out

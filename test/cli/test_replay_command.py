@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``rlml replay`` over the sample bags and over damaged and useless ones."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rlml_slam import se2
+from rlml_slam.cli.main import main
+from rlml_slam.cli.replay import fates, replay, sources
+from rlml_slam.datasets.tum import Trajectory, read_tum, write_tum
+from rlml_slam.maps import occupancy
+from rlml_slam.params import Parameters
+from rlml_slam.ros.bags.bag import BagWriter
+from rlml_slam.ros.codecs import encode
+from rlml_slam.ros.codecs.message_types import make_bag
+from rlml_slam.types import Detections, Scan
+
+BAGS = Path(__file__).resolve().parents[2] / 'bags'
+SECOND = 1_000_000_000
+
+
+@pytest.fixture(scope='module')
+def replayed(tmp_path_factory):
+    """Two replays of one bag."""
+    folder = tmp_path_factory.mktemp('replay')
+    codes = [main(['replay', str(BAGS / 'room'), '--out', str(folder / n)]) for n in ('a', 'b')]
+    assert codes == [0, 0]
+    return folder
+
+
+def test_two_replays_are_byte_identical(replayed):
+    for name in ('trajectory.tum', 'front_end.tum', 'map.pgm', 'map.yaml', 'reflectors.csv'):
+        assert (replayed / 'a' / name).read_bytes() == (replayed / 'b' / name).read_bytes()
+
+
+def test_room_is_mapped(replayed):
+    f = json.loads((replayed / 'a' / 'metrics.json').read_text())
+    assert f['alignment'] == 'none'
+    # a room of a few metres, 2 cm range noise; the bound is a few times what is reached
+    assert f['live_ate_rmse_m'] < 0.03
+    assert f['heading_rmse_deg'] < 0.3
+    assert f['reflectors_found'] == f['reflectors_true']
+    assert f['reflectors_spurious'] == 0
+    assert f['inputs']['scan']['invalid'] == 0
+    assert f['topics']['scan'] == '/scan'
+    assert len(read_tum(replayed / 'a' / 'trajectory.tum')) == f['scans']
+
+
+def test_bag_is_localized_in_the_map_that_another_replay_made(replayed, tmp_path):
+    """The robot starts elsewhere than assumed, and the map comes out as it went in."""
+    start = tmp_path / 'start.yaml'
+    start.write_text('/**:\n  ros__parameters:\n    map_start_pose: [4.0, 3.0, 1.0]\n')
+    arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out')]
+    arguments += ['--map', str(replayed / 'a'), '--config', str(start)]
+    assert main(arguments) == 0
+    f = json.loads((tmp_path / 'out' / 'metrics.json').read_text())
+    assert f['keyframes'] == 0
+    assert f['health']['OK'] > 0.95
+    for name in ('map.pgm', 'map.yaml', 'reflectors.csv'):
+        assert (tmp_path / 'out' / name).read_bytes() == (replayed / 'a' / name).read_bytes()
+    found = read_tum(tmp_path / 'out' / 'trajectory.tum')
+    mapped = read_tum(replayed / 'a' / 'trajectory.tum')
+    error = se2.between(mapped.poses, found.poses)[10:]
+    assert np.hypot(error[:, 0], error[:, 1]).max() < 0.04
+    assert np.abs(error[:, 2]).max() < 0.02
+
+
+def test_folder_without_a_map_is_refused(tmp_path, capsys):
+    arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out')]
+    assert main([*arguments, '--map', str(tmp_path)]) == 1
+    assert 'neither reflectors.csv nor map.csv' in capsys.readouterr().err
+
+
+def test_given_truth_is_aligned(replayed, tmp_path, capsys):
+    path = read_tum(replayed / 'a' / 'trajectory.tum')
+    moved = Trajectory(path.stamps, path.poses + np.array([1.0, 2.0, 0.0]))
+    write_tum(tmp_path / 'truth.tum', moved)
+    arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out'), '--json']
+    assert main([*arguments, '--truth', str(tmp_path / 'truth.tum')]) == 0
+    f = json.loads(capsys.readouterr().out)
+    assert f['alignment'] == 'se2'
+    assert f['ate_rmse_m'] < 1e-6
+
+
+def test_summary_says_which_topic_was_taken(tmp_path, capsys):
+    config = tmp_path / 'c.yaml'
+    config.write_text('/**:\n  ros__parameters:\n    scan_topic: front/scan\n')
+    arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out')]
+    assert main([*arguments, '--config', str(config)]) == 0
+    (row,) = re.findall(r'input scan +(.*)', capsys.readouterr().out)
+    # not the one that was asked for, but the only scans there are
+    assert row.endswith('used (/scan)')
+
+
+def test_both_topics_of_reflectors_are_told():
+    topics = {'scan': '/front', 'reflectors': '/cloud', 'reflector_poses': '/poses'}
+    told = sources(topics, ['/rear'])
+    assert told == {'scan': '/front, /rear', 'reflectors': '/cloud, /poses'}
+    assert sources({'odom': '/odom'}, ['/rear']) == {'odom': '/odom', 'scan': '/rear'}
+
+
+def test_configuration_is_used(tmp_path, capsys):
+    config = tmp_path / 'c.yaml'
+    config.write_text('/**:\n  ros__parameters:\n    use_scan: false\n')
+    arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out')]
+    assert main([*arguments, '--config', str(config)]) == 0
+    assert 'scan' not in json.loads((tmp_path / 'out' / 'metrics.json').read_text())['inputs']
+    config.write_text('/**:\n  ros__parameters:\n    use_scam: false\n')
+    assert main([*arguments, '--config', str(config)]) == 1
+    assert "unknown parameter 'use_scam'" in capsys.readouterr().err
+
+
+def test_odometry_is_left_out_where_it_is_withheld(tmp_path, capsys):
+    out = tmp_path / 'out'
+    assert main(['replay', str(BAGS / 'room'), '--out', str(out), '--no-odometry', '--json']) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert 'odom' not in figures['inputs']
+    assert figures['inputs']['scan']['used'] > 0
+    # the walls of the room hold the pose without any odometry
+    assert figures['live_ate_rmse_m'] < 0.1
+
+
+def test_no_such_bag_is_one_line(tmp_path, capsys):
+    assert main(['replay', str(tmp_path / 'gone'), '--out', str(tmp_path / 'out')]) == 1
+    assert capsys.readouterr().err.endswith('gone: no such bag\n')
+
+
+def made_scan(stamp):
+    """Half of a room of 4 x 3 m, seen from its middle."""
+    angles = -1.57 + 0.035 * np.arange(90)
+    ranges = np.minimum(2.0 / np.abs(np.cos(angles)), 1.5 / np.abs(np.sin(angles) + 1e-9))
+    none = np.zeros(0, np.float32)
+    return Scan(stamp, 'laser', -1.57, 0.035, 0.0, 0.1, 30.0, ranges.astype(np.float32), none)
+
+
+def write_scans(path, stamps):
+    with BagWriter(path) as bag:
+        for k, stamp in enumerate(stamps):
+            bag.write('/scan', encode.laser_scan(make_bag, made_scan(stamp)), (k + 1) * SECOND)
+
+
+def test_bag_without_anything_usable_says_why(tmp_path, capsys):
+    with BagWriter(tmp_path / 'bag') as bag:
+        pose = np.zeros(3)
+        message = encode.odometry(make_bag, SECOND, ('odom', 'base_link'), pose, np.eye(3))
+        bag.write('/odom', message, SECOND)
+    assert main(['replay', str(tmp_path / 'bag'), '--out', str(tmp_path / 'out')]) == 1
+    assert 'no scan and no reflectors in the bag' in capsys.readouterr().err
+
+
+def test_clock_that_jumps_back_gives_what_came_before(tmp_path, capsys):
+    first = [(100 + k) * SECOND for k in range(20)]
+    write_scans(tmp_path / 'bag', first + [k * SECOND for k in range(1, 20)])
+    assert main(['replay', str(tmp_path / 'bag'), '--out', str(tmp_path / 'out')]) == 1
+    assert 'jumped back' in capsys.readouterr().err
+    assert len(read_tum(tmp_path / 'out' / 'trajectory.tum')) == 20
+    assert 'jumped back' in json.loads((tmp_path / 'out' / 'metrics.json').read_text())['problem']
+
+
+def test_damaged_bag_gives_what_came_before(tmp_path, monkeypatch, capsys):
+    from rlml_slam.errors import BagError
+    from rlml_slam.ros.bags.bag import BagReader
+
+    sound = BagReader.messages
+
+    def damaged(self, topics=None, **more):
+        for k, message in enumerate(sound(self, topics, **more)):
+            if k == 600:
+                raise BagError(f'{self.path}: damaged after {k} messages: cut')
+            yield message
+
+    monkeypatch.setattr(BagReader, 'messages', damaged)
+    assert main(['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out')]) == 1
+    err = capsys.readouterr().err
+    assert 'damaged after 600 messages: cut; the results hold what came before' in err
+    assert len(read_tum(tmp_path / 'out' / 'trajectory.tum')) > 50
+    assert 'damaged' in (tmp_path / 'out' / 'report.html').read_text()
+
+
+@pytest.mark.parametrize('system', ['rlml', 'ekf'])
+def test_grid_too_large_to_be_drawn_costs_only_itself(system, tmp_path, monkeypatch, capsys):
+    # the room has more cells than this, as one with an outlier kilometres away has in truth
+    monkeypatch.setattr(occupancy, 'MAX_CELLS', 1000)
+    arguments = ['--system', system, '--out', str(tmp_path / 'out')]
+    assert main(['replay', str(BAGS / 'room'), *arguments]) == 1
+    said = r'map of \d+ x \d+ cells is too large to be drawn; the results hold everything else'
+    assert re.search(said, capsys.readouterr().err)
+    f = json.loads((tmp_path / 'out' / 'metrics.json').read_text())
+    assert re.search(said, f['problem'])
+    assert f['reflectors_found'] == f['reflectors_true']
+    assert len(read_tum(tmp_path / 'out' / 'trajectory.tum')) == f['scans']
+    assert {p.name for p in (tmp_path / 'out').iterdir()} >= {'map.pgm', 'report.html'}
+
+
+def test_file_cut_short_fails_in_one_line(tmp_path, capsys):
+    shutil.copytree(BAGS / 'room', tmp_path / 'bag')
+    (file,) = (tmp_path / 'bag').glob('*.mcap')
+    file.write_bytes(file.read_bytes()[:100_000])
+    assert main(['replay', str(tmp_path / 'bag'), '--out', str(tmp_path / 'out')]) == 1
+    err = capsys.readouterr().err
+    assert err.count('\n') == 1
+    assert str(tmp_path / 'bag') in err
+
+
+def test_reflectors_alone_are_enough(tmp_path):
+    with BagWriter(tmp_path / 'bag') as bag:
+        for k in range(30):
+            stamp = (k + 1) * SECOND // 10
+            points = np.array([[2.0, 1.0], [3.0, -1.0], [-1.0, 2.0]])
+            seen = Detections(
+                stamp, 'base_link', points, np.broadcast_to(4e-4 * np.eye(2), (3, 2, 2)),
+                np.full(3, -1), np.full(3, np.nan),
+            )  # fmt: skip
+            bag.write('/reflectors', encode.detections(make_bag, seen), stamp)
+    run = replay(tmp_path / 'bag', Parameters())
+    assert len(run.reflectors) == 3
+    assert run.grid is None
+    assert np.abs(run.trajectory.poses).max() < 0.02
+
+
+def test_fates_name_what_could_not_be_read():
+    counts = {'scan': {'used': 5, 'waited_out': 1}, 'reflectors': {'used': 2}}
+    topics = {'scan': '/scan', 'reflector_poses': '/poses', 'imu': '/imu'}
+    assert fates(counts, {'/scan': 2, '/poses': 1}, topics) == {
+        'scan': {'used': 5, 'late': 0, 'invalid': 2, 'waited_out': 1},
+        'reflectors': {'used': 2, 'late': 0, 'invalid': 1},
+        'imu': {'used': 0, 'late': 0, 'invalid': 0},
+    }

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sensors that hang upside down, and scans of drivers that know no farthest range."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rlml_slam.params import Node, Parameters
+from rlml_slam.ros.codecs import decode, encode
+from rlml_slam.ros.codecs.decode import Transform
+from rlml_slam.ros.codecs.message_types import make_bag
+from rlml_slam.ros.sensor_input import Feed
+from rlml_slam.sensing.deskew import project
+from rlml_slam.sensing.synchronization.synchronizer import Inputs
+from rlml_slam.types import Detections, Scan
+
+PLACE = np.array([0.4, -0.1, 0.7])
+ANGLES = np.linspace(-2.0, 2.0, 9)
+FOUND = np.array([[3.0, 1.0], [-2.0, 0.5]])
+SCAN = Scan(
+    5, 'laser', -2.0, 0.5, 1e-3, 0.1, 30.0, np.arange(1.0, 10.0, dtype=np.float32),
+    np.zeros(0, dtype=np.float32),
+)  # fmt: skip
+SEEN = Detections(
+    5, 'laser', FOUND, np.tile([[0.04, 0.01], [0.01, 0.02]], (2, 1, 1)), np.full(2, -1),
+    np.full(2, np.nan),
+)  # fmt: skip
+
+
+class Target:
+    """Keeps what it is given."""
+
+    def __init__(self):
+        self.given, self.places = [], {}
+
+    def set_sensor_pose(self, frame_id, T_base_sensor):
+        self.places[frame_id] = T_base_sensor
+
+    def add_scan(self, scan):
+        self.given.append(scan)
+        return []
+
+    add_detections = add_scan
+
+
+def upside_down():
+    """R and t of the laser: half a turn about its x axis, which points to PLACE's heading."""
+    c, s = np.cos(PLACE[2]), np.sin(PLACE[2])
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ np.diag([1.0, -1.0, -1.0])
+    return R, np.array([*PLACE[:2], 2.0])
+
+
+def in_base(points):
+    """Points (n, 2) of the laser's plane in the base frame."""
+    R, t = upside_down()
+    return (np.column_stack([points, np.zeros(len(points))]) @ R.T + t)[:, :2]
+
+
+@pytest.fixture(params=['tf', 'parameter'])
+def feed(request):
+    by_tf = request.param == 'tf'
+    node = Node() if by_tf else Node(laser_upside_down=True, laser_pose=tuple(PLACE))
+    feed = Feed(Parameters(node=node), Target(), Inputs())
+    if by_tf:
+        feed.extrinsics.add([Transform('base_link', 'laser', *upside_down())])
+    return feed
+
+
+def place(feed):
+    return feed._target.places.get('laser', PLACE)
+
+
+def test_scan_of_a_laser_upside_down_is_where_its_rays_end(feed):
+    feed.add('scan', encode.laser_scan(make_bag, SCAN))
+    (scan,) = feed._target.given
+    assert scan.time_increment == SCAN.time_increment
+    points = project(scan, place(feed), np.zeros(3), 30.0)
+    rays = SCAN.ranges[:, None] * np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1)
+    np.testing.assert_allclose(points, in_base(rays), atol=1e-6)
+
+
+def test_reflectors_of_a_laser_upside_down_are_on_its_other_side(feed):
+    message = encode.detections(make_bag, SEEN)
+    feed.add('reflectors', message)
+    (seen,) = feed._target.given
+    T = place(feed)
+    c, s = np.cos(T[2]), np.sin(T[2])
+    np.testing.assert_allclose(
+        seen.points @ np.array([[c, s], [-s, c]]) + T[:2], in_base(FOUND), atol=1e-6
+    )
+    # noise along and across a beam is as it was
+    plain = decode.detections(message, Parameters().reflector)
+    for quarter in (np.eye(2), np.array([[0.0, -1.0], [1.0, 0.0]])):
+        now, before = (
+            np.einsum('ni,nij,nj->n', d.points @ quarter, d.cov, d.points @ quarter)
+            for d in (seen, plain)
+        )
+        np.testing.assert_allclose(now, before, rtol=1e-6)
+
+
+def test_sensor_in_the_base_frame_does_not_hang():
+    feed = Feed(Parameters(node=Node(laser_upside_down=True)), Target(), Inputs())
+    feed.add('scan', encode.laser_scan(make_bag, replace(SCAN, frame_id='base_link')))
+    assert feed._target.given[0].angle_min == SCAN.angle_min
+
+
+def test_farthest_range_of_inf_makes_no_range_of_inf():
+    ranges = SCAN.ranges.copy()
+    ranges[3] = np.inf
+    feed = Feed(Parameters(), Target(), Inputs())
+    feed.add('scan', encode.laser_scan(make_bag, replace(SCAN, range_max=np.inf, ranges=ranges)))
+    (scan,) = feed._target.given
+    assert np.isfinite(scan.range_max)
+    assert len(project(scan, np.zeros(3), np.zeros(3), 30.0)) == len(ranges) - 1

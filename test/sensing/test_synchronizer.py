@@ -1,0 +1,535 @@
+# SPDX-License-Identifier: Apache-2.0
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rlml_slam import se2
+from rlml_slam.errors import InputError
+from rlml_slam.motion import SECOND, MotionBuffer
+from rlml_slam.params import Node, Parameters
+from rlml_slam.sensing.detection_frames import SIGMA
+from rlml_slam.sensing.synchronization.synchronizer import PAIRING, PERSISTENT, Sequencer
+from rlml_slam.types import Detections, Imu, Odometry, Scan
+
+MS = SECOND // 1000
+T0 = 10 * SECOND
+SPEED, TURN = 0.8, 0.3
+
+
+def pose_at(stamp):
+    t = (stamp - T0) / SECOND
+    return se2.exp(np.array([SPEED * t, 0.0, TURN * t]))
+
+
+def odometry(stamp):
+    return Odometry(stamp, pose_at(stamp))
+
+
+def scan(stamp, ranges=(2.0, 3.0, np.nan, 4.0), frame='laser', time_increment=0.0):
+    return Scan(
+        stamp, frame, -1.0, 0.5, time_increment, 0.1, 20.0,
+        np.array(ranges, dtype=np.float32), np.zeros(0, dtype=np.float32),
+    )  # fmt: skip
+
+
+def detections(stamp, points=((2.0, 1.0),), frame='laser'):
+    p = np.array(points, dtype=np.float64).reshape(-1, 2)
+    n = len(p)
+    cov = np.tile(np.diag([4e-4, 1e-4]), (n, 1, 1))
+    return Detections(stamp, frame, p, cov, np.full(n, -1), np.full(n, np.nan))
+
+
+def add(sequencer, message):
+    if isinstance(message, Odometry):
+        return sequencer.add_odometry(message)
+    if isinstance(message, Imu):
+        return sequencer.add_imu(message)
+    if isinstance(message, Scan):
+        return sequencer.add_scan(message)
+    return sequencer.add_detections(message)
+
+
+def feed(sequencer, inputs):
+    return [o for m in inputs for o in add(sequencer, m)]
+
+
+def running(until=T0 + 3 * SECOND, **node):
+    """A sequencer with 50 Hz of odometry, which is past its first second."""
+    sequencer = Sequencer(Parameters(node=Node(**node)))
+    feed(sequencer, [odometry(t) for t in range(T0, until + 1, 20 * MS)])
+    return sequencer, until
+
+
+def drive_inputs(seconds=3.0, imu=False):
+    """Odometry at 50 Hz, pairs of scan and detections at 10 Hz, in order of stamps."""
+    out = []
+    for k in range(round(seconds * 50)):
+        stamp = T0 + 20 * MS * k
+        out.append(odometry(stamp))
+        if imu:
+            out.append(Imu(stamp, TURN))
+        if k % 5 == 0:
+            out += [scan(stamp), detections(stamp)]
+    return out
+
+
+# --- order and pairing -------------------------------------------------------------------------
+
+
+def test_observations_come_in_order_of_stamps_once_each():
+    sequencer = Sequencer(Parameters())
+    out = feed(sequencer, drive_inputs()) + sequencer.flush()
+    stamps = [o.stamp for o in out]
+    assert stamps == list(range(T0, T0 + 3 * SECOND, 100 * MS))
+    for o in out:
+        assert o.points is not None
+        assert len(o.detections) == 1
+    assert sequencer.inputs.totals()['scan'] == {'used': 30}
+
+
+def test_order_of_arrival_does_not_matter_within_the_timeout():
+    rng = np.random.default_rng(0)
+    inputs = drive_inputs()
+    odom = [m for m in inputs if isinstance(m, Odometry)]
+    others = [m for m in inputs if not isinstance(m, Odometry)]
+    # odometry in time; the rest up to 80 ms late, in an order of its own
+    late = [(m.stamp + rng.uniform(0, 80 * MS), 1, k, m) for k, m in enumerate(others)]
+    merged = sorted([(m.stamp, 0, k, m) for k, m in enumerate(odom)] + late)
+    a, b = Sequencer(Parameters()), Sequencer(Parameters())
+    x = feed(a, inputs) + a.flush()
+    y = feed(b, [m for *_, m in merged]) + b.flush()
+    assert [o.stamp for o in x] == [o.stamp for o in y]
+    for p, q in zip(x, y, strict=True):
+        np.testing.assert_array_equal(p.motion.delta, q.motion.delta)
+        np.testing.assert_array_equal(p.points, q.points)
+        np.testing.assert_array_equal(p.detections.points, q.detections.points)
+
+
+def test_motion_is_that_between_the_stamps():
+    sequencer = Sequencer(Parameters())
+    out = feed(sequencer, drive_inputs()) + sequencer.flush()
+    np.testing.assert_array_equal(out[0].motion.delta, 0.0)
+    for a, b in itertools.pairwise(out[:-1]):
+        # midpoint chords of 20 ms: (w dt)^2 = 4e-5 of 8 cm
+        expected = se2.between(pose_at(a.stamp), pose_at(b.stamp))
+        np.testing.assert_allclose(b.motion.delta, expected, atol=1e-6)
+        assert b.motion.known
+        np.testing.assert_allclose(b.odom_pose, pose_at(b.stamp), atol=1e-12)
+
+
+@pytest.mark.parametrize('apart', [0, PAIRING])
+def test_scan_and_detections_of_one_instant_are_one_observation(apart):
+    sequencer, t = running()
+    t += 10 * MS
+    out = feed(sequencer, [scan(t), detections(t + apart), odometry(t + 20 * MS)])
+    (o,) = out
+    assert o.stamp == t
+    assert o.points is not None
+    assert o.detections is not None
+
+
+def test_stamps_farther_apart_are_two_observations():
+    sequencer, t = running()
+    inputs = [scan(t), detections(t + PAIRING + 1)]
+    inputs += [odometry(t + k * 20 * MS) for k in range(1, 30)]
+    a, b = feed(sequencer, inputs)
+    assert a.detections is None
+    assert b.points is None
+    assert b.stamp - a.stamp == PAIRING + 1
+
+
+def test_scan_waits_for_odometry_that_covers_its_last_ray():
+    sequencer, t = running()
+    sweep = 50 * MS
+    s = scan(t, ranges=np.full(100, 3.0), time_increment=sweep / 100 / SECOND)
+    assert feed(sequencer, [s, detections(t), odometry(t + 20 * MS), odometry(t + 40 * MS)]) == []
+    (o,) = add(sequencer, odometry(t + 60 * MS))
+    np.testing.assert_allclose(o.sweep, se2.between(pose_at(t), pose_at(t + sweep)), atol=1e-6)
+
+
+def test_lone_scan_waits_for_its_detections_only_if_they_use_to_come():
+    sequencer, t = running()
+    # never paired so far: scan by scan without delay
+    assert len(feed(sequencer, [scan(t), odometry(t + 20 * MS)])) == 1
+    t += 20 * MS
+    assert len(feed(sequencer, [scan(t), detections(t), odometry(t + 20 * MS)])) == 1
+    t += 20 * MS
+    # now they come in pairs: it waits, but not for ever
+    assert feed(sequencer, [scan(t), odometry(t + 20 * MS)]) == []
+    released = feed(sequencer, [odometry(t + k * 20 * MS) for k in range(2, 12)])
+    assert [o.stamp for o in released] == [t]
+
+
+def test_nothing_waits_longer_than_the_timeout():
+    sequencer, t = running(transform_timeout=0.2)
+    # odometry is gone; only scans come
+    out = feed(sequencer, [scan(t + k * 100 * MS) for k in range(1, 8)])
+    assert [o.stamp for o in out] == [t + k * 100 * MS for k in range(1, 5)]
+    assert sequencer.inputs.counts['scan']['waited_out'] == 4
+    assert not out[-1].motion.known
+    assert len(sequencer.flush()) == 3
+
+
+def test_without_odometry_scans_alone_go_through_after_a_second():
+    sequencer = Sequencer(Parameters())
+    inputs = [scan(T0 + k * 100 * MS) for k in range(30)]
+    out = feed(sequencer, inputs) + sequencer.flush()
+    assert len(out) == 30
+    assert all(not o.motion.known and o.odom_pose is None for o in out[1:])
+    sequencer = Sequencer(Parameters(node=Node(use_odom=False)))
+    out = feed(sequencer, [odometry(T0), *inputs]) + sequencer.flush()
+    assert len(out) == 30
+    assert 'odom' not in sequencer.inputs.counts
+
+
+def test_switched_off_inputs_are_not_used():
+    node = Node(use_imu=False, use_reflectors=False, use_scan=False)
+    sequencer = Sequencer(Parameters(node=node))
+    out = feed(sequencer, drive_inputs(imu=True)) + sequencer.flush()
+    assert len(out) == 30
+    assert all(o.points is None and o.scan is None and o.detections is None for o in out)
+    assert set(sequencer.inputs.counts) == {'odom', 'scan'}
+
+
+# --- bad input ---------------------------------------------------------------------------------
+
+
+def test_late_and_duplicate_inputs_are_counted_and_left_out():
+    sequencer, t = running()
+    t += 10 * MS
+    feed(sequencer, [scan(t), detections(t), odometry(t + 20 * MS)])
+    before = sequencer.buffer.newest
+    assert feed(sequencer, [scan(t), scan(t - 50 * MS), detections(t - 50 * MS)]) == []
+    assert feed(sequencer, [odometry(t + 20 * MS), odometry(t)]) == []
+    counts = sequencer.inputs.totals()
+    assert counts['scan'] == {'duplicate': 1, 'late': 1, 'used': 1}
+    assert counts['reflectors'] == {'late': 1, 'used': 1}
+    assert counts['odom']['duplicate'] == counts['odom']['late'] == 1
+    assert sequencer.buffer.newest == before
+
+
+@pytest.mark.parametrize(
+    ('stream', 'bad'),
+    [
+        ('odom', Odometry(T0 + 4 * SECOND, np.array([np.nan, 0.0, 0.0]))),
+        ('odom', Odometry(T0 + 4 * SECOND, np.array([0.0, 0.0]))),
+        ('odom', Odometry(-5, np.zeros(3))),
+        ('imu', Imu(T0 + 4 * SECOND, float('inf'))),
+        ('imu', Imu(0, 0.1)),
+        ('scan', scan(T0 + 4 * SECOND, ranges=())),
+        ('scan', replace(scan(T0 + 4 * SECOND), angle_min=float('nan'))),
+        ('scan', replace(scan(T0 + 4 * SECOND), angle_increment=0.0)),
+        ('scan', replace(scan(T0 + 4 * SECOND), time_increment=float('inf'))),
+        ('reflectors', detections(T0 + 4 * SECOND, ((np.nan, 1.0),))),
+        (
+            'reflectors',
+            replace(detections(T0 + 4 * SECOND), cov=np.full((1, 2, 2), np.inf)),
+        ),
+    ],
+)
+def test_invalid_input_is_counted_and_costs_nothing(stream, bad):
+    sequencer, t = running()
+    assert add(sequencer, bad) == []
+    assert sequencer.inputs.counts[stream]['invalid'] == 1
+    assert stream in sequencer.inputs.last_error
+    assert sequencer.flush() == []
+    (o,) = feed(sequencer, [scan(t), detections(t), odometry(t + 20 * MS)])
+    assert o.motion.known
+
+
+def test_scan_without_a_single_return_is_an_observation_without_points():
+    sequencer, t = running()
+    (o,) = feed(
+        sequencer, [scan(t, ranges=[np.nan, np.inf, -np.inf, 50.0]), detections(t),
+                    odometry(t + 20 * MS)],
+    )  # fmt: skip
+    assert o.points.shape == (0, 2)
+
+
+def test_unknown_frame_is_refused_and_named():
+    sequencer, t = running()
+    # the first frame gets the parameter's pose, another one has none
+    assert len(feed(sequencer, [scan(t), odometry(t + 20 * MS)])) == 1
+    assert feed(sequencer, [scan(t + 20 * MS, frame='attic')]) == []
+    assert sequencer.inputs.counts['scan']['invalid'] == 1
+    assert "'attic'" in sequencer.inputs.last_error
+    sequencer.set_sensor_pose('attic', np.zeros(3))
+    assert len(feed(sequencer, [scan(t + 20 * MS, frame='attic'), odometry(t + 40 * MS)])) == 1
+
+
+def test_detections_are_moved_from_their_sensor_to_the_base():
+    sequencer, t = running(use_scan=False)
+    T = np.array([0.5, 0.2, np.pi / 2])
+    sequencer.set_sensor_pose('mast', T)
+    # one is too far, and one in the sensor itself: so do some drivers tell that they saw none
+    seen = ((2.0, 1.0), (300.0, 0.0), (0.0, 0.0))
+    (o,) = feed(sequencer, [detections(t, seen, frame='mast')])
+    np.testing.assert_allclose(o.detections.points, [[-0.5, 2.2]], atol=1e-12)
+    np.testing.assert_allclose(o.detections.cov[0], np.diag([1e-4, 4e-4]), atol=1e-15)
+    assert o.detections.frame_id == 'base_link'
+    assert sequencer.inputs.counts['reflectors']['points_out_of_range'] == 1
+
+
+def test_single_stamps_far_ahead_are_left_out():
+    sequencer, t = running()
+    assert feed(sequencer, [odometry(t + 100 * SECOND), scan(t + 100 * SECOND)]) == []
+    more = [odometry(t + k * 20 * MS) for k in range(1, 5)]
+    (o,) = feed(sequencer, [scan(t), detections(t), *more])
+    assert o.motion.known
+    assert sequencer.inputs.counts['odom']['future'] == 1
+    assert sequencer.inputs.counts['scan']['future'] == 1
+
+
+def test_clock_that_stays_ahead_is_followed():
+    sequencer, t = running()
+    ahead = t + 100 * SECOND
+    feed(sequencer, [odometry(ahead + k * 20 * MS) for k in range(100)])
+    s = ahead + 50 * 20 * MS
+    out = feed(sequencer, [scan(s), detections(s), odometry(ahead + 2 * SECOND)])
+    assert [o.stamp for o in out] == [s]
+    assert 'future' not in sequencer.inputs.counts['odom']
+
+
+@pytest.mark.parametrize('pause', [1.5, 8.0, 60.0])
+@pytest.mark.parametrize('odometry_too', [True, False])
+def test_nothing_is_lost_across_a_pause_of_everything(pause, odometry_too):
+    later = int(pause * SECOND)
+    inputs = [m for m in drive_inputs() if odometry_too or not isinstance(m, Odometry)]
+    again = [replace(m, stamp=m.stamp + 3 * SECOND + later) for m in inputs]
+    # the last of them begin a second pause: the end of the data is no reason to lose them
+    last = [replace(m, stamp=m.stamp + 10 * SECOND + 2 * later) for m in inputs[:2]]
+    sequencer = Sequencer(Parameters())
+    out = feed(sequencer, [*inputs, *again, *last]) + sequencer.flush()
+    assert len(out) == 61
+    assert sequencer.inputs.counts['scan']['used'] == 61
+    if odometry_too:
+        assert sequencer.inputs.counts['odom'] == {'used': 301}
+    assert all('future' not in c for c in sequencer.inputs.counts.values())
+
+
+@pytest.mark.parametrize('ahead', [5, 12, 25])
+@pytest.mark.parametrize('stream', ['odom', 'imu', 'scan', 'reflectors'])
+def test_one_stamp_ahead_costs_no_observation(ahead, stream):
+    inputs = drive_inputs(imu=True)
+    late = T0 + SECOND + ahead * SECOND
+    bad = {
+        'odom': odometry(late), 'imu': Imu(late, 0.0), 'scan': scan(late),
+        'reflectors': detections(late),
+    }[stream]  # fmt: skip
+    for at in (0, len(inputs) // 2):
+        sequencer = Sequencer(Parameters())
+        out = feed(sequencer, [*inputs[:at], bad, *inputs[at:]]) + sequencer.flush()
+        assert sequencer.inputs.counts[stream]['future'] == 1
+        known = [o for o in out if o.motion.known and o.odom_pose is not None]
+        # of the first message nothing else tells that it is wrong
+        assert len(known) >= 30 - (0 if at else 3)
+        assert max(o.stamp for o in out) < late
+
+
+def test_first_stamp_of_another_clock_is_found_out():
+    """A message stamped by the wall clock before simulated time."""
+    sequencer = Sequencer(Parameters())
+    inputs = [Imu(T0 + 10**9 * SECOND, 0.0), *drive_inputs()]
+    out = feed(sequencer, inputs) + sequencer.flush()
+    assert len(out) >= 28
+    assert all(o.motion.known for o in out[3:])
+    assert sequencer.inputs.counts['imu']['future'] == 1
+
+
+def test_clock_that_stays_back_is_an_error():
+    sequencer, t = running(until=T0 + 60 * SECOND)
+    feed(sequencer, [scan(t), odometry(t + 20 * MS)])
+    start = T0 + 20 * SECOND
+    for k in range(PERSISTENT - 1):
+        assert add(sequencer, odometry(start + k * 20 * MS)) == []
+    with pytest.raises(InputError, match=r'clock of odom jumped back by \d+'):
+        add(sequencer, odometry(start + SECOND))
+
+
+# --- long times without observations, and the end of odometry ----------------------------------
+
+
+@pytest.mark.parametrize('gap', [5.0, 31.0])
+def test_motion_carried_over_a_long_time_is_the_direct_motion(gap):
+    params = Parameters()
+    sequencer = Sequencer(params)
+    direct = MotionBuffer(params.motion, 1000.0)
+    first, last = T0 + 2 * SECOND, T0 + 2 * SECOND + round(gap * SECOND)
+    out = []
+    for stamp in range(T0, last + 100 * MS, 20 * MS):
+        direct.add_odometry(odometry(stamp))
+        out += add(sequencer, odometry(stamp))
+        if stamp in (first, last):
+            out += feed(sequencer, [scan(stamp), detections(stamp)])
+    _, b = out + sequencer.flush()
+    expected = direct.motion(first, last)
+    assert b.stamp == last
+    assert b.motion.known
+    np.testing.assert_allclose(b.motion.delta, expected.delta, atol=1e-6)
+    np.testing.assert_allclose(b.motion.cov, expected.cov, rtol=1e-6, atol=1e-9)
+
+
+def stalled(imu=False):
+    """Observations every 100 ms while odometry stalls, and the first one after it goes on."""
+    sequencer, t = running()
+    out = feed(sequencer, [scan(t), detections(t), odometry(t + 20 * MS)])
+    stamps = [t + k * 100 * MS for k in range(1, 12)]
+    for s in stamps:
+        if imu:
+            rates = [Imu(r, TURN) for r in range(s - 100 * MS, s + 20 * MS, 10 * MS)]
+            out += feed(sequencer, rates)
+        out += feed(sequencer, [scan(s), detections(s)])
+    out += feed(sequencer, [odometry(t + k * 20 * MS) for k in range(52, 60)])
+    assert [o.stamp for o in out] == [t, *stamps]
+    return t, out[1:]
+
+
+def test_motion_after_a_stall_is_that_since_the_last_observation():
+    """What is seen during a stall says where the robot is: nothing of it is to be made good."""
+    _, out = stalled()
+    known = [o.motion.known for o in out]
+    assert known == sorted(known)
+    assert 2 <= sum(known) <= len(known) - 3
+    for before, o in itertools.pairwise(out):
+        moved = se2.between(pose_at(before.stamp), pose_at(o.stamp))
+        if o.motion.known:
+            np.testing.assert_allclose(o.motion.delta, moved, atol=1e-3)
+        else:
+            assert 0.0 <= o.motion.delta[0] < 1.01 * moved[0]
+
+
+def test_uncertainty_of_a_stall_grows_with_its_length_alone():
+    """One unknown speed: the deviation grows with time, in however many parts it is counted."""
+    t, out = stalled()
+    parts = [o.motion for o in out if not o.motion.known]
+    total = np.sum([m.cov[:2, :2] for m in parts], axis=0)
+    whole = running()[0].buffer
+    whole = whole.extrapolate(t, t + len(parts) * 100 * MS).cov[:2, :2]
+    np.testing.assert_allclose(np.trace(total), np.trace(whole), rtol=0.1)
+
+
+def test_imu_tells_the_turn_while_odometry_stalls():
+    _, without = stalled()
+    _, out = stalled(imu=True)
+    stall = [o.motion for o in out if not o.motion.known][2:]
+    for m in stall:
+        assert m.delta[2] == pytest.approx(0.1 * TURN, rel=1e-6)
+        assert m.bias_gain[2] == pytest.approx(-0.1)
+        assert m.cov[2, 2] < 0.01 * without[4].motion.cov[2, 2]
+
+
+def test_imu_refines_the_motion_between_observations():
+    sequencer = Sequencer(Parameters())
+    out = feed(sequencer, drive_inputs(imu=True)) + sequencer.flush()
+    m = out[15].motion
+    assert m.bias_gain[2] == pytest.approx(-0.1)
+    assert m.bias == pytest.approx(0.0, abs=1e-9)
+    assert np.isfinite(m.bias_var)
+
+
+# --- several lidars ----------------------------------------------------------------------------
+
+
+def two_lidars(offset, delay, seconds=3.0):
+    """Odometry at 50 Hz and two lidars at 10 Hz; the rear one's scans are ``offset`` later.
+
+    The front one's arrive ``delay`` after their stamps, the others at once.
+    """
+    rows = []
+    for k in range(round(seconds * 50)):
+        stamp = T0 + 20 * MS * k
+        rows.append((stamp, 0, odometry(stamp)))
+        if k % 5 == 0:
+            rows.append((stamp + delay, 1, scan(stamp, frame='front')))
+            rows.append((stamp + offset, 2, scan(stamp + offset, (5.0, 6.0), frame='rear')))
+    return [m for *_, m in sorted(rows, key=lambda r: r[:2])]
+
+
+def two_lidar_sequencer():
+    sequencer = Sequencer(Parameters())
+    sequencer.set_sensor_pose('front', np.array([0.3, 0.0, 0.0]))
+    sequencer.set_sensor_pose('rear', np.array([-0.3, 0.0, np.pi]))
+    return sequencer
+
+
+# at once, at the same instant within drivers' rounding, and in between
+@pytest.mark.parametrize('offset', [0, MS, 30 * MS])
+@pytest.mark.parametrize('delay', [0, 90 * MS])
+def test_each_scan_of_two_lidars_is_used_from_its_own_place(offset, delay):
+    sequencer = two_lidar_sequencer()
+    out = feed(sequencer, two_lidars(offset, delay)) + sequencer.flush()
+    # the first period is not known yet: by then the rear lidar's first scan may have been used
+    lost = 1 if delay > offset else 0
+    assert sequencer.inputs.totals()['scan'].get('late', 0) <= lost
+    stamps = [o.stamp for o in out]
+    assert stamps == sorted(set(stamps))
+    for frame, x, n in (('front', 0.3, 4), ('rear', -0.3, 2)):
+        own = [o for o in out if o.scan.frame_id == frame]
+        assert 30 - lost <= len(own) <= 30
+        assert all(abs(o.stamp - o.scan.stamp) <= 1 for o in own)
+        assert all(o.origin[0] == x and len(o.scan.ranges) == n for o in own)
+
+
+def test_silent_lidar_is_not_waited_for():
+    sequencer = two_lidar_sequencer()
+    inputs = two_lidars(30 * MS, 0)
+    half = T0 + SECOND
+    silent = [
+        m for m in inputs if not isinstance(m, Scan) or m.frame_id == 'rear' or m.stamp < half
+    ]
+    out = feed(sequencer, silent) + sequencer.flush()
+    assert [o.scan.frame_id for o in out].count('rear') == 30
+    # while it may still come, the other waits as long as for anything else
+    assert sequencer.inputs.totals()['scan']['waited_out'] <= 10
+
+
+@pytest.mark.parametrize('increment', [1.0, -1e-4, 1e6])
+def test_sweep_of_impossible_length_is_refused_and_holds_nothing_up(increment):
+    sequencer = Sequencer(Parameters())
+    out = []
+    for k in range(1, 40):
+        stamp = k * 100_000_000
+        out += sequencer.add_odometry(Odometry(stamp, np.array([0.01 * k, 0.0, 0.0])))
+        sweep = scan(stamp, time_increment=0.0 if k % 2 else increment)
+        out += sequencer.add_scan(sweep)
+    counts = sequencer.inputs.totals()['scan']
+    assert counts['invalid'] == 19
+    assert 'time_increment' in sequencer.inputs.last_error
+    assert len(out) >= 18
+
+
+@pytest.mark.parametrize('sigma', [1e-8, 1e5, 1e19])
+def test_sigma_that_nobody_can_mean_is_bounded_and_counted(sigma):
+    sequencer = Sequencer(Parameters())
+    d = detections(200_000_000)
+    d = replace(d, cov=np.broadcast_to(sigma**2 * np.eye(2), d.cov.shape))
+    sequencer.add_odometry(Odometry(100_000_000, np.zeros(3)))
+    sequencer.add_detections(d)
+    (observation,) = sequencer.flush()
+    values = np.sqrt(np.linalg.eigvalsh(observation.detections.cov))
+    assert 0.99 * SIGMA[0] <= values.min() <= values.max() <= 1.01 * SIGMA[1]
+    assert sequencer.inputs.totals()['reflectors']['sigma_bounded'] == 1
+
+
+def test_scan_that_is_sent_again_while_the_robot_drives_is_left_out():
+    ranges = np.random.default_rng(0).uniform(1.0, 9.0, 100)
+    sequencer, _ = running(until=T0)
+    stamps = [T0 + k * 100 * MS for k in range(8)]
+    inputs = []
+    for k, stamp in enumerate(stamps):
+        sent = ranges if k < 5 else ranges + 0.01 * k  # then the driver is well again
+        inputs += [scan(stamp, sent), detections(stamp)]
+        inputs += [odometry(stamp + j * 20 * MS) for j in range(1, 6)]
+    out = feed(sequencer, inputs) + sequencer.flush()
+    assert [o.stamp for o in out] == stamps
+    # 8 cm in each interval
+    assert [o.points is not None for o in out] == [True, *[False] * 4, True, True, True]
+    assert [o.detections is not None for o in out] == [o.points is not None for o in out]
+    assert sequencer.inputs.counts['scan']['repeated'] == 4
+    moved = se2.between(pose_at(stamps[0]), pose_at(stamps[5]))
+    way = np.zeros(3)
+    for o in out[1:6]:
+        way = se2.compose(way, o.motion.delta)
+    np.testing.assert_allclose(way, moved, atol=1e-6)

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A closure enters where the graph expects it, or with others that agree, seen from apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from rlml_slam import se2
+from rlml_slam.graph.incremental.online_solver import Live
+from rlml_slam.graph.model.graph import Graph
+from rlml_slam.graph.robust.inlier_evidence import uniform
+from rlml_slam.graph.robust.spanning_forest import Backbone
+from rlml_slam.slam.closures.closure_consistency import _Between, may_enter
+from rlml_slam.types import EdgeKind
+
+SIGMA = np.array([0.02, 0.02, 0.005])
+STEP = 0.25  # [m] between two poses
+LAP = 80  # poses of a circle
+WRONG = uniform(6.0)
+COV = np.diag(np.array([0.02, 0.02, 0.005]) ** 2)
+
+
+def true(k):
+    phi = 2.0 * np.pi * np.asarray(k) / LAP
+    radius = STEP * LAP / (2.0 * np.pi)
+    return np.stack([radius * np.cos(phi), radius * np.sin(phi), se2.wrap(phi + np.pi / 2.0)], -1)
+
+
+@pytest.fixture(scope='module')
+def graph():
+    """Two laps by odometry alone."""
+    out, rng = Graph(), np.random.default_rng(3)
+    out.add_pose(true(0), fixed=True)
+    for k in range(1, 2 * LAP):
+        delta = se2.compose(se2.between(true(k - 1), true(k)), SIGMA * rng.standard_normal(3))
+        out.add_pose(se2.compose(out.poses[-1], delta))
+        out.add_edge(EdgeKind.ODOMETRY, k - 1, k, delta, np.diag(SIGMA**-2))
+    return out
+
+
+def tried(graph, ends, shift=(0.0, 0.0, 0.0), sight=0.0):
+    """Whether closures (i, j) may enter which say that the true places are off by a shift."""
+    nodes = np.array(ends)
+    off = se2.compose(np.asarray(shift, dtype=np.float64), true(nodes[:, 1]))
+    deltas = se2.between(true(nodes[:, 0]), off)
+    covs = np.broadcast_to(COV, (len(nodes), 3, 3))
+    return may_enter(Live(graph), nodes, deltas, covs, WRONG, sight=sight)
+
+
+def sure(graph):
+    """The same graph after many closures: sharp all over."""
+    out = Graph()
+    out.add_poses(true(np.arange(2 * LAP)))
+    out.fixed_poses[0] = True
+    e = graph.edges
+    for (i, j), information in zip(e.nodes, e.information, strict=True):
+        out.add_edge(EdgeKind.ODOMETRY, i, j, se2.between(true(i), true(j)), information)
+    for k in range(LAP):
+        delta = se2.between(true(k), true(k + LAP))
+        out.add_edge(EdgeKind.CLOSURE, k, k + LAP, delta, np.linalg.inv(COV))
+    return out
+
+
+def test_covariance_of_where_a_pose_is_adds_up_along_a_chain(graph):
+    i, j = np.array([3, 90, 7, 0]), np.array([100, 20, 8, 159])
+    covs = _Between(Live(graph), np.unique([i, j])).covs(i, j)
+    chain = Backbone(graph, np.arange(len(graph.edges))).motion(i, j)[1]
+    assert_allclose(covs, chain, rtol=1e-6, atol=1e-12)
+
+
+def test_closure_that_the_graph_expects_enters_alone(graph):
+    assert tried(graph, [(5, 5 + LAP)]).all()
+    assert tried(sure(graph), [(5, 5 + LAP)]).all()
+
+
+def test_surer_the_graph_the_nearer_it_must_be(graph):
+    off = (0.4, 0.0, 0.0)
+    assert tried(graph, [(5, 5 + LAP)], off).all()
+    assert not tried(sure(graph), [(5, 5 + LAP)], off).any()
+
+
+def test_far_one_waits_until_others_from_apart_agree(graph):
+    far = (2.0, 0.0, 0.0)
+    sharp = sure(graph)
+    ends = [(k, k + LAP) for k in range(5, 70, 5)]
+    assert not tried(sharp, ends[:1], far).any()
+    assert not tried(sharp, ends[:3], far).any()
+    assert tried(sharp, ends, far).all()
+
+
+def test_more_of_them_are_asked_where_the_graph_is_surer(graph):
+    ends = [(k, k + LAP) for k in range(5, 70, 5)]
+    far = (2.0, 0.0, 0.0)
+
+    def asked(one):
+        return next(n for n in range(1, len(ends) + 1) if tried(one, ends[:n], far).any())
+
+    assert 1 < asked(graph) < asked(sure(graph))
+
+
+def test_views_from_one_place_count_as_one(graph):
+    """However many there are, and of however many submaps."""
+    far = (2.0, 0.0, 0.0)
+    ends = [(i, j + LAP) for i in range(5, 9) for j in (5, 6, 7)]
+    assert not tried(sure(graph), ends, far).any()
+
+
+def test_views_of_the_same_walls_count_as_one(graph):
+    """In a long corridor one sees the same for longer than between desks."""
+    far, sharp = (2.0, 0.0, 0.0), sure(graph)
+    ends = [(k, k + LAP) for k in range(5, 70, 5)]
+    assert tried(sharp, ends, far, sight=1.0).all()
+    assert not tried(sharp, ends, far, sight=5.0).any()
+
+
+def test_wrong_ones_that_disagree_help_no_one(graph):
+    rng = np.random.default_rng(0)
+    nodes = np.array([(k, k + LAP) for k in range(5, 70, 5)])
+    shift = np.column_stack([rng.uniform(-3.0, 3.0, (len(nodes), 2)), np.zeros(len(nodes))])
+    shift[:, :2] += 2.0 * np.sign(shift[:, :2])
+    deltas = se2.between(true(nodes[:, 0]), se2.compose(shift, true(nodes[:, 1])))
+    covs = np.broadcast_to(COV, (len(nodes), 3, 3))
+    assert not may_enter(Live(sure(graph)), nodes, deltas, covs, WRONG).any()
+
+
+def test_nothing_depends_on_the_order_of_submaps_or_on_the_frame(graph):
+    ends = [(k, k + LAP) for k in range(5, 40, 5)]
+    far = (0.9, 0.0, 0.0)
+    flags = tried(graph, ends, far)
+    moved = Graph()
+    moved.add_poses(se2.compose(np.array([3.0, -2.0, 1.1]), graph.poses))
+    moved.fixed_poses[0] = True
+    e = graph.edges
+    moved.add_edges(EdgeKind.ODOMETRY, e.nodes, e.measured, e.information)
+    assert (tried(moved, ends, far) == flags).all()
+    assert (tried(graph, ends[::-1], far) == flags[::-1]).all()

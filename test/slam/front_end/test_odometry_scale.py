@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+from made_worlds import SECOND, STEP
+
+from rlml_slam import se2
+from rlml_slam.params import MotionNoise
+from rlml_slam.slam.front_end.joint_state import WHEELS, JointState
+from rlml_slam.slam.front_end.odometry_scale import went_on
+from rlml_slam.types import Motion
+
+NOISE = MotionNoise()
+SIGMA = np.array([0.01, 0.01, 0.001])  # of a pose that is measured
+DT = STEP / SECOND
+
+
+def drive(rng, shares, steps, turning=0.6):
+    """Estimates, covariances and truth of the shares, of a robot that sees where it is.
+
+    It goes at 1 m/s and turns at ``turning`` [rad/s], to the left and to the right by turns.
+    """
+    state = JointState(np.zeros(3), np.zeros((3, 3)), 0.0, wheels=NOISE.wheels)
+    pose, velocity, kept = np.zeros(3), np.zeros(3), np.exp(-DT / NOISE.wheels_time)
+    shares = np.array(shares)
+    for k in range(steps):
+        v, w = 1.0, turning * (-1.0) ** (k // 100)
+        true = se2.exp(np.array([v, 0.0, w]) * DT)
+        pose = se2.compose(pose, true)
+        sigma = np.array([NOISE.a * v + NOISE.b, NOISE.c * abs(w) + NOISE.d]) * DT
+        tells = np.array([v, w]) * DT / (1.0 + shares) + sigma * rng.standard_normal(2)
+        half = 0.5 * tells[1]
+        delta = np.array([tells[0] * np.cos(half), tells[0] * np.sin(half), tells[1]])
+        cov = np.diag([sigma[0], 1e-4, sigma[1]]) ** 2
+        by_turn = tells[1] * np.array([-0.5 * delta[1], 0.5 * delta[0], 1.0])
+        before = state.pose
+        motion = Motion(delta, cov, turn_gain=by_turn)
+        state.predict(motion, 0.0, kept, went_on(velocity, DT, NOISE))
+        z = pose + SIGMA * rng.standard_normal(3)
+        error = z - state.pose
+        error[2] = se2.wrapped(error[2])
+        state.apply(np.arange(3), np.eye(3), np.diag(SIGMA**2), error)
+        velocity = se2.log(se2.between(before, state.pose)) / DT
+        innovation = np.sqrt(1.0 - kept**2) * np.array(NOISE.wheels)
+        shares = kept * shares + innovation * rng.standard_normal(2)
+    return state.x[WHEELS], state.P[WHEELS, WHEELS], shares
+
+
+def test_worn_wheels_are_found_out():
+    rng = np.random.default_rng(0)
+    drives = [drive(rng, (0.04, -0.05), 800) for _ in range(8)]
+    error = np.mean([x - true for x, _, true in drives], axis=0)
+    sigma = np.sqrt(np.mean([np.diag(P) for _, P, _ in drives], axis=0))
+    assert (sigma < 0.5 * np.array(NOISE.wheels)).all()
+    # a mean of eight: four sigmas of it
+    assert (np.abs(error) < 4.0 * sigma / np.sqrt(8.0)).all()
+
+
+def test_shares_are_as_sure_as_they_are_said_to_be():
+    rng = np.random.default_rng(1)
+    runs = 60
+    nees = []
+    for _ in range(runs):
+        x, P, true = drive(rng, rng.normal(0.0, NOISE.wheels), 300)
+        e = x - true
+        nees.append(e @ np.linalg.solve(P, e))
+    # chi-square of 2 degrees of freedom: a mean of 2, the sigma of which is 2 / sqrt(runs)
+    assert np.mean(nees) == pytest.approx(2.0, abs=4.0 * 2.0 / np.sqrt(runs))
+
+
+def test_noise_of_the_wheels_is_not_taken_for_a_share():
+    # with what the wheels tell as the derivative, the share of turn comes to -0.4 here
+    x, P, _ = drive(np.random.default_rng(2), (0.0, 0.0), 2000, turning=0.0)
+    assert abs(x[1]) < 0.01
+    assert P[1, 1] == pytest.approx(NOISE.wheels[1] ** 2, rel=0.02)
+
+
+def test_what_may_be_no_way_at_all_tells_nothing():
+    """After a jump of the pose its velocity is none; unseen, a robot may have braked."""
+    assert went_on(np.array([1.0, 0.0, 0.1]), 0.5, NOISE).all()
+    for velocity, dt in (((1.0, 0.0, 0.1), 5.0), ((50.0, 0.0, 0.1), 0.5), ((1.0, 0.0, 50.0), 0.5)):
+        assert not went_on(np.array(velocity), dt, NOISE).any()

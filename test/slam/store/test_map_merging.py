@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two maps become one where their reflectors tell how they lie, and nowhere else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_worlds import ROOM, drive, errors, messages
+
+from rlml_slam import se2
+from rlml_slam.cli.main import main
+from rlml_slam.errors import MapError
+from rlml_slam.maps import map_container
+from rlml_slam.matching.reflectors.constellation import locate
+from rlml_slam.params import Parameters, Relocalization
+from rlml_slam.slam.back_end.back_end import BackEnd
+from rlml_slam.slam.back_end.trajectory import poses_of
+from rlml_slam.slam.store import map_file
+from rlml_slam.slam.store.map_merging import APART, merge_maps
+from rlml_slam.slam.system import Slam
+from rlml_slam.types import Detections, Odometry, Scan, Verdict
+
+PARAMS = Parameters(back_end=replace(Parameters().back_end, submap_size=10))
+CURVE = drive((0.6, 0.0, 3.0), (0.6, 0.6, 6.0), (0.5, -0.7, 4.0))
+START = np.array([2.0, -1.4, 1.2])
+AGAIN = drive((0.5, 0.5, 7.0), (0.4, -0.5, 4.0), start=START)
+
+
+def mapped(world, poses, seed, scan=True):
+    """A back end that knows nothing of where in the world its first pose is."""
+    slam = Slam(PARAMS)
+    slam.set_sensor_pose('laser', np.zeros(3))
+    add = {Odometry: slam.add_odometry, Scan: slam.add_scan, Detections: slam.add_detections}
+    for m in messages(world, poses, scan=scan, rng=np.random.default_rng(seed)):
+        add[type(m)](m)
+    slam.finish()
+    return slam.back_end
+
+
+@pytest.fixture(scope='module')
+def two():
+    first, second = mapped(ROOM, CURVE, 0), mapped(ROOM, AGAIN, 1)
+    return [map_file.content_of(b, PARAMS, None) for b in (first, second)]
+
+
+@pytest.fixture(scope='module')
+def merged(two):
+    return merge_maps(*two, PARAMS)
+
+
+def test_second_map_is_put_where_it_lies(two, merged):
+    a, b = (len(c.arrays['pose']) for c in two)
+    np.testing.assert_allclose(merged.T_first_second, START, atol=0.05)
+    poses = merged.back_end.graph.poses
+    assert len(poses) == a + b
+    stamps = (two[1].arrays['key_stamp'] - 1_000_000_000) // 100_000_000
+    distance, turn = errors(poses[a:], AGAIN[stamps])
+    assert distance.max() < 0.05
+    assert turn.max() < 0.03
+
+
+def test_what_both_have_seen_is_there_once(two, merged):
+    found = merged.back_end.reflectors()
+    gap = np.linalg.norm(found.points[:, None] - ROOM.reflectors, axis=-1)
+    assert len(found) == len(ROOM.reflectors) == merged.joined
+    assert gap.min(axis=0).max() < 0.03
+    # of what both know: better than either
+    alone = map_file.saved_map(two[0]).reflectors
+    assert np.trace(found.cov.sum(axis=0)) < np.trace(alone.cov.sum(axis=0))
+
+
+def test_frames_of_both_are_kept(two, merged):
+    path = merged.content.arrays['path']
+    assert len(path) == sum(len(c.arrays['path']) for c in two)
+    assert (np.diff(path['stamp']) >= 0).all()
+    poses = poses_of(path, merged.content.arrays['path_motion'], merged.back_end.graph.poses)
+    of = (path['stamp'] - 1_000_000_000) // 100_000_000
+    second = path['key'] >= len(two[0].arrays['pose'])
+    assert errors(poses[~second], CURVE[of[~second]])[0].max() < 0.05
+    assert errors(poses[second], AGAIN[of[second]])[0].max() < 0.05
+
+
+def test_graph_is_one_and_at_its_optimum(two, merged):
+    back_end = merged.back_end
+    assert merged.closures > 0
+    assert back_end.graph.fixed_poses.sum() == 1
+    before = back_end.graph.poses.copy()
+    back_end.optimize()
+    np.testing.assert_allclose(back_end.graph.poses, before, atol=1e-3)
+
+
+def test_merged_map_is_saved_and_gone_on_with(merged, tmp_path):
+    path = map_file.save(tmp_path / 'c.rlml', merged.back_end, PARAMS)
+    again = BackEnd(PARAMS)
+    map_file.restore(map_file.load(path), again)
+    assert again.graph.chi2() == merged.back_end.graph.chi2()
+    numbers = [c.number for c in again.scans.closures if c.accepted]
+    assert len(set(numbers)) == len(numbers)
+    slam = Slam(PARAMS)
+    slam.continue_map(map_file.load(path))
+    slam.set_sensor_pose('laser', np.zeros(3))
+    for m in messages(ROOM, AGAIN, rng=np.random.default_rng(5)):
+        {Odometry: slam.add_odometry, Scan: slam.add_scan, Detections: slam.add_detections}[
+            type(m)
+        ](m)
+    slam.finish()
+    assert len(slam.reflectors()) == len(ROOM.reflectors)
+    assert errors(slam.trajectory()[1][-1:], AGAIN[-1:])[0][0] < 0.06
+
+
+def test_maps_of_which_nothing_tells_how_they_lie_are_refused(two, tmp_path, capsys):
+    square = np.array([[-1.5, -2.0], [1.5, -2.0], [1.5, 2.0], [-1.5, 2.0]])
+    for world in (
+        replace(ROOM, reflectors=square),
+        replace(ROOM, reflectors=np.random.default_rng(2).uniform(-2.0, 3.0, (5, 2))),
+    ):
+        other = map_file.content_of(mapped(world, AGAIN, 3), PARAMS, None)
+        with pytest.raises(MapError, match='do not tell how the maps lie'):
+            merge_maps(two[0], other, PARAMS)
+    # twice the same square could be turned four ways
+    twin = map_file.content_of(mapped(replace(ROOM, reflectors=square), CURVE, 4), PARAMS, None)
+    with pytest.raises(MapError, match='do not tell'):
+        merge_maps(twin, twin, PARAMS)
+
+
+@pytest.mark.parametrize('is_first', [False, True])
+def test_map_without_a_scan_is_merged_with_one_of_scans(two, is_first):
+    blind = map_file.content_of(mapped(ROOM, AGAIN, 2, scan=False), PARAMS, None)
+    pair = (blind, two[0]) if is_first else (two[0], blind)
+    merged = merge_maps(*pair, PARAMS)
+    assert merged.joined == len(ROOM.reflectors)
+    again = map_file.saved_map(merged.content)
+    assert len(again.reflectors) == len(ROOM.reflectors)
+    shapes = [c.arrays['submap_shape'] for c in (two[0], merged.content)]
+    np.testing.assert_array_equal(*shapes)
+
+
+def test_map_of_an_older_program_is_refused(two):
+    older = {k: v for k, v in two[1].arrays.items() if k != 'reflector_gone'}
+    for pair in ((two[0], two[1]._replace(arrays=older)), (two[1]._replace(arrays=older),) * 2):
+        with pytest.raises(MapError, match='older program'):
+            merge_maps(*pair, PARAMS)
+
+
+def test_command_merges_files(two, tmp_path, capsys):
+    names = [str(map_container.write(tmp_path / f'{k}.rlml', c)) for k, c in enumerate(two)]
+    out = tmp_path / 'c.rlml'
+    assert main(['map', 'merge', *names, '--out', str(out)]) == 0
+    assert 'reflectors in both' in capsys.readouterr().out
+    assert len(map_file.saved_map(map_file.load(out)).reflectors) == len(ROOM.reflectors)
+
+
+@pytest.mark.parametrize(('shared', 'told'), [(7, True), (2, False)])
+def test_maps_that_overlap_by_a_few_reflectors_are_placed_by_these(shared, told):
+    rng = np.random.default_rng(8)
+    west, both, east = (
+        rng.uniform(low, high, (n, 2))
+        for low, high, n in (
+            ((0.0, 0.0), (25.0, 20.0), 15), ((25.0, 0.0), (30.0, 20.0), shared),
+            ((30.0, 0.0), (55.0, 20.0), 15),
+        )
+    )  # fmt: skip
+    second = np.vstack([both, east])
+    seen = se2.transform(se2.inverse(START), second) + 0.01 * rng.standard_normal(second.shape)
+    first = np.vstack([west, both])
+    cov = [np.tile(1e-4 * np.eye(2), (len(p), 1, 1)) for p in (seen, first)]
+    stars = locate(seen, cov[0], first, cov[1], replace(Relocalization(), ghosts=APART))
+    assert (stars.verdict is Verdict.UNIQUE) == told, stars.why
+    if told:
+        np.testing.assert_allclose(stars.candidates[0].pose, START, atol=0.03)

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Small made-up graphs for the tests of graph/, and the place of the shared data sets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rlml_slam import se2
+from rlml_slam.graph.model.graph import Graph
+from rlml_slam.graph.model.robust_loss import Losses
+from rlml_slam.types import EdgeKind
+
+SHARED_GRAPHS = Path(__file__).resolve().parents[2].parent / 'shared' / 'data' / 'graphs-2d'
+
+
+def shared_graph(name: str) -> Path:
+    path = SHARED_GRAPHS / name
+    if not path.exists():
+        pytest.skip(f'needs the shared data set {name} in {SHARED_GRAPHS}')
+    return path
+
+
+def loop_graph(
+    seed: int = 0,
+    poses: int = 30,
+    landmarks: int = 8,
+    noise: float = 1.0,
+    start_noise: float = 0.0,
+    losses: Losses | None = None,
+) -> tuple[Graph, np.ndarray, np.ndarray]:
+    """A robot on two laps of a circle that sees landmarks within 6 m: (graph, truth, truth).
+
+    ``noise`` scales the measurement noise; the information always matches noise = 1.
+    """
+    rng = np.random.default_rng(seed)
+    phi = 4.0 * np.pi * np.arange(poses) / poses
+    truth = np.stack([5 * np.cos(phi), 5 * np.sin(phi), se2.wrap(phi + np.pi / 2)], -1)
+    points = rng.uniform(-8.0, 8.0, (landmarks, 2))
+    sigma = np.array([0.05, 0.05, 0.02])
+    graph = Graph(losses)
+    start = truth + start_noise * rng.standard_normal(truth.shape) * [0.1, 0.1, 0.05]
+    start[0] = truth[0]
+    graph.add_poses(start)
+    graph.fixed_poses[0] = True
+    graph.add_landmarks(points + start_noise * 0.1 * rng.standard_normal(points.shape))
+    pairs = [(i, i + 1) for i in range(poses - 1)]
+    pairs += [(i, i + poses // 2) for i in range(0, poses - poses // 2, 4)]
+    for i, j in pairs:
+        e = noise * sigma * rng.standard_normal(3)
+        delta = se2.compose(se2.between(truth[i], truth[j]), e)
+        kind = EdgeKind.ODOMETRY if j == i + 1 else EdgeKind.CLOSURE
+        graph.add_edge(kind, i, j, delta, np.diag(sigma**-2))
+    for i in range(poses):
+        seen = se2.transform(se2.inverse(truth[i]), points)
+        for k in np.flatnonzero(np.hypot(*seen.T) < 6.0):
+            z = seen[k] + noise * 0.03 * rng.standard_normal(2)
+            graph.add_sighting(i, int(k), z, np.eye(2) / 0.03**2)
+    return graph, truth, points
