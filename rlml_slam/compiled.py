@@ -16,12 +16,12 @@ import numba
 from llvmlite import ir
 from numba.extending import intrinsic
 
-from rlml_slam.kernel_cache import forget_stale
+from rlml_slam.kernel_cache import remove_stale
 
 F = TypeVar('F', bound=Callable[..., Any])
 
 
-forget_stale(Path(__file__).parent)
+remove_stale(Path(__file__).parent)
 
 
 def kernel(function: F) -> F:

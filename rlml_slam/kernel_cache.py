@@ -20,7 +20,7 @@ import numba
 MAKER = 'rlml_slam.compiled'
 
 
-def forget_stale(package: Path) -> None:
+def remove_stale(package: Path) -> None:
     """Delete the compiled kernels of a package which were made of other sources.
 
     Where the folder cannot be written to, and NUMBA_CACHE_DIR tells no other, Numba keeps them

@@ -125,7 +125,7 @@ class _Noise(NamedTuple):
     imu_c: float
     imu_d: float
     interval: float
-    guess: float
+    long_interval_noise: float
     max_gap: float
     max_speed: float
     max_turn_rate: float
@@ -178,10 +178,10 @@ def _drive(
         sigma_v, sigma_w = n.max_speed / 5.0, n.max_turn_rate / 5.0
         if known:
             speed, turn = v[at], w[at]
-            # when inside a long interval the motion happened is a guess
-            guess = n.guess if gap > 2.0 * n.interval else 0.0
-            sigma_v = (n.a + guess) * abs(speed) + n.b
-            sigma_w = (n.c + guess) * abs(turn) + n.d
+            # when inside a long interval the motion happened is a long_interval_noise
+            long_interval_noise = n.guess if gap > 2.0 * n.interval else 0.0
+            sigma_v = (n.a + long_interval_noise) * abs(speed) + n.b
+            sigma_w = (n.c + long_interval_noise) * abs(turn) + n.d
         # the wheels do not turn: so does the robot not, and the IMU shows its bias
         stands = known and speed == 0.0 and turn == 0.0
         if stands:

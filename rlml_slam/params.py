@@ -185,20 +185,20 @@ class MotionNoise(Group, prefix='motion.'):
     lateral: float = param(0.05, 'sideways slip per speed', '', 0.0, 10.0)
     imu_c: float = param(0.005, "the IMU's turn rate noise per turn rate", '', 0.0, 10.0)
     imu_d: float = param(0.003, "the IMU's turn rate noise floor", 'rad/s', 0.0, 10.0)
-    imu_bias: float = param(0.02, "the IMU's bias at start, 1 sigma", 'rad/s', 0.0, 10.0)
+    imu_bias_sigma: float = param(0.02, "the IMU's bias at start, 1 sigma", 'rad/s', 0.0, 10.0)
     imu_bias_walk: float = param(2e-4, "random walk of the IMU's bias", 'rad/s/sqrt(s)', 0.0, 1.0)
-    wheels: tuple[float, ...] = param(
+    scale_error_sigma: tuple[float, ...] = param(
         (0.03, 0.05),
         'share by which odometry errs in speed and in turn for a long time, 1 sigma; 0: never',
         '',
         0.0,
         1.0,
     )
-    wheels_time: float = param(
+    scale_error_time: float = param(
         600.0, 'correlation time of that error: load, floor, tyres', 's', 1.0, 1e6
     )
     interval: float = param(0.1, 'control interval that a, b, c, d are given for', 's', 1e-3, 10.0)
-    guess: float = param(
+    long_interval_noise: float = param(
         0.2,
         'noise per speed and turn rate added inside an interval over two times `interval`',
         '',
@@ -210,13 +210,15 @@ class MotionNoise(Group, prefix='motion.'):
         5.0, 'a faster odometry step is a jump and is not used', 'm/s', 0.01, 100.0
     )
     max_turn_rate: float = param(15.0, 'a faster odometry turn is a jump', 'rad/s', 0.01, 100.0)
-    free_speeds: tuple[float, ...] = param(
+    constant_velocity_sigma: tuple[float, ...] = param(
         (1.0, 0.1, 2.0),
         'speed forward, sideways and of turning of a robot without odometry, 1 sigma',
         'm/s, m/s, rad/s',
     )
-    free_time: float = param(4.0, 'correlation time of these speeds', 's', 0.01, 60.0)
-    free_jitter: float = param(0.02, 'error of the stamps that it is told by', 's', 0.0, 1.0)
+    constant_velocity_time: float = param(4.0, 'correlation time of these speeds', 's', 0.01, 60.0)
+    constant_velocity_stamp_sigma: float = param(
+        0.02, 'error of the stamps that it is told by', 's', 0.0, 1.0
+    )
 
 
 @dataclass(frozen=True)
@@ -240,14 +242,14 @@ class Reflector(Group):
         0.5,
         0.9999999,
     )
-    blur: float = param(
+    separability_sigma: float = param(
         4.0, 'anonymous reflectors within this many sigmas of a detection are one', '', 0.0, 100.0
     )
-    density: float = param(
+    unmapped_density: float = param(
         0.02, 'reflectors per area that may stand unmapped: what a match competes with', '1/m²',
         1e-6, 10.0,
     )  # fmt: skip
-    sure: float = param(
+    match_probability: float = param(
         0.99, 'probability of a match of an anonymous reflector to be used at once', '', 0.5, 1.0
     )
     track_timeout: float = param(
@@ -262,14 +264,14 @@ class Reflector(Group):
     candidate_timeout: float = param(
         20.0, 'a candidate not seen again for this long is dropped', 's', 0.1, 1e4
     )
-    gone: float = param(
+    persistence_threshold: float = param(
         1e-3, 'probability of still being there below which a reflector leaves the map; 0: never',
         '', 0.0, 0.1,
     )  # fmt: skip
     robust_scale: float = param(
         3.0, 'Cauchy scale of the reflector residual, in sigmas', '', 0.5, 100.0
     )
-    alike: float = param(
+    correlated_share: float = param(
         0.05, "share of a detection's variance that those of one keyframe have in common", '', 0.0,
         1.0,
     )  # fmt: skip
@@ -285,21 +287,21 @@ class Submap(Group):
     max_points: int = param(500, 'most end points of one scan that are inserted', '', 20, 100000)
     p_hit: float = param(0.7, 'occupancy probability that one hit adds', '', 0.5, 0.99)
     p_miss: float = param(0.46, 'occupancy probability that one miss leaves', '', 0.01, 0.5)
-    bias2: tuple[float, ...] = param(
+    bias_variance: tuple[float, ...] = param(
         (1e-4, 1e-4, 2.25e-6),
         "variance of a submap's own error, common to its scans",
         'm², m², rad²',
         0.0,
         100.0,
     )
-    grid_bias2: tuple[float, ...] = param(
+    grid_bias_variance: tuple[float, ...] = param(
         (4e-4, 4e-4, 9e-6),
         'variance of a fix in the grid of a saved map, common to its beams',
         'm², m², rad²',
         0.0,
         100.0,
     )
-    size: int = param(90, 'insertions that complete a submap', '', 2, 10000)
+    insertions: int = param(90, 'insertions that complete a submap', '', 2, 10000)
     min_travel: float = param(0.1, 'travel between two insertions', 'm', 0.0, 10.0)
     min_turn: float = param(0.08, 'turn between two insertions', 'rad', 0.0, 3.2)
 
@@ -319,24 +321,24 @@ class ScanMatch(Group):
         0.03, 'error of an end point across its surface, correlation included', 'm', 1e-3, 10.0
     )
     min_points: int = param(20, 'scans with fewer end points are not used', '', 3, 10000)
-    floor2: tuple[float, ...] = param(
+    variance_floor: tuple[float, ...] = param(
         (1e-6, 1e-6, 1e-7), 'variance of a match that more beams do not lower', 'm², m², rad²',
         0.0, 100.0,
     )  # fmt: skip
     min_score: float = param(
         0.3, 'mean hit probability below which a match is not used', '', 0.0, 1.0
     )
-    good_score: float = param(
+    search_score: float = param(
         0.55, 'mean hit probability below which the start is searched for', '', 0.0, 1.0
     )
     search_window: float = param(0.1, 'half width of the search', 'm', 0.0, 10.0)
     search_angle: float = param(0.35, 'half width of the search', 'rad', 0.0, 3.2)
-    poor_score: float = param(
+    wide_search_score: float = param(
         0.58, 'mean hit probability below which the wide search is made', '', 0.0, 1.0
     )
     wide_window: float = param(0.6, 'half width of the wide search', 'm', 0.0, 10.0)
     wide_angle: float = param(0.5, 'half width of the wide search', 'rad', 0.0, 3.2)
-    search_share: float = param(
+    search_prior_weight: float = param(
         0.05, 'share of the hits that a component far from the prior costs in the search', '',
         0.0, 1.0,
     )  # fmt: skip
@@ -354,19 +356,19 @@ class ScanMatch(Group):
 class HealthLimits(Group, prefix='health.'):
     """When the estimate counts as DEGRADED or LOST."""
 
-    patience: float = param(1.0, 'an input may fail for this long', 's', 0.0, 60.0)
+    input_timeout: float = param(1.0, 'an input may fail for this long', 's', 0.0, 60.0)
     confirm_time: float = param(
         5.0, 'LOST when nothing matches the saved map for this long', 's', 0.0, 600.0
     )
     confirm_distance: float = param(
         5.0, 'DEGRADED when the saved map has not confirmed the pose for this far', 'm', 0.0, 1e4
     )
-    weak_sigma: float = param(
+    degenerate_sigma: float = param(
         0.15, 'a scan that holds a direction worse leaves it open', 'm', 1e-3, 10.0
     )
     sigma_degraded: float = param(0.5, 'DEGRADED beyond this position sigma', 'm', 1e-3, 100.0)
     sigma_lost: float = param(2.0, 'LOST beyond this position sigma', 'm', 1e-3, 1000.0)
-    doubt_share: float = param(
+    contradiction_ratio: float = param(
         0.6, 'a scan that fits less than this share of the usual contradicts the map', '', 0.0, 1.0
     )
     lost_time: float = param(
@@ -391,10 +393,10 @@ class BackEnd(Group):
         'relative', 'covariance of an edge: of the relative motion, or eq. 14 literally',
         choices=('relative', 'sum'),
     )  # fmt: skip
-    edge_floor2: tuple[float, ...] = param(
+    edge_variance_floor: tuple[float, ...] = param(
         (1e-6, 1e-6, 1e-7), 'variance added to every odometry edge', 'm², m², rad²', 0.0, 100.0
     )
-    scan_floor2: tuple[float, ...] = param(
+    scan_edge_variance_floor: tuple[float, ...] = param(
         (1e-4, 1e-4, 4e-6),
         'variance added to a scan edge: of what the keyframes of one submap have in common',
         'm², m², rad²',
@@ -445,7 +447,7 @@ class BackEnd(Group):
         0.02, 'error of a surveyed place per axis; 0.001 holds reflectors where surveyed', 'm',
         0.001, 1.0,
     )  # fmt: skip
-    path_frames: int = param(
+    max_trajectory_frames: int = param(
         1_000_000, 'frames of which the path is kept; beyond, every second one is let go', '',
         1000, 100_000_000,
     )  # fmt: skip
@@ -461,19 +463,21 @@ class LoopClosure(Group):
         0.1, 100.0,
     )  # fmt: skip
     min_score: float = param(0.55, 'mean hit probability that a closure must reach', '', 0.1, 1.0)
-    every: int = param(3, 'try every n-th keyframe', '', 1, 1000)
-    floor2: tuple[float, ...] = param(
+    keyframe_interval: int = param(3, 'try every n-th keyframe', '', 1, 1000)
+    variance_floor: tuple[float, ...] = param(
         (1e-4, 1e-4, 1e-5), 'variance of a closure that more beams do not lower', 'm², m², rad²',
         0.0, 100.0,
     )  # fmt: skip
-    candidates: int = param(3, 'submaps tried per keyframe, nearest first', '', 1, 100)
-    max_second: float = param(0.95, 'score of the second place relative to the best', '', 0.1, 1.0)
+    max_candidates: int = param(3, 'submaps tried per keyframe, nearest first', '', 1, 100)
+    ambiguity_ratio: float = param(
+        0.95, 'score of the second place relative to the best', '', 0.1, 1.0
+    )
     search_window: float = param(3.0, 'least half width of the search', 'm', 0.1, 100.0)
     search_angle: float = param(0.5, 'least half width of the search', 'rad', 0.01, 3.2)
-    widest_window: float = param(
+    max_search_window: float = param(
         12.0, 'the search is as wide as the pose is uncertain, but no wider', 'm', 0.1, 100.0
     )
-    widest_angle: float = param(
+    max_search_angle: float = param(
         1.5, 'the search turns as far as the pose is uncertain, but no farther', 'rad', 0.01, 3.2
     )
 
@@ -490,7 +494,9 @@ class Relocalization(Group):
     gate: float = param(
         0.999, 'probability inside the gate of a detection and a reflector', '', 0.5, 0.999999
     )
-    risk: float = param(1e-4, 'probability that a verdict of unique may be wrong', '', 1e-12, 0.5)
+    false_positive_probability: float = param(
+        1e-4, 'probability that a verdict of unique may be wrong', '', 1e-12, 0.5
+    )
     sigma_floor: float = param(
         0.01, 'error of a detection besides the noise that it states', 'm', 1e-4, 1.0
     )
@@ -537,7 +543,9 @@ class Deformable(Group):
     common_drift: float = param(
         0.05, 'random walk of the whole carrier against its nominal motion', 'm/sqrt(s)', 0.0, 10.0
     )
-    forget_after: float = param(5.0, 'a feature not seen for this long is dropped', 's', 0.1, 1e4)
+    feature_timeout: float = param(
+        5.0, 'a feature not seen for this long is dropped', 's', 0.1, 1e4
+    )
     candidate_timeout: float = param(
         1.0, 'a feature with few sightings is dropped sooner', 's', 0.05, 1e4
     )
@@ -586,7 +594,7 @@ class Ekf(Group):
     min_separation: float = param(
         0.25, 'a detection this near to a landmark never starts a candidate', 'm', 0.0, 20.0
     )
-    sightings: int = param(3, 'sightings before a candidate enters the state', '', 1, 1000)
+    min_sightings: int = param(3, 'sightings before a candidate enters the state', '', 1, 1000)
     candidate_timeout: float = param(
         5.0, 'a candidate not seen again for this long is dropped', 's', 0.01, 1e4
     )

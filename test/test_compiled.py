@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import rlml_slam
-from rlml_slam.kernel_cache import forget_stale
+from rlml_slam.kernel_cache import remove_stale
 
 
 @pytest.fixture
@@ -65,14 +65,14 @@ def test_folder_that_numba_is_told_to_use_is_looked_at(package, tmp_path):
 
 
 def test_kernels_of_the_same_sources_stay(package):
-    forget_stale(package)
+    remove_stale(package)
     compiled = package / '__pycache__' / 'kernels.answer.nbi'
     compiled.touch()
-    forget_stale(package)
+    remove_stale(package)
     assert compiled.exists()
     (package / 'more.py').write_text('')
     (package / 'constants.py').touch()
-    forget_stale(package)
+    remove_stale(package)
     assert compiled.exists()
 
 
@@ -82,12 +82,12 @@ def test_kernel_goes_with_a_source_that_it_is_made_of(package, changed):
     (package / 'deep' / '__init__.py').write_text('')
     (package / 'deep' / 'base.py').write_text('M = 1\n')
     (package / 'constants.py').write_text('from some.deep import base\nN = base.M\n')
-    forget_stale(package)
+    remove_stale(package)
     compiled = package / '__pycache__' / 'kernels.answer.nbi'
     compiled.touch()
     with (package / changed).open('a') as source:
         source.write('# changed\n')
-    forget_stale(package)
+    remove_stale(package)
     assert not compiled.exists()
 
 
@@ -102,4 +102,4 @@ def test_every_file_with_kernels_is_known():
 
 def test_folder_that_cannot_be_written_to_is_no_error(package):
     (package / '__pycache__').write_text('not a folder')
-    forget_stale(package)
+    remove_stale(package)

@@ -81,7 +81,7 @@ local_costmap:
 @pytest.mark.parametrize(
     ('of', 'values'),
     [
-        (Parameters, {'odom_topic': 'wheels', 'submap.size': 80, 'map_file_name': 'hall'}),
+        (Parameters, {'odom_topic': 'wheels', 'submap.insertions': 80, 'map_file_name': 'hall'}),
         (EkfParameters, {'odom_topic': 'wheels'}),
         (DetectorParameters, {'odom_topic': 'wheels', 'detector.threshold': 'fixed'}),
         (SimulatorParameters, {'laser_frame': 'eye'}),
@@ -129,8 +129,8 @@ def test_misspelt_parameter_is_refused(tmp_path):
         ('map_start_pose', [1.0], r'map_start_pose = \[1.0\] is not a list of 3 numbers'),
         ('laser_pose', [], 'is not a list of 3 numbers'),
         ('laser_pose', [0.0, 0.0, 0.0, 0.0], 'is not a list of 3 numbers'),
-        ('submap.bias2', [-1.0, 0.0, 0.0], r'has a number outside \[0, 100\]'),
-        ('loop_closure.floor2', [0.0, 0.0, -1e-9], r'has a number outside \[0, 100\]'),
+        ('submap.bias_variance', [-1.0, 0.0, 0.0], r'has a number outside \[0, 100\]'),
+        ('loop_closure.variance_floor', [0.0, 0.0, -1e-9], r'has a number outside \[0, 100\]'),
         ('back_end.match_sigma', [0.0, 0.1, 0.1], r'has a number outside \[0.0001, 10\]'),
     ],
 )

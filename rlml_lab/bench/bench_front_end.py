@@ -28,9 +28,9 @@ from rlml_slam.errors import RlmlError
 from rlml_slam.evaluation.metrics import distribution
 from rlml_slam.params import Parameters, SimulatorParameters, from_mapping
 from rlml_slam.ros.bags.bag import BagReader
-from rlml_slam.ros.sensor_input import Feed
+from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.se2 import Array
-from rlml_slam.sensing.synchronization.synchronizer import Sequencer
+from rlml_slam.sensing.synchronization.synchronizer import Synchronizer
 from rlml_slam.simulation.simulation import Simulation
 from rlml_slam.simulation.world_file import load_world
 from rlml_slam.slam.front_end.front_end import FrontEnd
@@ -81,8 +81,8 @@ def run(args: argparse.Namespace) -> int:
 def from_bag(bag: BagReader) -> Iterator[Input]:
     """The inputs of a bag."""
     params = Parameters()
-    inputs, sequencer = BagInputs(bag, params), Sequencer(params)
-    feed = Feed(params, sequencer, sequencer.inputs)
+    inputs, synchronizer = BagInputs(bag, params), Synchronizer(params)
+    feed = SensorInput(params, synchronizer, synchronizer.inputs)
     feed.extrinsics = inputs.extrinsics
     for _, stream, message in inputs:
         yield partial(feed.add, stream, message)
@@ -93,13 +93,13 @@ def from_hall(beams: int) -> Iterator[Input]:
     p: SimulatorParameters = from_mapping(
         {'world': 'hall', 'laser.beams': beams, 'repeat': True}, SimulatorParameters
     )
-    sequencer = Sequencer(Parameters())
-    sequencer.set_sensor_pose(p.node.laser_frame, np.array(p.node.laser_pose))
+    synchronizer = Synchronizer(Parameters())
+    synchronizer.set_sensor_pose(p.node.laser_frame, np.array(p.node.laser_pose))
     add: dict[type[Any], Callable[[Any], list[Observation]]] = {
-        Odometry: sequencer.add_odometry,
-        Imu: sequencer.add_imu,
-        Scan: sequencer.add_scan,
-        Detections: sequencer.add_detections,
+        Odometry: synchronizer.add_odometry,
+        Imu: synchronizer.add_imu,
+        Scan: synchronizer.add_scan,
+        Detections: synchronizer.add_detections,
     }
     for event in Simulation(load_world('hall'), p):
         if type(event.message) in add:

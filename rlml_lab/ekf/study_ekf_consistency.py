@@ -168,9 +168,9 @@ def knows(p: SimulatorParameters) -> EkfParameters:
     values = {f'motion.{k}': getattr(w, k) for k in ('a', 'b', 'c', 'd', 'lateral', 'interval')}
     params: EkfParameters = from_mapping(
         {
-            **values, 'motion.guess': 0.0, 'motion.wheels': (0.0, 0.0), 'use_imu': False,
-            'use_scan': False,
-            'ekf.sightings': 1, 'reflector.min_sightings': 1,
+            **values, 'motion.long_interval_noise': 0.0, 'motion.scale_error_sigma': (0.0, 0.0),
+            'use_imu': False, 'use_scan': False,
+            'ekf.min_sightings': 1, 'reflector.min_sightings': 1,
         },
         EkfParameters,
     )  # fmt: skip

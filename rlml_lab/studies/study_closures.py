@@ -27,7 +27,7 @@ from rlml_slam.graph.batch.initialization import initialize
 from rlml_slam.graph.batch.solver import optimize
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.ros.bags.bag import BagReader
-from rlml_slam.ros.sensor_input import Feed
+from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.loop_closure import State
 from rlml_slam.slam.system import Slam
@@ -93,7 +93,7 @@ def drive(bag_path: Path, scale: float, turn: float, quiet: bool) -> Slam:
     slam.scale, slam.turn = scale, turn
     with BagReader(bag_path) as bag, Progress('replay', 1.0, quiet) as progress:
         inputs = BagInputs(bag, parameters)
-        feed = Feed(parameters, slam, slam.sequencer.inputs)
+        feed = SensorInput(parameters, slam, slam.synchronizer.inputs)
         feed.extrinsics = inputs.extrinsics
         for k, (time, stream, message) in enumerate(inputs):
             feed.add(stream, message)

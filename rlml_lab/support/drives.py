@@ -13,7 +13,7 @@ from rlml_slam.ekf.slam import EkfSlam
 from rlml_slam.evaluation.run_record import Truth
 from rlml_slam.params import Parameters, SimulatorParameters
 from rlml_slam.ros.sensor_input import Out, Target
-from rlml_slam.sensing.synchronization.synchronizer import Sequencer
+from rlml_slam.sensing.synchronization.synchronizer import Synchronizer
 from rlml_slam.simulation.simulation import GroundTruth, Message, Simulation
 from rlml_slam.simulation.world_file import load_world
 from rlml_slam.slam.system import Slam
@@ -42,9 +42,9 @@ def observe(
     messages: Sequence[Message], params: Parameters, simulator: SimulatorParameters
 ) -> list[Observation]:
     """What a system's sequencer makes of all messages: the same for every system."""
-    sequencer = Sequencer(params)
-    sequencer.set_sensor_pose(simulator.node.laser_frame, np.array(simulator.node.laser_pose))
-    return [o for m in messages for o in _add(sequencer, m)] + sequencer.flush()
+    synchronizer = Synchronizer(params)
+    synchronizer.set_sensor_pose(simulator.node.laser_frame, np.array(simulator.node.laser_pose))
+    return [o for m in messages for o in _add(synchronizer, m)] + synchronizer.flush()
 
 
 def process(slam: Slam | EkfSlam, observations: Sequence[Observation]) -> list[list[Frame]]:

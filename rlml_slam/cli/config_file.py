@@ -34,9 +34,9 @@ UNREAD: dict[str, tuple[str, ...]] = {
         'continue_map', 'restore_pose', 'transform_publish_period',
         'scan_match', 'loop_closure', 'relocalization', 'solver',
     ),
-    'deformable_slam.yaml': ('motion.wheels', 'motion.wheels_time'),
+    'deformable_slam.yaml': ('motion.scale_error_sigma', 'motion.scale_error_time'),
     'reflector_detector.yaml': (
-        'motion.wheels', 'motion.wheels_time',
+        'motion.scale_error_sigma', 'motion.scale_error_time',
         'map_frame', 'odom_frame', 'local_frame', 'use_scan', 'use_reflectors',
         'reflector_poses_topic', 'mode', 'map_directory', 'map_file_name', 'map_start_pose',
         'restore_pose', 'continue_map', 'transform_publish_period', 'map_update_interval',

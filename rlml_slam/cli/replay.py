@@ -29,7 +29,7 @@ from rlml_slam.params import EkfParameters, Parameters, from_mapping, read_yaml
 from rlml_slam.report.outputs import make_folder, write_outputs
 from rlml_slam.report.summary import tell
 from rlml_slam.ros.bags.bag import BagReader
-from rlml_slam.ros.sensor_input import Feed
+from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.closures.closure_table import closure_table
 from rlml_slam.slam.store import map_file
@@ -150,7 +150,7 @@ def replay(
         wall = time.perf_counter() - began
         problem = problem or bag.damage
         if not log.stamps:
-            why = problem or slam.sequencer.inputs.last_error or 'no scan and no reflectors'
+            why = problem or slam.synchronizer.inputs.last_error or 'no scan and no reflectors'
             raise BagError(f'{path}: nothing in it could be used: {why}')
         truth = truth or inputs.truth()
         if truth is not None and surveyed is not None:
@@ -183,7 +183,7 @@ def _drive(
     quiet: bool,
 ) -> None:
     """Feed all inputs, the same way as the live nodes do."""
-    feed = Feed(params, slam, slam.sequencer.inputs)
+    feed = SensorInput(params, slam, slam.synchronizer.inputs)
     feed.extrinsics = inputs.extrinsics
     began, (start, end) = time.perf_counter(), span
     with Progress('replay', (end - start) * 1e-9, quiet) as progress:
@@ -197,13 +197,13 @@ def _drive(
 
 def survey_figures(back_end: BackEnd) -> dict[str, Any]:
     """Of metrics.json: how the map and the survey, if there is one, agree."""
-    plant = back_end.plant
-    if plant is None:
+    survey_frame = back_end.survey_frame
+    if survey_frame is None:
         return {}
-    if not plant.found:
-        return {'survey': {'found': False, 'why': plant.why}}
-    rows = compare(back_end.reflectors(), plant.survey, in_plant=True)
-    return {'survey': {'found': True, 'why': plant.why, **rows}}
+    if not survey_frame.found:
+        return {'survey': {'found': False, 'why': survey_frame.why}}
+    rows = compare(back_end.reflectors(), survey_frame.survey, in_survey_frame=True)
+    return {'survey': {'found': True, 'why': survey_frame.why, **rows}}
 
 
 def collect(slam: Slam | EkfSlam, log: FrameLog, name: str, truth: Truth | None) -> Run:

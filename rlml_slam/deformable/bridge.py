@@ -35,7 +35,7 @@ def bridge(
     n = max(math.ceil(dt / noise.interval), 1)
     step = log(delta)
     v, w = math.hypot(step[0], step[1]) / dt, step[2] / dt
-    guess = noise.guess if n > 2 else 0.0
+    guess = noise.long_interval_noise if n > 2 else 0.0
     sigma = np.array([
         (noise.a + guess) * v + noise.b, (noise.c + guess) * abs(w) + noise.d, noise.lateral * v
     ])  # fmt: skip

@@ -20,7 +20,7 @@ class GyroBias:
     def __init__(self, noise: MotionNoise) -> None:
         self._walk2 = noise.imu_bias_walk**2
         self._time = 0.0  # [s] since the start
-        self.bias, self.variance = 0.0, noise.imu_bias**2
+        self.bias, self.variance = 0.0, noise.imu_bias_sigma**2
 
     def correct(self, motion: Motion, dt: float) -> Motion:
         """The motion of the last ``dt`` seconds less the bias; as it is without a gyro.

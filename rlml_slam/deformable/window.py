@@ -252,7 +252,7 @@ class DeformableWindow:
         k = self._length - 1
         for slot, track in list(self._tracks.items()):
             patience = (
-                self._p.forget_after if self._is_confirmed(track) else self._p.candidate_timeout
+                self._p.feature_timeout if self._is_confirmed(track) else self._p.candidate_timeout
             )
             if (stamp - track.last_seen) * 1e-9 > patience:
                 del self._tracks[slot]

@@ -26,7 +26,7 @@ from rlml_slam.ekf.filter import Filter
 from rlml_slam.ekf.likelihood import SAME_PLACE, log_density
 from rlml_slam.ekf.matching import Matcher
 from rlml_slam.estimation.landmark_models import POINT
-from rlml_slam.estimation.landmark_tracks import Tracks
+from rlml_slam.estimation.landmark_tracks import LandmarkTracks
 from rlml_slam.estimation.smoother import BIAS, ROBOT, Sight, Step
 from rlml_slam.matching.reflectors.multi_hypothesis import GATE, OUTLIER, TOGETHER, UNKNOWN
 from rlml_slam.motion import STILL
@@ -90,7 +90,7 @@ class Branch:
         self._matcher = matcher
         self.filter = filter_
         self.candidates = Candidates(filter_.model)
-        self.tracks = Tracks()
+        self.tracks = LandmarkTracks()
         self.apart: frozenset[tuple[int, int]] = frozenset()
         self.weight = 0.0
         self.path: Path | None = None
@@ -99,7 +99,7 @@ class Branch:
         self.looked = Looked.nothing()
         self._region: Array | None = None
         self._radius = self._reach = 0.0
-        self._log_new = math.log(UNKNOWN * params.reflector.density)
+        self._log_new = math.log(UNKNOWN * params.reflector.unmapped_density)
 
     def copy(self) -> Branch:
         """A branch of its own that knows the same."""
@@ -251,7 +251,7 @@ class Branch:
                 look.stamp, seen.z[new], seen.R[new], ids[new], self._matcher.gate
             )
             for i, n in zip(new.tolist(), times.tolist(), strict=True):
-                if n >= self._p.ekf.sightings:
+                if n >= self._p.ekf.min_sightings:
                     out = [child for b in out for child in b._enter(look, i, n)]
         for b in out:
             b._forget_candidates(look.stamp)
@@ -259,7 +259,7 @@ class Branch:
 
     def _forget_candidates(self, stamp: int) -> None:
         e = self._p.ekf
-        self.candidates.drop(stamp, e.sightings, e.candidate_timeout, e.candidate_sigma)
+        self.candidates.drop(stamp, e.min_sightings, e.candidate_timeout, e.candidate_sigma)
 
     def _enter(self, look: Look, i: int, n: int) -> list[Branch]:
         """Measurement i was seen n times: new here, and one that is known in other branches."""
@@ -326,7 +326,7 @@ class Branch:
                 continue
             cov = f.difference_cov(s, o) + 1e-6 * np.eye(2)
             peak = 1.0 / (2.0 * math.pi * math.sqrt(np.linalg.det(cov)))
-            if peak < p.reflector.sure * (peak + p.reflector.density):
+            if peak < p.reflector.match_probability * (peak + p.reflector.unmapped_density):
                 continue
             near = gap[o] < p.ekf.min_separation
             if near or d[o] @ np.linalg.solve(cov, d[o]) < self._matcher.gate:

@@ -28,7 +28,7 @@ from rlml_slam.maps.occupancy import OccupancyGrid, render
 from rlml_slam.params import EkfParameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.front_end.grid_localization import Fix
-from rlml_slam.slam.front_end.map_confirmation import START_SIGMA, Confirmation
+from rlml_slam.slam.front_end.map_confirmation import START_SIGMA, MapConfirmation
 from rlml_slam.slam.landmarks.delayed_association import SLIP2
 from rlml_slam.types import Frame, Observation, Reflectors, Status
 
@@ -57,11 +57,11 @@ class Estimator:
         # a line is no point that turns with the rest
         invariant = self._p.ekf.error == 'invariant' and self.model is POINT
         m = self._p.motion
-        filter_ = Filter(pose, cov, m.imu_bias, self.model, invariant, m.wheels)
+        filter_ = Filter(pose, cov, m.imu_bias_sigma, self.model, invariant, m.scale_error_sigma)
         self._start = Start(filter_.x.copy(), filter_.P.copy())
         self.branches = [Branch(self._p, self._matcher, filter_)]
         self.health = HealthMonitor(self._p.health)
-        self.confirmation = Confirmation(self._p)
+        self.confirmation = MapConfirmation(self._p)
         self.fates: Counter[str] = Counter()
         self._mapping = self._p.node.mode == 'mapping'
         self._last_stamp: int | None = None
@@ -110,7 +110,7 @@ class Estimator:
         self._last_stamp = observation.stamp
         m = self._p.motion
         for branch in self.branches:
-            branch.predict(motion, m.imu_bias_walk**2 * dt, math.exp(-dt / m.wheels_time))
+            branch.predict(motion, m.imu_bias_walk**2 * dt, math.exp(-dt / m.scale_error_time))
         self._since += [np.hypot(motion.delta[0], motion.delta[1]), abs(motion.delta[2])]
 
     def _look(self, seen: Measured, stamp: int) -> None:

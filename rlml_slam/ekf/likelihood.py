@@ -10,7 +10,7 @@ import numpy as np
 from rlml_slam.ekf.association import mahalanobis2
 from rlml_slam.ekf.extraction import Measured
 from rlml_slam.ekf.filter import Filter
-from rlml_slam.estimation.landmark_tracks import Tracks
+from rlml_slam.estimation.landmark_tracks import LandmarkTracks
 from rlml_slam.se2 import Array
 from rlml_slam.slam.landmarks.delayed_association import SPREAD
 
@@ -20,7 +20,7 @@ ALIKE = np.array([0.3, 0.25])
 SAME_PLACE = 0.3  # what a look from the same place is worth to the filter, of one from elsewhere
 
 
-def log_density(filter_: Filter, tracks: Tracks, seen: Measured) -> tuple[Array, Array]:
+def log_density(filter_: Filter, tracks: LandmarkTracks, seen: Measured) -> tuple[Array, Array]:
     """Log density [1/m²] and squared Mahalanobis distance (k, a) of measurements, by landmark.
 
     What is held as one landmark may be several that stand together: nothing finer than SPREAD

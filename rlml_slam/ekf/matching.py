@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rlml_slam.ekf.association import compatible_ids, mahalanobis2, nearest
 from rlml_slam.ekf.extraction import Measured
 from rlml_slam.ekf.filter import Filter
-from rlml_slam.estimation.landmark_tracks import Tracks
+from rlml_slam.estimation.landmark_tracks import LandmarkTracks
 from rlml_slam.matching.reflectors.association import Associator, Believed, gate
 from rlml_slam.params import EkfParameters
 from rlml_slam.se2 import Array
@@ -55,7 +55,9 @@ class Matcher:
             )  # fmt: skip
         self.defers = association == 'deferred' and self._joint is not None
 
-    def match(self, seen: Measured, filter_: Filter, tracks: Tracks, stamp: int) -> Matches:
+    def match(
+        self, seen: Measured, filter_: Filter, tracks: LandmarkTracks, stamp: int
+    ) -> Matches:
         """The landmark of the filter's region that each measurement is of."""
         # where all tell their ids there is no question that others could help to answer
         if self._joint is None or (seen.detections.ids != ANONYMOUS).all():
@@ -72,7 +74,7 @@ class Matcher:
         return Matches(found.match, found.status, found.distance2)
 
     def learn_spread(
-        self, seen: Measured, matches: Matches, local: NDArray[np.int64], tracks: Tracks
+        self, seen: Measured, matches: Matches, local: NDArray[np.int64], tracks: LandmarkTracks
     ) -> None:
         """Two detections at once of one landmark: it is several which cannot be told apart."""
         assert self._joint is not None
@@ -108,7 +110,7 @@ class Matcher:
         where = filter_.model.place(filter_.x[:3], seen.z)[0]
         gap = np.linalg.norm(where[:, None] - filter_.points[None], axis=-1)
         sigma = np.sqrt(np.linalg.eigvalsh(seen.detections.cov)[:, -1])
-        blur = self._reflector.blur * sigma
+        blur = self._reflector.separability_sigma * sigma
         near = gap.min(axis=1) < np.maximum(self._p.min_separation, blur)
         near |= d2.min(axis=1) <= self._new_gate
         # one that tells who it is, is new if nobody has told so before

@@ -14,12 +14,12 @@ from rlml_slam.estimation.smoother import Smoothed
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import EkfParameters
 from rlml_slam.se2 import Array
-from rlml_slam.sensing.synchronization.synchronized_system import Driven
+from rlml_slam.sensing.synchronization.synchronized_system import SynchronizedSystem
 from rlml_slam.types import Frame, Observation, Reflectors
 
 
-class EkfSlam(Driven):
-    """Sequencer and filter; what is told in the end is smoothed, frames are as they were live."""
+class EkfSlam(SynchronizedSystem):
+    """Synchronizer and filter; frames are live estimates, the final path is smoothed."""
 
     def __init__(self, params: EkfParameters) -> None:
         super().__init__(params)
@@ -28,7 +28,7 @@ class EkfSlam(Driven):
 
     def finish(self) -> list[Frame]:
         """Everything that still waits; then the path is smoothed."""
-        frames = self.process(self.sequencer.flush())
+        frames = self.process(self.synchronizer.flush())
         self.estimator.filter.settle()
         self._smoothed = self.estimator.smoothed()
         return frames

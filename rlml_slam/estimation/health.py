@@ -71,7 +71,7 @@ class HealthMonitor:
         if contradicted:
             lost = True
             reasons.append('what is seen contradicts the map: was the robot carried away?')
-        patience = int(self._limits.patience * 1e9)
+        patience = int(self._limits.input_timeout * 1e9)
 
         def failing(since: int) -> bool:
             return stamp - max(since, self._first or stamp) > patience

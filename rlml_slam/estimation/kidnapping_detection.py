@@ -17,7 +17,7 @@ FEW = 2  # reflectors below this may be chance
 SHARE = 1.0 / 3.0  # of the detections that must match, ghosts being up to half of them
 
 
-class Doubt:
+class KidnappingDetection:
     """Judges frame by frame; ``since`` is the stamp [ns] of the first contradiction, or None.
 
     ``usual`` is the score of scans lately.
@@ -34,7 +34,7 @@ class Doubt:
         """Whether a scan fits far worse than usual a submap of so many scans."""
         if self._fits < SETTLED or insertions < SETTLED:
             return False
-        return score < self._limits.doubt_share * self.usual
+        return score < self._limits.contradiction_ratio * self.usual
 
     def judge(
         self,

@@ -23,7 +23,7 @@ def _ints() -> NDArray[np.int64]:
 
 
 @dataclass
-class Tracks:
+class LandmarkTracks:
     """Columns (m,) parallel to the reflectors of the joint state.
 
     ``keys`` never repeat, ``ids`` are the reflectors' own (ANONYMOUS), ``sightings`` counts, and
@@ -113,14 +113,14 @@ class Tracks:
         for name in COLUMNS:
             setattr(self, name, getattr(self, name)[mask])
 
-    def take(self, mask: NDArray[np.bool_]) -> Tracks:
+    def take(self, mask: NDArray[np.bool_]) -> LandmarkTracks:
         """Take out all where the mask (m,) is true, which are returned."""
         taken = replace(self)
         taken.keep(mask)
         self.keep(~mask)
         return taken
 
-    def extend(self, others: Tracks) -> None:
+    def extend(self, others: LandmarkTracks) -> None:
         """Append what was taken out."""
         for name in COLUMNS:
             setattr(self, name, np.concatenate([getattr(self, name), getattr(others, name)]))

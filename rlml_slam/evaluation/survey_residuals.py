@@ -17,21 +17,21 @@ SIGMA = 0.05  # [m] a survey and a map may differ by this besides what the map s
 MOVED = 3.0  # [m] one that is missing and one that is new are one that was moved, if this near
 
 
-def compare(found: Reflectors, surveyed: Survey, in_plant: bool = False) -> dict[str, Any]:
+def compare(found: Reflectors, surveyed: Survey, in_survey_frame: bool = False) -> dict[str, Any]:
     """Residuals, and what is missing, new or moved. Raises MapError where nothing tells the place.
 
-    ``T_plant_map`` makes the sum of the squared residuals as small as it can be; a map that is
+    ``T_survey_map`` makes the sum of the squared residuals as small as it can be; a map that is
     ``in_plant``, in the frame of the survey, is not moved.
     """
-    if in_plant:
+    if in_survey_frame:
         T, pairs = np.zeros(3), pairs_at(found, surveyed, np.zeros(3), SIGMA)
         if not len(pairs):
             raise MapError('no reflector of the map is where one was surveyed')
     else:
         placed = place(found, surveyed, SIGMA)
-        if placed.T_plant_map is None:
+        if placed.T_survey_map is None:
             raise MapError(f'the map is not found in the survey: {placed.why}')
-        T, pairs = placed.T_plant_map, placed.pairs
+        T, pairs = placed.T_survey_map, placed.pairs
     there = se2.transform(T, found.points)
     d = there[pairs[:, 0]] - surveyed.points[pairs[:, 1]]
     extra = np.setdiff1d(np.arange(len(found)), pairs[:, 0])
@@ -46,7 +46,7 @@ def compare(found: Reflectors, surveyed: Survey, in_plant: bool = False) -> dict
             moved.append({'survey': k, 'id': int(surveyed.ids[k]), 'key': int(found.keys[i]),
                           'by_m': float(gaps[a, b])})  # fmt: skip
     return {
-        'T_plant_map': T.tolist(),
+        'T_survey_map': T.tolist(),
         'rmse_m': float(np.sqrt((d**2).sum(-1).mean())),
         'residuals': [
             {'survey': int(k), 'id': int(surveyed.ids[k]), 'key': int(found.keys[i]),

@@ -16,7 +16,7 @@ from rlml_slam.params import Parameters
 from rlml_slam.ros.back_end.map_services import MapServices
 from rlml_slam.ros.back_end.mapper import Mapper
 from rlml_slam.ros.codecs import decode
-from rlml_slam.ros.codecs.frame_messages import FrameJoin, Record, read_points, read_record
+from rlml_slam.ros.codecs.frame_messages import FrameAssembler, Record, read_points, read_record
 from rlml_slam.ros.codecs.reflector_clouds import read_associated
 from rlml_slam.ros.declare import declare
 from rlml_slam.ros.diagnostics import HealthPublisher
@@ -36,7 +36,7 @@ class BackEndNode(Node):
         self.params: Parameters = declare(self)
         self.mapper = Mapper(self, self.params)
         warm_up.compile_loaded()
-        self.join = FrameJoin()
+        self.join = FrameAssembler()
         self.health = HealthPublisher(self, figures=self.figures)
         self.map_services = MapServices(self, self.params, self.mapper, self.join)
         for topic, callback in (
@@ -79,7 +79,7 @@ class BackEndNode(Node):
             'closures rejected': back_end.scans.tried[False],
             **fates(back_end.scans.closures),
             **self.mapper.continued,
-            **({} if back_end.plant is None else {'survey': back_end.plant.why}),
+            **({} if back_end.survey_frame is None else {'survey': back_end.survey_frame.why}),
             'constellations not searched': back_end.constellations.not_searched,
             'frames waiting for the worker': self.mapper.worker.backlog,
             'frames without their points or detections': self.join.incomplete,

@@ -20,7 +20,7 @@ from rlml_slam.ros.bags.playback import Playback
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_rclpy
 from rlml_slam.ros.declare import declare
-from rlml_slam.ros.playback_clock import Pace
+from rlml_slam.ros.playback_clock import PlaybackClock
 from rlml_slam.ros.run import run
 
 TICK = 0.002  # [s]
@@ -44,7 +44,7 @@ class BagPlayerNode(Node):
         self._next = next(self._messages, None)
         self._wall = wall
         self._began = wall()
-        self._pace: Pace | None = None
+        self._pace: PlaybackClock | None = None
         self._time = self.create_publisher(Clock, '/clock', 10)
         self._tick_due = self.bag.start
         self.published = 0
@@ -59,7 +59,7 @@ class BagPlayerNode(Node):
                 self._began = now
             if now - self._began < self.parameters.start_delay:
                 return
-            self._pace = Pace(self.parameters.rate, now)
+            self._pace = PlaybackClock(self.parameters.rate, now)
         for _ in range(BATCH):
             if self._next is None:
                 self._finish()

@@ -14,7 +14,7 @@ from rclpy.node import Node
 
 from rlml_slam.params import CarrierParameters
 from rlml_slam.ros.declare import declare
-from rlml_slam.ros.playback_clock import Pace
+from rlml_slam.ros.playback_clock import PlaybackClock
 from rlml_slam.ros.run import run
 from rlml_slam.ros.systems.carrier_messages import CarrierTopics
 from rlml_slam.simulation.carrier import simulate_carrier
@@ -34,7 +34,7 @@ class CarrierSimulatorNode(Node):
         self._step = next(self._steps)
         self._topics = CarrierTopics(self, self.parameters)
         self._wall = wall
-        self._pace: Pace | None = None
+        self._pace: PlaybackClock | None = None
         self._finished: float | None = None
         # a steady timer: with use_sim_time, a ROS timer would wait for this node's own clock
         self.create_timer(0.005, self.tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -45,7 +45,7 @@ class CarrierSimulatorNode(Node):
         if self._pace is None:
             if self._topics.listeners('reflectors') < n.wait_for_subscribers:
                 return
-            self._pace = Pace(n.rate, now)
+            self._pace = PlaybackClock(n.rate, now)
         for _ in range(BATCH):
             moment = self._step.stamp / SECOND
             if n.duration and moment > n.duration:

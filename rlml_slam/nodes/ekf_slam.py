@@ -18,7 +18,7 @@ from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.declare import declare
 from rlml_slam.ros.diagnostics import HealthPublisher
 from rlml_slam.ros.front_end.frame_publisher import FramePublisher
-from rlml_slam.ros.map_publisher import TOPICS, MapProducts
+from rlml_slam.ros.map_publisher import TOPICS, MapPublisher
 from rlml_slam.ros.odom_frame import OdomFrame
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensor_input import STREAMS
@@ -40,7 +40,7 @@ class EkfSlamNode(Node):
         self.map_services = EkfServices(self, n, self.estimator, self.restart_in)
         warm_up.compile_loaded()
         self.answers = FramePublisher(self, n)
-        self.products = MapProducts(self, n, TOPICS)
+        self.products = MapPublisher(self, n, TOPICS)
         self.tf = TransformPublisher(self)
         self.odom = OdomFrame()  # in the map, which is the filter's local frame
         self.sensors = Sensors(self, self.params, STREAMS, self.process, self.restart)

@@ -18,7 +18,7 @@ from rlml_slam.errors import InputError
 from rlml_slam.params import SimulatorParameters
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.declare import declare
-from rlml_slam.ros.playback_clock import Pace
+from rlml_slam.ros.playback_clock import PlaybackClock
 from rlml_slam.ros.run import run
 from rlml_slam.ros.systems.simulator_messages import SimulatedTopics
 from rlml_slam.simulation.robot import SECOND
@@ -39,7 +39,7 @@ class SimulatorNode(Node):
         self.simulation = Simulation(load_world(n.world), self.parameters)
         self._topics = SimulatedTopics(self, self.simulation)
         self._wall = wall
-        self._pace: Pace | None = None
+        self._pace: PlaybackClock | None = None
         self._finished: float | None = None
         if n.drive == 'cmd_vel':
             self.create_subscription(Twist, 'cmd_vel', self.on_cmd_vel, 10)
@@ -63,7 +63,7 @@ class SimulatorNode(Node):
             self._topics.publish_time(START)
             if not self._topics.is_heard('scan', n.wait_for_subscribers, now):
                 return
-            self._pace = Pace(n.rate, now)
+            self._pace = PlaybackClock(n.rate, now)
         for _ in range(BATCH):
             if self.simulation.done:
                 self._finish(now)

@@ -54,7 +54,7 @@ class HealthPublisher:
     def _inputs(self) -> dict[str, object]:
         if self._sensors is None:
             return {}
-        inputs = self._sensors.sequencer.inputs
+        inputs = self._sensors.synchronizer.inputs
         figures: dict[str, object] = {
             f'{stream} {what}': n
             for stream, counts in inputs.totals().items()

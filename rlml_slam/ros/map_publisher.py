@@ -48,7 +48,7 @@ class Mapped(Protocol):
         """Stamps (n,) and poses (n, 3)."""
 
 
-class MapProducts:
+class MapPublisher:
     """Publishes the map every ``map_update_interval`` of stamps, latched.
 
     ``stamp`` is that of the newest map that was sent, 0 before the first. ``undrawn`` says why the

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 
-class Pace:
+class PlaybackClock:
     """Says when a moment of message time is due; it never drifts, and it forgives stalls.
 
     Times are seconds: ``now`` of a steady wall clock, ``moment`` since the beginning of the data.

@@ -40,7 +40,7 @@ def topics_of(node: Node, stream: str) -> tuple[str, ...]:
 
 
 class Target(Protocol[Out]):
-    """A Sequencer, whose answers are observations, or a Slam, whose answers are frames."""
+    """A Synchronizer, whose answers are observations, or a Slam, whose answers are frames."""
 
     def set_sensor_pose(self, frame_id: str, T_base_sensor: Array) -> None:
         """Where a sensor sits."""
@@ -58,7 +58,7 @@ class Target(Protocol[Out]):
         """The reflectors of one instant."""
 
 
-class Feed(Generic[Out]):
+class SensorInput(Generic[Out]):
     """Converts the messages of the streams (keys of STREAMS) and hands them to a target.
 
     ``extrinsics`` is filled by the caller from /tf_static; a sensor that it does not know gets

@@ -16,9 +16,9 @@ from rlml_slam.errors import InputError
 from rlml_slam.params import Parameters
 from rlml_slam.ros.codecs.decode import frame
 from rlml_slam.ros.codecs.message_types import rclpy_class
-from rlml_slam.ros.sensor_input import PLACED, STREAMS, USED_BY, Feed, topics_of
+from rlml_slam.ros.sensor_input import PLACED, STREAMS, USED_BY, SensorInput, topics_of
 from rlml_slam.ros.tf import Extrinsics, subscribe_static
-from rlml_slam.sensing.synchronization.synchronizer import Sequencer
+from rlml_slam.sensing.synchronization.synchronizer import Synchronizer
 from rlml_slam.types import Detections, Observation
 
 TF_PATIENCE = 1_000_000_000  # [ns] of stamps that a sensor's place on /tf_static is waited for
@@ -35,7 +35,7 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class Sensors:
-    """Feeds the messages of the streams to a Sequencer and its observations to ``handle``.
+    """Feeds the messages of the streams to a Synchronizer and its observations to ``handle``.
 
     Where the clock jumps back by more than the buffer holds, ``restart`` is called and a new
     sequencer begins. Scans and detections wait, in order, until /tf_static tells where their
@@ -78,8 +78,8 @@ class Sensors:
         self._queues.append((stream, subscription))
 
     def _begin(self, extrinsics: Extrinsics) -> None:
-        self.sequencer = Sequencer(self._p)
-        self._feed = Feed(self._p, self.sequencer, self.sequencer.inputs)
+        self.synchronizer = Synchronizer(self._p)
+        self._feed = SensorInput(self._p, self.synchronizer, self.synchronizer.inputs)
         self._feed.extrinsics = extrinsics
 
     @property
@@ -119,7 +119,7 @@ class Sensors:
         self._tell_of_missing()
         if self._take({}) or time.monotonic() - self._heard < SILENCE:
             return
-        for observation in self.sequencer.flush():
+        for observation in self.synchronizer.flush():
             self._handle(observation)
 
     def _tell_of_missing(self) -> None:
@@ -133,7 +133,7 @@ class Sensors:
 
     def _tell_of_refused(self) -> None:
         """Say of each stream once why an input was not used; /diagnostics count all of them."""
-        for stream, error in self.sequencer.inputs.first_errors.items():
+        for stream, error in self.synchronizer.inputs.first_errors.items():
             if stream not in self._told:
                 self._told.add(stream)
                 self._logger.warning(f'{stream}: not used: {error}')
@@ -189,7 +189,7 @@ class Sensors:
 
     def add_detections(self, detections: Detections) -> None:
         """Detections that are converted already."""
-        self._observe(lambda: self.sequencer.add_detections(detections))
+        self._observe(lambda: self.synchronizer.add_detections(detections))
 
     def _observe(self, add: Callable[[], list[Observation]]) -> None:
         try:

@@ -23,7 +23,7 @@ ARC = 0.3  # [rad] of neighbouring beams of one and the same range, farther than
 FEWEST = 8  # beams of it, some may be equal by chance; and fewer than these are stray ones
 
 
-class NoReturns:
+class NoReturnRanges:
     """What stands for "no return" in the scans of each lidar, by its frame.
 
     An arc shows it; from then on single beams of that range are none either, until the lidar

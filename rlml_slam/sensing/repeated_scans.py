@@ -20,7 +20,7 @@ MOVED = 0.05  # [m, rad] by odometry: far beyond the noise of a range, and of a 
 FEWEST = 30  # ranges: fewer, in whole centimetres, may come again by chance
 
 
-class Repeats:
+class RepeatedScans:
     """The last new scan of each lidar, by its frame, and the odometry (3,) that it came with."""
 
     def __init__(self) -> None:

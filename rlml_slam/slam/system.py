@@ -17,12 +17,12 @@ from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.maps.survey import Survey
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
-from rlml_slam.sensing.synchronization.synchronized_system import Driven
+from rlml_slam.sensing.synchronization.synchronized_system import SynchronizedSystem
 from rlml_slam.slam.back_end.back_end import BackEnd, Update
 from rlml_slam.slam.front_end.front_end import FrontEnd
-from rlml_slam.slam.offline.back_end_process import Apart
-from rlml_slam.slam.offline.batch_reassociation import Hindsight
-from rlml_slam.slam.relocalization.global_localization import find_place
+from rlml_slam.slam.offline.back_end_process import BackEndProcess
+from rlml_slam.slam.offline.batch_reassociation import BatchReassociation
+from rlml_slam.slam.relocalization.global_localization import localize_globally
 from rlml_slam.slam.relocalization.recovery import Recovery
 from rlml_slam.slam.store import map_file
 from rlml_slam.types import (
@@ -36,8 +36,8 @@ from rlml_slam.types import (
 AHEAD = 1000  # frames that the front end may be ahead of the back end
 
 
-class Slam(Driven):
-    """Sequencer, front end and back end.
+class Slam(SynchronizedSystem):
+    """Synchronizer, front end and back end.
 
     With ``parallel`` the back end works in a process of its own, up to AHEAD frames behind, and
     frames come later by as many; they are the same to the last bit. The front end's local frame
@@ -54,16 +54,16 @@ class Slam(Driven):
         self.front_end = FrontEnd(params)
         self.back_end = BackEnd(params, survey)
         self.recovery = Recovery(params)
-        self.hindsight = Hindsight(params)
+        self.batch_reassociation = BatchReassociation(params)
         if survey is not None:  # its frame is not that of the start
-            self.hindsight.close()
+            self.batch_reassociation.close()
         self.updates: list[Update] = []
         self._params = params
         self._saved: SavedMap | None = None
         self._begin_in: SavedMap | None = None
         self._path: list[tuple[int, Array]] = []
         self._parallel = parallel
-        self._apart: Apart | None = None
+        self._apart: BackEndProcess | None = None
         self._pending: deque[tuple[Frame, float, Array]] = deque()
 
     def use_map(self, saved: SavedMap) -> None:
@@ -77,14 +77,14 @@ class Slam(Driven):
         Where that is not told, it is taken to be at ``map_start_pose``. Raises FileFormatError if
         the parts of the map do not fit together.
         """
-        self.hindsight.close()  # the map knows what this run does not
+        self.batch_reassociation.close()  # the map knows what this run does not
         map_file.restore(content, self.back_end)
         self._begin_in = map_file.saved_map(content)
 
     def _enter(self, observation: Observation) -> None:
         """Begin where an observation was made in the map to go on with."""
         assert self._begin_in is not None
-        found = find_place(
+        found = localize_globally(
             self._begin_in.grid, self._begin_in.reflectors, observation, self._params
         )
         if found.verdict is Verdict.UNIQUE and found.pose is not None and found.cov is not None:
@@ -95,7 +95,7 @@ class Slam(Driven):
 
     def finish(self) -> list[Frame]:
         """Everything that still waits; then the last optimisation."""
-        frames = self.process(self.sequencer.flush()) + self._take_turns()
+        frames = self.process(self.synchronizer.flush()) + self._take_turns()
         if self._saved is None:
             self.back_end.finish()
             self._look_back()
@@ -103,7 +103,7 @@ class Slam(Driven):
 
     def _look_back(self) -> None:
         """Make the map again from what the whole run tells, where that is more."""
-        frames = self.hindsight.look_back(
+        frames = self.batch_reassociation.look_back(
             self.back_end.trajectory()[1], self.back_end.reflectors()
         )
         if frames:
@@ -127,13 +127,13 @@ class Slam(Driven):
             frame = self.front_end.process(observation)
             if enters:  # no motion leads here from where the map was left
                 frame = replace(frame, jumped=True)
-            self.hindsight.add(observation, frame)
+            self.batch_reassociation.add(observation, frame)
             if self._saved is not None:
                 self._path.append((frame.stamp, frame.T_map_base))
                 frames.append(frame)
             elif self._parallel:
                 spent = 1e3 * (time.thread_time() - began)
-                self._apart = self._apart or Apart(self.back_end, _add)
+                self._apart = self._apart or BackEndProcess(self.back_end, _add)
                 self._apart.add(frame)
                 late = self.front_end.late(observation.stamp_sigma)
                 self._pending.append((frame, spent, frame.cov_local + late))

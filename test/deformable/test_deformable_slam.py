@@ -24,7 +24,7 @@ from rlml_slam.params import (
     Reflector,
 )
 from rlml_slam.se2 import compose, exp, wrap
-from rlml_slam.sensing.synchronization.synchronizer import Sequencer
+from rlml_slam.sensing.synchronization.synchronizer import Synchronizer
 from rlml_slam.simulation.carrier import simulate_carrier
 from rlml_slam.types import Level, Motion, Observation, Odometry
 
@@ -112,7 +112,7 @@ def test_heading_error_by_a_biased_gyro_stays_within_its_covariance():
     errors, variances = [], []
     for seed in range(100):
         g = np.random.default_rng(seed)
-        filtered, bias = GyroBias(noise), noise.imu_bias * g.standard_normal()
+        filtered, bias = GyroBias(noise), noise.imu_bias_sigma * g.standard_normal()
         error = variance = 0.0
         for _ in range(300):
             bias += noise.imu_bias_walk * np.sqrt(dt) * g.standard_normal()
@@ -217,7 +217,7 @@ def with_gap(kind, seed, gap, ids=True):
         a=0.0, b=0.01 / np.sqrt(0.1), c=0.0, d=0.004 / np.sqrt(0.1), lateral=0.01 / np.sqrt(0.1)
     )  # fmt: skip
     params = DeformableParameters(motion=noise)
-    sequencer = Sequencer(Parameters(motion=noise, node=params.node))
+    synchronizer = Synchronizer(Parameters(motion=noise, node=params.node))
     slam, wheels, errors = DeformableSlam(params), np.zeros(3), []
     run = steps(round(10 * (10 + gap)) + 1, seed, kind=kind, ids=ids)
     for step, after in pairwise(run):
@@ -226,8 +226,8 @@ def with_gap(kind, seed, gap, ids=True):
             continue
         stamp = SECOND + step.stamp
         slam.announce(stamp, CarrierVelocity(after.linear, after.angular))
-        ready = sequencer.add_odometry(Odometry(stamp, wheels))
-        ready += sequencer.add_detections(replace(step.detections, stamp=stamp))
+        ready = synchronizer.add_odometry(Odometry(stamp, wheels))
+        ready += synchronizer.add_detections(replace(step.detections, stamp=stamp))
         for observation in ready:
             frame = slam.process(observation)
             if observation.stamp == stamp:

@@ -58,17 +58,20 @@ def test_landmarks_seen_again_after_a_blind_stretch_are_told_in_the_end(seed):
 
 def test_reflectors_are_told_so_by_default():
     observed = blinded(0)
-    _, deferred, _ = run(observed, 'deferred')
+    _, delayed_association, _ = run(observed, 'deferred')
     _, frames, _ = run(observed, 'auto')
-    assert all((a.T_map_base == b.T_map_base).all() for a, b in zip(frames, deferred, strict=True))
+    assert all(
+        (a.T_map_base == b.T_map_base).all()
+        for a, b in zip(frames, delayed_association, strict=True)
+    )
 
 
 @pytest.mark.parametrize(
     ('extractor', 'deferred'), [('reflectors', True), ('spikes', False), ('lines', False)]
 )
-def test_answers_are_deferred_for_reflectors_alone(extractor, deferred):
+def test_answers_are_deferred_for_reflectors_alone(extractor, delayed_association):
     params = from_mapping({'ekf.extractor': extractor}, EkfParameters)
-    assert Matcher(params).defers is deferred
+    assert Matcher(params).defers is delayed_association
 
 
 def test_nearest_neighbour_takes_them_for_others():

@@ -93,7 +93,7 @@ def test_pose_is_consistent_around_the_first_loop_with_known_associations():
     runs = 8
     nees = []
     for seed in range(runs):
-        p = from_mapping({'motion.wheels': (0.0, 0.0)}, EkfParameters)
+        p = from_mapping({'motion.scale_error_sigma': (0.0, 0.0)}, EkfParameters)
         _, frames, truth = drive(p, np.random.default_rng(seed), ids=True)
         e = np.array([f.T_map_base for f in frames]) - truth
         e[:, 2] = se2.wrap(e[:, 2])
@@ -114,7 +114,9 @@ def test_pose_is_consistent_where_wheels_err_for_long():
     """As for wheels that do not; a filter that does not know of it believes far too much."""
     runs, sigma, nees = 12, (0.1, 0.2), {}
     for known in (True, False):
-        p = from_mapping({'motion.wheels': sigma if known else (0.0, 0.0)}, EkfParameters)
+        p = from_mapping(
+            {'motion.scale_error_sigma': sigma if known else (0.0, 0.0)}, EkfParameters
+        )
         out = []
         for seed in range(runs):
             rng = np.random.default_rng(seed)
@@ -143,7 +145,7 @@ def test_anonymous_detections_find_every_landmark_and_no_other():
 
 
 def test_landmark_enters_the_state_with_its_nth_sighting():
-    _, frames, _ = drive(params(sightings=4), steps=5)
+    _, frames, _ = drive(params(min_sightings=4), steps=5)
     assert [int((f.landmarks >= 0).sum()) for f in frames][:3] == [0, 0, 0]
     assert (frames[3].landmarks >= 0).all()
     assert (frames[3].statuses == Status.NEW).all()

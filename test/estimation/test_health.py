@@ -21,7 +21,7 @@ from made_worlds import (
 )
 
 from rlml_slam import se2
-from rlml_slam.estimation.kidnapping_detection import Doubt
+from rlml_slam.estimation.kidnapping_detection import KidnappingDetection
 from rlml_slam.maps.occupancy import render
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import HealthLimits, Node, Parameters
@@ -261,7 +261,7 @@ def test_without_the_map_to_localize_in_nothing_is_sure():
 
 
 def test_scan_misfits_only_against_what_is_usual():
-    doubt = Doubt(HealthLimits(doubt_share=0.6))
+    doubt = KidnappingDetection(HealthLimits(contradiction_ratio=0.6))
     assert not doubt.misfits(0.0, 90)
     for score in (0.5, 0.6, 0.7, 0.6, 0.6):
         doubt.learn(score)
@@ -283,14 +283,14 @@ def test_scan_misfits_only_against_what_is_usual():
     ],
 )
 def test_either_sense_overrules_the_other(frame, contradicts):
-    doubt = Doubt(HealthLimits())
+    doubt = KidnappingDetection(HealthLimits())
     doubt.judge(FIRST, False, True, 4, 4, False)
     assert doubt.judge(FIRST + STEP, *frame, False) is contradicts
     assert (doubt.since == FIRST + STEP) is contradicts
 
 
 def test_new_reflectors_contradict_only_where_known_ones_were_seen_just_before():
-    doubt = Doubt(HealthLimits())
+    doubt = KidnappingDetection(HealthLimits())
     doubt.judge(FIRST, False, True, 4, 4, False)
     assert not doubt.judge(FIRST + 6 * STEP, False, False, 5, 0, False)
     assert doubt.judge(FIRST + 7 * STEP, False, False, 5, 0, True)

@@ -22,7 +22,7 @@ from rlml_slam.graph.robust.closure_selection import ROUNDS, _Selector, select_c
 from rlml_slam.graph.robust.graduated_non_convexity import graduate, truncated_weights
 from rlml_slam.graph.robust.inlier_evidence import NU, evidence, fit_scale, uniform
 from rlml_slam.graph.robust.pairwise_consistency import group
-from rlml_slam.graph.robust.spanning_forest import Backbone
+from rlml_slam.graph.robust.spanning_forest import SpanningForest
 from rlml_slam.types import EdgeKind
 
 SIGMA = np.array([0.03, 0.03, 0.01])
@@ -103,13 +103,13 @@ def test_scale_of_nothing_is_one():
 def test_backbone_predicts_what_the_graph_of_odometry_does():
     graph = laps()
     odometry = np.flatnonzero(graph.edges.kinds == FactorKind.ODOMETRY)
-    backbone = Backbone(graph, odometry)
+    spanning_forest = SpanningForest(graph, odometry)
     graph.edges.enabled[:] = graph.edges.kinds == FactorKind.ODOMETRY
-    graph.poses[:] = backbone.poses
+    graph.poses[:] = spanning_forest.poses
     assert graph.chi2() == pytest.approx(0.0, abs=1e-15)
     marginals = Marginals(graph)
     i, j = np.array([0, 5, 100]), np.array([7, 90, 40])
-    T, S = backbone.motion(i, j)
+    T, S = spanning_forest.motion(i, j)
     _, J_i, J_j = factors.relative_pose(graph.poses[i], graph.poses[j], T)
     for k in range(3):
         J = np.hstack([J_i[k], J_j[k]])
@@ -123,8 +123,8 @@ def test_backbone_of_a_tree_takes_the_way_over_the_fork():
     for j, x in ((1, 1.0), (2, 2.0)):
         graph.add_edge(EdgeKind.ODOMETRY, 0, j, [x, 0.0, 0.0], np.eye(3))
     graph.add_edge(EdgeKind.ODOMETRY, 3, 2, [0.0, 1.0, 0.0], np.eye(3))
-    backbone = Backbone(graph, np.arange(3))
-    T, S = backbone.motion(np.array([1, 2]), np.array([3, 0]))
+    spanning_forest = SpanningForest(graph, np.arange(3))
+    T, S = spanning_forest.motion(np.array([1, 2]), np.array([3, 0]))
     assert_allclose(T[0], [1.0, -1.0, 0.0], atol=1e-12)
     assert_allclose(np.diag(S[1]), [1.0, 5.0, 1.0])  # across: heading error over 2 m besides
     assert S[0][2, 2] == pytest.approx(3.0)  # three edges
@@ -144,9 +144,9 @@ def test_right_closures_form_groups_and_wrong_ones_do_not():
     right = int(np.sum(graph.edges.kinds == FactorKind.CLOSURE))
     spoil(graph, WRONG)
     e, closures = graph.edges, np.flatnonzero(graph.edges.kinds == FactorKind.CLOSURE)
-    backbone = Backbone(graph, np.flatnonzero(e.kinds == FactorKind.ODOMETRY))
+    spanning_forest = SpanningForest(graph, np.flatnonzero(e.kinds == FactorKind.ODOMETRY))
     covs = np.linalg.inv(e.information[closures])
-    groups = group(backbone, e.nodes[closures], e.measured[closures], covs, 400.0)
+    groups = group(spanning_forest, e.nodes[closures], e.measured[closures], covs, 400.0)
     assert groups.size[groups.label[:right]].min() >= 5
     assert_array_equal(groups.size[groups.label[right:]], 1)
     assert groups.scale == pytest.approx(1.0, rel=0.5)

@@ -11,7 +11,7 @@ from scipy import sparse
 from rlml_slam import se2
 from rlml_slam.graph.batch.marginals import Marginals
 from rlml_slam.graph.incremental.incremental_solver import Incremental
-from rlml_slam.graph.incremental.online_solver import Live
+from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.incremental.solver_state import IN_USE
 from rlml_slam.graph.model.factors import pose_landmark, relative_pose
 from rlml_slam.graph.model.graph import Graph
@@ -190,7 +190,7 @@ def test_leverage_of_a_sighting_is_the_share_that_it_has_in_what_is_known(seed):
     graph = with_reflectors(np.random.default_rng(seed))
     s = graph.sightings
     use = np.flatnonzero(s.nodes[:, 0] == 5)
-    h = sighting_leverages(Live(graph), 5, use)
+    h = sighting_leverages(OnlineSolver(graph), 5, use)
     marginals = Marginals(graph)
     for row, k in zip(use, s.nodes[use, 1], strict=True):
         _, J_x, J_m = pose_landmark(graph.poses[5], graph.landmarks[k], s.measured[row])
@@ -202,7 +202,7 @@ def test_leverage_of_a_sighting_is_the_share_that_it_has_in_what_is_known(seed):
 @pytest.mark.parametrize('seed', range(5))
 def test_sightings_that_go_make_nothing_surer_and_take_less_than_their_share(seed):
     graph = with_reflectors(np.random.default_rng(seed))
-    live, s = Live(graph), graph.sightings
+    live, s = OnlineSolver(graph), graph.sightings
     others = s.nodes[:, 0] != 5
     num = int(np.sum(~others))
     before = Marginals(graph).joint(np.arange(1, 20), np.arange(12))
@@ -219,7 +219,7 @@ def test_sightings_that_go_make_nothing_surer_and_take_less_than_their_share(see
 
 def test_the_only_sightings_of_a_reflector_stay():
     graph = with_reflectors(np.random.default_rng(1))
-    live, alone = Live(graph), graph.add_landmark([3.0, 3.0])
+    live, alone = OnlineSolver(graph), graph.add_landmark([3.0, 3.0])
     see(graph, np.random.default_rng(0), 5, alone)
     while len(prune_sightings(live, 5, 0)):
         pass

@@ -12,7 +12,7 @@ from rlml_slam import se2
 from rlml_slam.errors import SolverError
 from rlml_slam.graph.batch.marginals import Marginals
 from rlml_slam.graph.batch.solver import optimize
-from rlml_slam.graph.incremental.online_solver import Live
+from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.cost import total_cost
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.graph.model.robust_loss import Loss, Losses, LossKind, loss
@@ -38,7 +38,7 @@ def best_cost(graph: Graph) -> float:
     return cost(other)
 
 
-def assert_at_the_optimum(live: Live) -> None:
+def assert_at_the_optimum(live: OnlineSolver) -> None:
     best = best_cost(live.graph)
     # 0.1 %, and of a cost of nearly nothing what linear models may be off, a twentieth of a sigma
     assert best * (1.0 - 1e-6) <= cost(live.graph) <= 1.001 * best + 0.01
@@ -76,7 +76,7 @@ def drive_on(graph: Graph, truth: list[np.ndarray], rng: np.random.Generator) ->
 
 
 def do_something(
-    live: Live, truth: list[np.ndarray], points: np.ndarray, rng: np.random.Generator
+    live: OnlineSolver, truth: list[np.ndarray], points: np.ndarray, rng: np.random.Generator
 ) -> str:
     """One of what happens to the graph of a robot; its name."""
     graph = live.graph
@@ -122,7 +122,7 @@ def do_something(
 def test_estimate_is_that_of_the_batch_solver_whatever_happens(seed: int) -> None:
     rng = np.random.default_rng(seed)
     graph, true, points = loop_graph(seed, poses=40, losses=ROBUST)
-    truth, live = list(true), Live(graph)
+    truth, live = list(true), OnlineSolver(graph)
     live.solve()
     done = set()
     for _ in range(80):
@@ -135,7 +135,7 @@ def test_estimate_is_that_of_the_batch_solver_whatever_happens(seed: int) -> Non
 def test_what_happens_every_day_takes_no_batch_solve() -> None:
     rng = np.random.default_rng(1)
     graph, true, _ = loop_graph(1, poses=60)
-    truth, live = list(true), Live(graph)
+    truth, live = list(true), OnlineSolver(graph)
     live.solve()
     for k in range(40):
         drive_on(graph, truth, rng)
@@ -153,7 +153,7 @@ def test_a_solver_goes_on_with_a_renumbered_graph() -> None:
     """What is left is not factored anew, but for where poses went."""
     rng = np.random.default_rng(2)
     graph, true, points = loop_graph(2, poses=40)
-    truth, live = list(true), Live(graph)
+    truth, live = list(true), OnlineSolver(graph)
     for _ in range(200):
         drive_on(graph, truth, rng)
         live.solve()
@@ -172,7 +172,7 @@ def test_a_bad_start_is_the_batch_solvers() -> None:
     graph, truth, _ = loop_graph(0, poses=40)
     rng = np.random.default_rng(0)
     graph.poses[1:] += rng.normal(0.0, 2.0, (39, 3))
-    live = Live(graph)
+    live = OnlineSolver(graph)
     live.solve()
     assert live.batches == 1
     live.solve()
@@ -184,7 +184,7 @@ def test_joint_covariance_is_that_of_the_whole_graph(seed: int) -> None:
     graph, _, _ = loop_graph(seed, poses=50, losses=ROBUST)
     loose = graph.add_landmark([1.0, 1.0])
     graph.fixed_landmarks[3] = True
-    live = Live(graph)
+    live = OnlineSolver(graph)
     for _ in range(20):  # linearised at the optimum itself
         live.start_over()
         live.solve()
@@ -202,7 +202,7 @@ def test_joint_covariance_is_that_of_the_whole_graph(seed: int) -> None:
 def test_covariance_that_cannot_be_told_moves_nothing() -> None:
     """A graph that cannot be solved: poses stay, and it is told once it can be."""
     graph, truth, _ = loop_graph(1, poses=30, losses=ROBUST)
-    live = Live(graph)
+    live = OnlineSolver(graph)
     live.solve()
     drive_on(graph, list(truth), np.random.default_rng(1))
     island = [graph.add_pose([x, 1.0, 0.0]) for x in (1.0, 2.0)]
@@ -220,7 +220,7 @@ def test_what_is_at_rest_stays_there() -> None:
     """Robust weights come to rest slowly: a solve that ended may have left a little to gain."""
     rng = np.random.default_rng(3)
     graph, true, points = loop_graph(3, poses=40, losses=ROBUST)
-    truth, live = list(true), Live(graph)
+    truth, live = list(true), OnlineSolver(graph)
     for _ in range(60):
         do_something(live, truth, points, rng)
         live.solve()
@@ -237,7 +237,7 @@ def test_joint_covariance_moves_nothing_until_the_next_solve(seed: int) -> None:
     """Also where it has to be solved for; and the next solve has no more to do then."""
     rng = np.random.default_rng(seed)
     graph, true, _ = loop_graph(seed, poses=40, losses=ROBUST)
-    truth, live = list(true), Live(graph)
+    truth, live = list(true), OnlineSolver(graph)
     live.solve()
     moved = 0
     for k in range(40):
@@ -263,7 +263,7 @@ def test_joint_covariance_moves_nothing_until_the_next_solve(seed: int) -> None:
 def test_joint_covariance_is_there_where_the_batch_solver_had_to_come() -> None:
     graph, _, _ = loop_graph(0, poses=40)
     graph.poses[1:] += np.random.default_rng(0).normal(0.0, 2.0, (39, 3))
-    live, before = Live(graph), graph.poses.copy()
+    live, before = OnlineSolver(graph), graph.poses.copy()
     cov = live.joint([7])
     assert live.batches == 1
     np.testing.assert_array_equal(graph.poses, before)

@@ -31,7 +31,9 @@ def test_reference_agrees_with_all_relations_of_a_part():
 def test_odometry_is_spoilt_step_by_step(monkeypatch):
     told = []
     slam = MisledSlam(Parameters())
-    monkeypatch.setattr(slam.sequencer, 'add_odometry', lambda sample: told.append(sample) or [])
+    monkeypatch.setattr(
+        slam.synchronizer, 'add_odometry', lambda sample: told.append(sample) or []
+    )
     slam.scale, slam.turn = 1.1, 1.05
     pose = np.array([1.0, 2.0, 0.5])
     for k in range(3):

@@ -190,7 +190,7 @@ def test_far_detection_is_new_and_near_misfit_is_gated():
     assert inside < beyond
     direction = np.linalg.cholesky(S) @ [1.0, 0.0]
     between = seen(b).points[0] + np.sqrt(0.5 * (inside + beyond)) * direction
-    params = Reflector(min_separation=0.0, blur=0.0)
+    params = Reflector(min_separation=0.0, separability_sigma=0.0)
     result = Associator(params).associate(detections([between, [9.0, -9.0]]), b)
     np.testing.assert_array_equal(result.match, [-1, -1])
     np.testing.assert_array_equal(result.status, [Status.GATED, Status.NEW])
@@ -246,7 +246,7 @@ def test_joint_compatibility_resolves_what_each_alone_gets_wrong():
     cov[1, 1] = cov[2, 2] = 1e-6
     b = replace(b, cov=cov)
     d = detections(row + np.array([0.3, 0.0]), sigma=0.01)
-    result = Associator(Reflector(blur=0.0)).associate(d, b)
+    result = Associator(Reflector(separability_sigma=0.0)).associate(d, b)
     np.testing.assert_array_equal(result.match, np.arange(5))
     assert (result.status == Status.USED).all()
 
@@ -295,8 +295,8 @@ def test_reflector_seen_a_moment_ago_and_one_with_an_id_need_no_proof():
 def test_the_denser_unknown_reflectors_may_stand_the_surer_a_match_must_be():
     b = wary(believed(pose_sigma=0.3))
     d = seen(b, [1])
-    assert Associator(Reflector(density=1e-4)).associate(d, b).match[0] == 1
-    assert Associator(Reflector(density=1.0)).associate(d, b).match[0] == -1
+    assert Associator(Reflector(unmapped_density=1e-4)).associate(d, b).match[0] == 1
+    assert Associator(Reflector(unmapped_density=1.0)).associate(d, b).match[0] == -1
 
 
 def test_unknown_detections_side_by_side_begin_one_reflector():

@@ -5,7 +5,7 @@ from differences import central_differences
 
 from rlml_slam import se2
 from rlml_slam.matching.reflectors.hypothesis_filter import to_invariant
-from rlml_slam.matching.reflectors.multi_hypothesis import Hypotheses, Sight
+from rlml_slam.matching.reflectors.multi_hypothesis import MultiHypothesis, Sight
 
 POSE = np.array([1.0, -2.0, 0.6])
 POINTS = np.array([[4.0, 1.0], [4.0, 4.0], [-3.0, 2.0]])
@@ -16,7 +16,7 @@ R = 0.05**2 * np.eye(2)
 def begin(pose=POSE, points=POINTS, pose_sigma=(0.01, 0.01, 0.01), sigma=0.02, density=0.02):
     m = len(points)
     cov = np.diag(np.concatenate([pose_sigma, np.full(2 * m, sigma)]) ** 2)
-    return Hypotheses(np.array(pose), KEYS[:m], np.asarray(points), cov, density)
+    return MultiHypothesis(np.array(pose), KEYS[:m], np.asarray(points), cov, density)
 
 
 def sight(key, pose, point, noise=(0.0, 0.0)):
@@ -147,7 +147,7 @@ def test_outlier_moves_nothing():
 def test_many_reflectors_leave_room_for_few_hypotheses():
     grid = np.stack(np.meshgrid(np.arange(40.0), np.arange(40.0)), axis=-1).reshape(-1, 2)
     n = 3 + 2 * len(grid)
-    h = Hypotheses(np.zeros(3), np.arange(len(grid)), grid, 0.5 * np.eye(n), 0.02)
+    h = MultiHypothesis(np.zeros(3), np.arange(len(grid)), grid, 0.5 * np.eye(n), 0.02)
     h.see([Sight(10**6, np.array([3.0, 4.0]), R)])
     assert 1 < len(h) <= 4
 
@@ -161,7 +161,7 @@ def test_drive_with_blind_stretches_is_told_right(seed):
     rng = np.random.default_rng(seed)
     points = np.array([[0.6, -4.4], [2.9, -4.3], [3.0, -2.4], [1.6, 2.7], [3.3, 3.9], [1.3, 4.5]])
     pose = np.array([2.0, -0.5, -1.5])
-    h = Hypotheses(pose, np.arange(6), points, np.diag(np.full(15, 1e-4)), 0.02)
+    h = MultiHypothesis(pose, np.arange(6), points, np.diag(np.full(15, 1e-4)), 0.02)
     key, truth_of, wrong, told = 100, {}, 0, 0
     for _ in range(25):
         blind = np.diag([0.25, 0.15, 0.2]) ** 2

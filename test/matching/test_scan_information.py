@@ -60,7 +60,7 @@ def test_room_holds_all_directions():
     info = told(ROOM)
     sigma = np.sqrt(np.diag(np.linalg.inv(info)))
     # never better than the floor that more beams do not lower, and close to it
-    floor = np.sqrt(PARAMS.floor2)
+    floor = np.sqrt(PARAMS.variance_floor)
     assert (sigma >= floor).all()
     assert (sigma[:2] < 0.03).all()
     assert sigma[2] < 0.01

@@ -14,11 +14,11 @@ if importlib.util.find_spec('rclpy') is None:
 @pytest.fixture
 def live(monkeypatch, tmp_path):
     """A ROS context that hears nothing but the test, in a folder of its own for its maps."""
-    from live import Live
+    from live import OnlineSolver
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    context = Live()
+    context = OnlineSolver()
     yield context
     context.close()
 

@@ -22,7 +22,7 @@ from rlml_slam.ros.codecs import decode, encode
 from rlml_slam.ros.codecs.message_types import make_rclpy as make
 from rlml_slam.ros.codecs.message_types import rclpy_class
 from rlml_slam.ros.codecs.reflector_clouds import read_reflector_map
-from rlml_slam.ros.sensor_input import Feed
+from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.slam.closures.loop_closure import Closure
 from rlml_slam.slam.system import Slam
 from rlml_slam.types import EdgeKind
@@ -69,7 +69,7 @@ def drive(live, front, back, start=0.0, end=SECONDS):
             continue
         front.sensors.add(stream, msg)
         live.executor.spin_once(timeout_sec=0.0)
-    for observation in front.sensors.sequencer.flush():  # as after a second of silence
+    for observation in front.sensors.synchronizer.flush():  # as after a second of silence
         front.process(observation)
     live.spin_until(lambda: back.health.newest == front.last.stamp)
     live.spin_until(lambda: back.mapper.worker.backlog == 0)
@@ -78,10 +78,10 @@ def drive(live, front, back, start=0.0, end=SECONDS):
 
 def replayed(seconds=SECONDS):
     slam = Slam(Parameters())
-    feed = Feed(Parameters(), slam, slam.sequencer.inputs)
+    feed = SensorInput(Parameters(), slam, slam.synchronizer.inputs)
     for stream, msg in room(seconds=seconds):
         feed.add(stream, msg)
-    for observation in slam.sequencer.flush():
+    for observation in slam.synchronizer.flush():
         slam.back_end.add(slam.front_end.process(observation))
     return slam
 

@@ -59,7 +59,7 @@ def node(live):
 
 
 def used(node, stream, what='used'):
-    return node.sensors.sequencer.inputs.totals().get(stream, {}).get(what, 0)
+    return node.sensors.synchronizer.inputs.totals().get(stream, {}).get(what, 0)
 
 
 def test_each_scan_gets_a_pose_with_its_own_stamp(live, node):
@@ -262,7 +262,7 @@ def test_wrong_frame_is_counted_and_named(live, node):
 
     feed(node, 3.0, spoil)
     assert used(node, 'scan', 'invalid') > 5
-    assert "scan in frame 'camera'" in node.sensors.sequencer.inputs.last_error
+    assert "scan in frame 'camera'" in node.sensors.synchronizer.inputs.last_error
 
 
 def test_first_refusal_of_a_stream_is_told_on_the_console(live, node, monkeypatch):
@@ -339,7 +339,7 @@ def test_stamps_that_are_not_positive_are_refused(live, node, sec):
     msg.header.stamp.sec, msg.header.stamp.nanosec = sec, 0
     node.sensors.add('scan', msg)
     assert used(node, 'scan', 'invalid') == 1
-    assert 'header.stamp' in node.sensors.sequencer.inputs.last_error
+    assert 'header.stamp' in node.sensors.synchronizer.inputs.last_error
 
 
 def test_odometry_that_is_not_finite_is_refused(live, node):
@@ -453,7 +453,7 @@ def test_several_lidars_answer_each_on_their_own(live):
             rear.angle_max -= np.pi
             node.sensors.add('scan', rear)
             sent += [msg, rear]
-    counts = node.sensors.sequencer.inputs.totals()['scan']
+    counts = node.sensors.synchronizer.inputs.totals()['scan']
     assert counts['used'] >= len(sent) - 2
     assert 'late' not in counts
     assert 'duplicate' not in counts

@@ -402,4 +402,4 @@ def test_survey_is_taken_from_the_map_directory_alone(ear, tmp_path):
     back_end = dataclasses.replace(p.back_end, survey='plant.csv')
     mapper = Mapper(ear, dataclasses.replace(p, node=node, back_end=back_end))
     mapper.worker.close()
-    np.testing.assert_array_equal(mapper.back_end.plant.survey.points, [[1.0, 2.0]])
+    np.testing.assert_array_equal(mapper.back_end.survey_frame.survey.points, [[1.0, 2.0]])

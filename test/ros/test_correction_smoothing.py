@@ -10,7 +10,7 @@ import pytest
 
 from rlml_slam import se2
 from rlml_slam.params import BackEnd
-from rlml_slam.ros.back_end.correction_smoothing import SteadyOdom
+from rlml_slam.ros.back_end.correction_smoothing import SmoothedCorrection
 
 STEP = 100_000_000
 BASE = np.array([40.0, -25.0, 2.0])  # far from the origin, where a turn moves much
@@ -19,7 +19,7 @@ SLOW = replace(BackEnd(), correction_speed=0.2, correction_turn_rate=0.1)
 
 def run(params, targets, bases):
     told = []
-    steady = SteadyOdom(params, lambda stamp, jump: told.append((stamp, jump)))
+    steady = SmoothedCorrection(params, lambda stamp, jump: told.append((stamp, jump)))
     out = [
         steady.follow(k * STEP, t, b) for k, (t, b) in enumerate(zip(targets, bases, strict=True))
     ]
@@ -82,7 +82,7 @@ def test_small_corrections_are_no_jumps():
 
 
 def test_clock_that_jumps_back_waits_for_nothing():
-    steady = SteadyOdom(SLOW, lambda *_: None)
+    steady = SmoothedCorrection(SLOW, lambda *_: None)
     targets, bases = corrected((0.3, 0.0, 0.0), at=1)
     steady.follow(100 * STEP, targets[0], bases[0])
     np.testing.assert_allclose(steady.follow(0, targets[1], bases[1]), targets[1], atol=1e-9)

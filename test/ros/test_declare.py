@@ -61,7 +61,7 @@ def test_ranges_and_choices_are_described(make_node):
     declare(node)
     bounds = node.describe_parameter('submap.resolution').floating_point_range[0]
     assert (bounds.from_value, bounds.to_value) == (0.01, 1.0)
-    whole = node.describe_parameter('submap.size').integer_range[0]
+    whole = node.describe_parameter('submap.insertions').integer_range[0]
     assert (whole.from_value, whole.to_value) == (2, 10000)
     assert node.describe_parameter('mode').additional_constraints == 'one of mapping, localization'
 

@@ -14,7 +14,7 @@ from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.belief_message import StampedBelief, build_belief, read_belief
 from rlml_slam.ros.codecs.frame_messages import (
     MAX_BEHIND,
-    FrameJoin,
+    FrameAssembler,
     build_points,
     build_record,
     read_points,
@@ -101,7 +101,7 @@ def assert_equal(got, want, exact, path=''):
 
 def test_every_field_of_a_frame_travels():
     want = a_frame()
-    (record,) = send(FrameJoin(), want, session=7)
+    (record,) = send(FrameAssembler(), want, session=7)
     assert record.session == 7
     assert_equal(record.frame, want, exact=False)
 
@@ -117,7 +117,7 @@ def test_figures_travel_exactly():
 
 @pytest.mark.parametrize('order', ['pdr', 'prd', 'rdp', 'drp'])
 def test_parts_come_in_any_order(order):
-    assert len(send(FrameJoin(), a_frame(), parts=order)) == 1
+    assert len(send(FrameAssembler(), a_frame(), parts=order)) == 1
 
 
 def test_frame_without_scan_or_detections_is_whole_at_once():
@@ -126,12 +126,12 @@ def test_frame_without_scan_or_detections_is_whole_at_once():
     frame = dataclasses.replace(
         frame, observation=bare, landmarks=frame.landmarks[:0], statuses=frame.statuses[:0]
     )
-    (record,) = send(FrameJoin(), frame, parts='r')
+    (record,) = send(FrameAssembler(), frame, parts='r')
     assert_equal(record.frame, frame, exact=True)
 
 
 def test_frames_keep_their_order():
-    join = FrameJoin()
+    join = FrameAssembler()
     first, second = a_frame(SECOND), a_frame(2 * SECOND, 1)
     assert send(join, first, parts='rp') == []
     assert send(join, second, parts='rpd') == []
@@ -140,7 +140,7 @@ def test_frames_keep_their_order():
 
 
 def test_lost_part_costs_only_itself():
-    join = FrameJoin()
+    join = FrameAssembler()
     out = send(join, a_frame(SECOND), parts='rd')
     for k in range(MAX_BEHIND):
         out += send(join, a_frame((k + 2) * SECOND, k))
@@ -151,7 +151,7 @@ def test_lost_part_costs_only_itself():
 
 
 def test_pause_marks_frames_and_keeps_their_motion():
-    join = FrameJoin()
+    join = FrameAssembler()
     join.paused = True
     first, second, third = (a_frame((k + 1) * SECOND, k) for k in range(3))
     paused = send(join, first) + send(join, second)

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from rlml_slam.sensing.repeated_scans import FEWEST, MOVED, Repeats
+from rlml_slam.sensing.repeated_scans import FEWEST, MOVED, RepeatedScans
 from rlml_slam.types import Scan
 
 RNG = np.random.default_rng(0)
@@ -22,7 +22,7 @@ WALL[3] = np.nan
 
 @pytest.mark.parametrize('axis', [0, 1, 2])
 def test_the_same_scan_from_another_place_is_stale(axis):
-    repeats, step = Repeats(), np.zeros(3)
+    repeats, step = RepeatedScans(), np.zeros(3)
     step[axis] = 0.6 * MOVED
     assert not repeats.is_stale(scan(WALL), HERE)
     assert not repeats.is_stale(scan(WALL), HERE + step)
@@ -34,14 +34,14 @@ def test_the_same_scan_from_another_place_is_stale(axis):
 
 
 def test_one_beam_that_differs_makes_a_scan_new():
-    repeats, other = Repeats(), WALL.copy()
+    repeats, other = RepeatedScans(), WALL.copy()
     other[7] += 1e-3
     repeats.is_stale(scan(WALL), HERE)
     assert not repeats.is_stale(scan(other), HERE + 1.0)
 
 
 def test_without_odometry_nothing_tells():
-    repeats = Repeats()
+    repeats = RepeatedScans()
     repeats.is_stale(scan(WALL), None)
     assert not repeats.is_stale(scan(WALL), None)
     assert not repeats.is_stale(scan(WALL), HERE)
@@ -50,14 +50,14 @@ def test_without_odometry_nothing_tells():
 
 
 def test_scans_that_see_next_to_nothing_may_be_alike():
-    repeats, empty = Repeats(), np.full(2 * FEWEST, np.inf)
+    repeats, empty = RepeatedScans(), np.full(2 * FEWEST, np.inf)
     empty[: FEWEST - 1] = 4.0
     repeats.is_stale(scan(empty), HERE)
     assert not repeats.is_stale(scan(empty), HERE + 1.0)
 
 
 def test_each_lidar_has_its_own():
-    repeats = Repeats()
+    repeats = RepeatedScans()
     repeats.is_stale(scan(WALL, 'front'), HERE)
     assert not repeats.is_stale(scan(WALL, 'rear'), HERE + 1.0)
     assert repeats.is_stale(scan(WALL, 'front'), HERE + 1.0)

@@ -8,8 +8,8 @@ import pytest
 
 from rlml_slam import se2
 from rlml_slam.params import Node, Parameters
-from rlml_slam.sensing.synchronization.stamp_filter import ENOUGH, WINDOW, SteadyClock
-from rlml_slam.sensing.synchronization.synchronizer import Sequencer, widened
+from rlml_slam.sensing.synchronization.stamp_filter import ENOUGH, WINDOW, StampFilter
+from rlml_slam.sensing.synchronization.synchronizer import Synchronizer, widened
 from rlml_slam.types import ANONYMOUS, Detections, Motion, Odometry
 
 MS = 1_000_000
@@ -19,7 +19,7 @@ TWIST = np.array([1.0, 0.0, 0.3])
 
 
 def told(stamps):
-    clock = SteadyClock()
+    clock = StampFilter()
     return np.array([clock.steady(int(s)) for s in stamps])
 
 
@@ -45,7 +45,7 @@ def test_the_error_that_is_left_is_told(seed):
     # five sigmas per period: some late messages look as if one had been lost before
     true = ticks(100, 6000)
     stamps = jittered(true, np.random.default_rng(seed))
-    clock, error, sigma = SteadyClock(), [], []
+    clock, error, sigma = StampFilter(), [], []
     for t, s in zip(true, stamps, strict=True):
         error.append(clock.steady(int(s)) - t)
         sigma.append(clock.sigma)
@@ -54,7 +54,7 @@ def test_the_error_that_is_left_is_told(seed):
     # before a line is believed, the stamps have all of their jitter
     assert 10 * MS < sigma[ENOUGH - 2] < 30 * MS
     assert told(true).tolist() == true.tolist()
-    assert SteadyClock().sigma == 0.0
+    assert StampFilter().sigma == 0.0
 
 
 def test_stamps_with_little_jitter_stay_as_they_are():
@@ -81,7 +81,7 @@ def test_exact_stamps_of_messages_that_overtake_one_another_stay():
     rng = np.random.default_rng(6)
     true = ticks(20, 1000)
     late = np.argsort(true + rng.uniform(0.0, 80.0 * MS, len(true)), kind='stable')
-    clock = SteadyClock()
+    clock = StampFilter()
     for stamp in true[late]:
         assert clock.steady(int(stamp)) == stamp
         assert clock.sigma == 0.0
@@ -115,7 +115,7 @@ def test_jump_of_the_clock_begins_another_line():
 
 
 def test_the_same_stamp_is_told_the_same_again():
-    clock = SteadyClock()
+    clock = StampFilter()
     for s in jittered(ticks(100, 100), np.random.default_rng(3)):
         first = clock.steady(int(s))
         assert clock.steady(int(s)) == first
@@ -124,19 +124,19 @@ def test_the_same_stamp_is_told_the_same_again():
 def observed(steady):
     """Errors [m] of what is seen of REFLECTORS on a drive where all stamps jitter by 20 ms."""
     rng = np.random.default_rng(4)
-    sequencer = Sequencer(replace(Parameters(), node=Node(steady_stamps=steady)))
+    synchronizer = Synchronizer(replace(Parameters(), node=Node(steady_stamps=steady)))
     stamps, out = set(), []
     for k in range(1500):
         pose = se2.exp(TWIST * k * 0.02)
         stamp = SECOND + k * 20 * MS + int(20 * MS * rng.standard_normal())
-        out += sequencer.add_odometry(Odometry(stamp, pose))
+        out += synchronizer.add_odometry(Odometry(stamp, pose))
         if k % 5 == 0:
             stamp = SECOND + k * 20 * MS + int(20 * MS * rng.standard_normal())
             stamps.add(stamp)
             z = se2.transform(se2.inverse(pose), REFLECTORS)
             ids, cov = np.full(4, ANONYMOUS), np.tile(1e-4 * np.eye(2), (4, 1, 1))
             seen = Detections(stamp, 'base_link', z, cov, ids, np.full(4, np.nan))
-            out += sequencer.add_detections(seen)
+            out += synchronizer.add_detections(seen)
     errors = []
     for o in out:
         seen = se2.transform(se2.exp(TWIST * (o.stamp - SECOND) / SECOND), o.detections.points)

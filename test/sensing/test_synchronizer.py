@@ -10,7 +10,7 @@ from rlml_slam.errors import InputError
 from rlml_slam.motion import SECOND, MotionBuffer
 from rlml_slam.params import Node, Parameters
 from rlml_slam.sensing.detection_frames import SIGMA
-from rlml_slam.sensing.synchronization.synchronizer import PAIRING, PERSISTENT, Sequencer
+from rlml_slam.sensing.synchronization.synchronizer import PAIRING, PERSISTENT, Synchronizer
 from rlml_slam.types import Detections, Imu, Odometry, Scan
 
 MS = SECOND // 1000
@@ -41,25 +41,25 @@ def detections(stamp, points=((2.0, 1.0),), frame='laser'):
     return Detections(stamp, frame, p, cov, np.full(n, -1), np.full(n, np.nan))
 
 
-def add(sequencer, message):
+def add(synchronizer, message):
     if isinstance(message, Odometry):
-        return sequencer.add_odometry(message)
+        return synchronizer.add_odometry(message)
     if isinstance(message, Imu):
-        return sequencer.add_imu(message)
+        return synchronizer.add_imu(message)
     if isinstance(message, Scan):
-        return sequencer.add_scan(message)
-    return sequencer.add_detections(message)
+        return synchronizer.add_scan(message)
+    return synchronizer.add_detections(message)
 
 
-def feed(sequencer, inputs):
-    return [o for m in inputs for o in add(sequencer, m)]
+def feed(synchronizer, inputs):
+    return [o for m in inputs for o in add(synchronizer, m)]
 
 
 def running(until=T0 + 3 * SECOND, **node):
     """A sequencer with 50 Hz of odometry, which is past its first second."""
-    sequencer = Sequencer(Parameters(node=Node(**node)))
-    feed(sequencer, [odometry(t) for t in range(T0, until + 1, 20 * MS)])
-    return sequencer, until
+    synchronizer = Synchronizer(Parameters(node=Node(**node)))
+    feed(synchronizer, [odometry(t) for t in range(T0, until + 1, 20 * MS)])
+    return synchronizer, until
 
 
 def drive_inputs(seconds=3.0, imu=False):
@@ -79,14 +79,14 @@ def drive_inputs(seconds=3.0, imu=False):
 
 
 def test_observations_come_in_order_of_stamps_once_each():
-    sequencer = Sequencer(Parameters())
-    out = feed(sequencer, drive_inputs()) + sequencer.flush()
+    synchronizer = Synchronizer(Parameters())
+    out = feed(synchronizer, drive_inputs()) + synchronizer.flush()
     stamps = [o.stamp for o in out]
     assert stamps == list(range(T0, T0 + 3 * SECOND, 100 * MS))
     for o in out:
         assert o.points is not None
         assert len(o.detections) == 1
-    assert sequencer.inputs.totals()['scan'] == {'used': 30}
+    assert synchronizer.inputs.totals()['scan'] == {'used': 30}
 
 
 def test_order_of_arrival_does_not_matter_within_the_timeout():
@@ -97,7 +97,7 @@ def test_order_of_arrival_does_not_matter_within_the_timeout():
     # odometry in time; the rest up to 80 ms late, in an order of its own
     late = [(m.stamp + rng.uniform(0, 80 * MS), 1, k, m) for k, m in enumerate(others)]
     merged = sorted([(m.stamp, 0, k, m) for k, m in enumerate(odom)] + late)
-    a, b = Sequencer(Parameters()), Sequencer(Parameters())
+    a, b = Synchronizer(Parameters()), Synchronizer(Parameters())
     x = feed(a, inputs) + a.flush()
     y = feed(b, [m for *_, m in merged]) + b.flush()
     assert [o.stamp for o in x] == [o.stamp for o in y]
@@ -108,8 +108,8 @@ def test_order_of_arrival_does_not_matter_within_the_timeout():
 
 
 def test_motion_is_that_between_the_stamps():
-    sequencer = Sequencer(Parameters())
-    out = feed(sequencer, drive_inputs()) + sequencer.flush()
+    synchronizer = Synchronizer(Parameters())
+    out = feed(synchronizer, drive_inputs()) + synchronizer.flush()
     np.testing.assert_array_equal(out[0].motion.delta, 0.0)
     for a, b in itertools.pairwise(out[:-1]):
         # midpoint chords of 20 ms: (w dt)^2 = 4e-5 of 8 cm
@@ -121,9 +121,9 @@ def test_motion_is_that_between_the_stamps():
 
 @pytest.mark.parametrize('apart', [0, PAIRING])
 def test_scan_and_detections_of_one_instant_are_one_observation(apart):
-    sequencer, t = running()
+    synchronizer, t = running()
     t += 10 * MS
-    out = feed(sequencer, [scan(t), detections(t + apart), odometry(t + 20 * MS)])
+    out = feed(synchronizer, [scan(t), detections(t + apart), odometry(t + 20 * MS)])
     (o,) = out
     assert o.stamp == t
     assert o.points is not None
@@ -131,83 +131,85 @@ def test_scan_and_detections_of_one_instant_are_one_observation(apart):
 
 
 def test_stamps_farther_apart_are_two_observations():
-    sequencer, t = running()
+    synchronizer, t = running()
     inputs = [scan(t), detections(t + PAIRING + 1)]
     inputs += [odometry(t + k * 20 * MS) for k in range(1, 30)]
-    a, b = feed(sequencer, inputs)
+    a, b = feed(synchronizer, inputs)
     assert a.detections is None
     assert b.points is None
     assert b.stamp - a.stamp == PAIRING + 1
 
 
 def test_scan_waits_for_odometry_that_covers_its_last_ray():
-    sequencer, t = running()
+    synchronizer, t = running()
     sweep = 50 * MS
     s = scan(t, ranges=np.full(100, 3.0), time_increment=sweep / 100 / SECOND)
-    assert feed(sequencer, [s, detections(t), odometry(t + 20 * MS), odometry(t + 40 * MS)]) == []
-    (o,) = add(sequencer, odometry(t + 60 * MS))
+    assert (
+        feed(synchronizer, [s, detections(t), odometry(t + 20 * MS), odometry(t + 40 * MS)]) == []
+    )
+    (o,) = add(synchronizer, odometry(t + 60 * MS))
     np.testing.assert_allclose(o.sweep, se2.between(pose_at(t), pose_at(t + sweep)), atol=1e-6)
 
 
 def test_lone_scan_waits_for_its_detections_only_if_they_use_to_come():
-    sequencer, t = running()
+    synchronizer, t = running()
     # never paired so far: scan by scan without delay
-    assert len(feed(sequencer, [scan(t), odometry(t + 20 * MS)])) == 1
+    assert len(feed(synchronizer, [scan(t), odometry(t + 20 * MS)])) == 1
     t += 20 * MS
-    assert len(feed(sequencer, [scan(t), detections(t), odometry(t + 20 * MS)])) == 1
+    assert len(feed(synchronizer, [scan(t), detections(t), odometry(t + 20 * MS)])) == 1
     t += 20 * MS
     # now they come in pairs: it waits, but not for ever
-    assert feed(sequencer, [scan(t), odometry(t + 20 * MS)]) == []
-    released = feed(sequencer, [odometry(t + k * 20 * MS) for k in range(2, 12)])
+    assert feed(synchronizer, [scan(t), odometry(t + 20 * MS)]) == []
+    released = feed(synchronizer, [odometry(t + k * 20 * MS) for k in range(2, 12)])
     assert [o.stamp for o in released] == [t]
 
 
 def test_nothing_waits_longer_than_the_timeout():
-    sequencer, t = running(transform_timeout=0.2)
+    synchronizer, t = running(transform_timeout=0.2)
     # odometry is gone; only scans come
-    out = feed(sequencer, [scan(t + k * 100 * MS) for k in range(1, 8)])
+    out = feed(synchronizer, [scan(t + k * 100 * MS) for k in range(1, 8)])
     assert [o.stamp for o in out] == [t + k * 100 * MS for k in range(1, 5)]
-    assert sequencer.inputs.counts['scan']['waited_out'] == 4
+    assert synchronizer.inputs.counts['scan']['waited_out'] == 4
     assert not out[-1].motion.known
-    assert len(sequencer.flush()) == 3
+    assert len(synchronizer.flush()) == 3
 
 
 def test_without_odometry_scans_alone_go_through_after_a_second():
-    sequencer = Sequencer(Parameters())
+    synchronizer = Synchronizer(Parameters())
     inputs = [scan(T0 + k * 100 * MS) for k in range(30)]
-    out = feed(sequencer, inputs) + sequencer.flush()
+    out = feed(synchronizer, inputs) + synchronizer.flush()
     assert len(out) == 30
     assert all(not o.motion.known and o.odom_pose is None for o in out[1:])
-    sequencer = Sequencer(Parameters(node=Node(use_odom=False)))
-    out = feed(sequencer, [odometry(T0), *inputs]) + sequencer.flush()
+    synchronizer = Synchronizer(Parameters(node=Node(use_odom=False)))
+    out = feed(synchronizer, [odometry(T0), *inputs]) + synchronizer.flush()
     assert len(out) == 30
-    assert 'odom' not in sequencer.inputs.counts
+    assert 'odom' not in synchronizer.inputs.counts
 
 
 def test_switched_off_inputs_are_not_used():
     node = Node(use_imu=False, use_reflectors=False, use_scan=False)
-    sequencer = Sequencer(Parameters(node=node))
-    out = feed(sequencer, drive_inputs(imu=True)) + sequencer.flush()
+    synchronizer = Synchronizer(Parameters(node=node))
+    out = feed(synchronizer, drive_inputs(imu=True)) + synchronizer.flush()
     assert len(out) == 30
     assert all(o.points is None and o.scan is None and o.detections is None for o in out)
-    assert set(sequencer.inputs.counts) == {'odom', 'scan'}
+    assert set(synchronizer.inputs.counts) == {'odom', 'scan'}
 
 
 # --- bad input ---------------------------------------------------------------------------------
 
 
 def test_late_and_duplicate_inputs_are_counted_and_left_out():
-    sequencer, t = running()
+    synchronizer, t = running()
     t += 10 * MS
-    feed(sequencer, [scan(t), detections(t), odometry(t + 20 * MS)])
-    before = sequencer.buffer.newest
-    assert feed(sequencer, [scan(t), scan(t - 50 * MS), detections(t - 50 * MS)]) == []
-    assert feed(sequencer, [odometry(t + 20 * MS), odometry(t)]) == []
-    counts = sequencer.inputs.totals()
+    feed(synchronizer, [scan(t), detections(t), odometry(t + 20 * MS)])
+    before = synchronizer.buffer.newest
+    assert feed(synchronizer, [scan(t), scan(t - 50 * MS), detections(t - 50 * MS)]) == []
+    assert feed(synchronizer, [odometry(t + 20 * MS), odometry(t)]) == []
+    counts = synchronizer.inputs.totals()
     assert counts['scan'] == {'duplicate': 1, 'late': 1, 'used': 1}
     assert counts['reflectors'] == {'late': 1, 'used': 1}
     assert counts['odom']['duplicate'] == counts['odom']['late'] == 1
-    assert sequencer.buffer.newest == before
+    assert synchronizer.buffer.newest == before
 
 
 @pytest.mark.parametrize(
@@ -230,66 +232,66 @@ def test_late_and_duplicate_inputs_are_counted_and_left_out():
     ],
 )
 def test_invalid_input_is_counted_and_costs_nothing(stream, bad):
-    sequencer, t = running()
-    assert add(sequencer, bad) == []
-    assert sequencer.inputs.counts[stream]['invalid'] == 1
-    assert stream in sequencer.inputs.last_error
-    assert sequencer.flush() == []
-    (o,) = feed(sequencer, [scan(t), detections(t), odometry(t + 20 * MS)])
+    synchronizer, t = running()
+    assert add(synchronizer, bad) == []
+    assert synchronizer.inputs.counts[stream]['invalid'] == 1
+    assert stream in synchronizer.inputs.last_error
+    assert synchronizer.flush() == []
+    (o,) = feed(synchronizer, [scan(t), detections(t), odometry(t + 20 * MS)])
     assert o.motion.known
 
 
 def test_scan_without_a_single_return_is_an_observation_without_points():
-    sequencer, t = running()
+    synchronizer, t = running()
     (o,) = feed(
-        sequencer, [scan(t, ranges=[np.nan, np.inf, -np.inf, 50.0]), detections(t),
+        synchronizer, [scan(t, ranges=[np.nan, np.inf, -np.inf, 50.0]), detections(t),
                     odometry(t + 20 * MS)],
     )  # fmt: skip
     assert o.points.shape == (0, 2)
 
 
 def test_unknown_frame_is_refused_and_named():
-    sequencer, t = running()
+    synchronizer, t = running()
     # the first frame gets the parameter's pose, another one has none
-    assert len(feed(sequencer, [scan(t), odometry(t + 20 * MS)])) == 1
-    assert feed(sequencer, [scan(t + 20 * MS, frame='attic')]) == []
-    assert sequencer.inputs.counts['scan']['invalid'] == 1
-    assert "'attic'" in sequencer.inputs.last_error
-    sequencer.set_sensor_pose('attic', np.zeros(3))
-    assert len(feed(sequencer, [scan(t + 20 * MS, frame='attic'), odometry(t + 40 * MS)])) == 1
+    assert len(feed(synchronizer, [scan(t), odometry(t + 20 * MS)])) == 1
+    assert feed(synchronizer, [scan(t + 20 * MS, frame='attic')]) == []
+    assert synchronizer.inputs.counts['scan']['invalid'] == 1
+    assert "'attic'" in synchronizer.inputs.last_error
+    synchronizer.set_sensor_pose('attic', np.zeros(3))
+    assert len(feed(synchronizer, [scan(t + 20 * MS, frame='attic'), odometry(t + 40 * MS)])) == 1
 
 
 def test_detections_are_moved_from_their_sensor_to_the_base():
-    sequencer, t = running(use_scan=False)
+    synchronizer, t = running(use_scan=False)
     T = np.array([0.5, 0.2, np.pi / 2])
-    sequencer.set_sensor_pose('mast', T)
+    synchronizer.set_sensor_pose('mast', T)
     # one is too far, and one in the sensor itself: so do some drivers tell that they saw none
     seen = ((2.0, 1.0), (300.0, 0.0), (0.0, 0.0))
-    (o,) = feed(sequencer, [detections(t, seen, frame='mast')])
+    (o,) = feed(synchronizer, [detections(t, seen, frame='mast')])
     np.testing.assert_allclose(o.detections.points, [[-0.5, 2.2]], atol=1e-12)
     np.testing.assert_allclose(o.detections.cov[0], np.diag([1e-4, 4e-4]), atol=1e-15)
     assert o.detections.frame_id == 'base_link'
-    assert sequencer.inputs.counts['reflectors']['points_out_of_range'] == 1
+    assert synchronizer.inputs.counts['reflectors']['points_out_of_range'] == 1
 
 
 def test_single_stamps_far_ahead_are_left_out():
-    sequencer, t = running()
-    assert feed(sequencer, [odometry(t + 100 * SECOND), scan(t + 100 * SECOND)]) == []
+    synchronizer, t = running()
+    assert feed(synchronizer, [odometry(t + 100 * SECOND), scan(t + 100 * SECOND)]) == []
     more = [odometry(t + k * 20 * MS) for k in range(1, 5)]
-    (o,) = feed(sequencer, [scan(t), detections(t), *more])
+    (o,) = feed(synchronizer, [scan(t), detections(t), *more])
     assert o.motion.known
-    assert sequencer.inputs.counts['odom']['future'] == 1
-    assert sequencer.inputs.counts['scan']['future'] == 1
+    assert synchronizer.inputs.counts['odom']['future'] == 1
+    assert synchronizer.inputs.counts['scan']['future'] == 1
 
 
 def test_clock_that_stays_ahead_is_followed():
-    sequencer, t = running()
+    synchronizer, t = running()
     ahead = t + 100 * SECOND
-    feed(sequencer, [odometry(ahead + k * 20 * MS) for k in range(100)])
+    feed(synchronizer, [odometry(ahead + k * 20 * MS) for k in range(100)])
     s = ahead + 50 * 20 * MS
-    out = feed(sequencer, [scan(s), detections(s), odometry(ahead + 2 * SECOND)])
+    out = feed(synchronizer, [scan(s), detections(s), odometry(ahead + 2 * SECOND)])
     assert [o.stamp for o in out] == [s]
-    assert 'future' not in sequencer.inputs.counts['odom']
+    assert 'future' not in synchronizer.inputs.counts['odom']
 
 
 @pytest.mark.parametrize('pause', [1.5, 8.0, 60.0])
@@ -300,13 +302,13 @@ def test_nothing_is_lost_across_a_pause_of_everything(pause, odometry_too):
     again = [replace(m, stamp=m.stamp + 3 * SECOND + later) for m in inputs]
     # the last of them begin a second pause: the end of the data is no reason to lose them
     last = [replace(m, stamp=m.stamp + 10 * SECOND + 2 * later) for m in inputs[:2]]
-    sequencer = Sequencer(Parameters())
-    out = feed(sequencer, [*inputs, *again, *last]) + sequencer.flush()
+    synchronizer = Synchronizer(Parameters())
+    out = feed(synchronizer, [*inputs, *again, *last]) + synchronizer.flush()
     assert len(out) == 61
-    assert sequencer.inputs.counts['scan']['used'] == 61
+    assert synchronizer.inputs.counts['scan']['used'] == 61
     if odometry_too:
-        assert sequencer.inputs.counts['odom'] == {'used': 301}
-    assert all('future' not in c for c in sequencer.inputs.counts.values())
+        assert synchronizer.inputs.counts['odom'] == {'used': 301}
+    assert all('future' not in c for c in synchronizer.inputs.counts.values())
 
 
 @pytest.mark.parametrize('ahead', [5, 12, 25])
@@ -319,9 +321,9 @@ def test_one_stamp_ahead_costs_no_observation(ahead, stream):
         'reflectors': detections(late),
     }[stream]  # fmt: skip
     for at in (0, len(inputs) // 2):
-        sequencer = Sequencer(Parameters())
-        out = feed(sequencer, [*inputs[:at], bad, *inputs[at:]]) + sequencer.flush()
-        assert sequencer.inputs.counts[stream]['future'] == 1
+        synchronizer = Synchronizer(Parameters())
+        out = feed(synchronizer, [*inputs[:at], bad, *inputs[at:]]) + synchronizer.flush()
+        assert synchronizer.inputs.counts[stream]['future'] == 1
         known = [o for o in out if o.motion.known and o.odom_pose is not None]
         # of the first message nothing else tells that it is wrong
         assert len(known) >= 30 - (0 if at else 3)
@@ -330,22 +332,22 @@ def test_one_stamp_ahead_costs_no_observation(ahead, stream):
 
 def test_first_stamp_of_another_clock_is_found_out():
     """A message stamped by the wall clock before simulated time."""
-    sequencer = Sequencer(Parameters())
+    synchronizer = Synchronizer(Parameters())
     inputs = [Imu(T0 + 10**9 * SECOND, 0.0), *drive_inputs()]
-    out = feed(sequencer, inputs) + sequencer.flush()
+    out = feed(synchronizer, inputs) + synchronizer.flush()
     assert len(out) >= 28
     assert all(o.motion.known for o in out[3:])
-    assert sequencer.inputs.counts['imu']['future'] == 1
+    assert synchronizer.inputs.counts['imu']['future'] == 1
 
 
 def test_clock_that_stays_back_is_an_error():
-    sequencer, t = running(until=T0 + 60 * SECOND)
-    feed(sequencer, [scan(t), odometry(t + 20 * MS)])
+    synchronizer, t = running(until=T0 + 60 * SECOND)
+    feed(synchronizer, [scan(t), odometry(t + 20 * MS)])
     start = T0 + 20 * SECOND
     for k in range(PERSISTENT - 1):
-        assert add(sequencer, odometry(start + k * 20 * MS)) == []
+        assert add(synchronizer, odometry(start + k * 20 * MS)) == []
     with pytest.raises(InputError, match=r'clock of odom jumped back by \d+'):
-        add(sequencer, odometry(start + SECOND))
+        add(synchronizer, odometry(start + SECOND))
 
 
 # --- long times without observations, and the end of odometry ----------------------------------
@@ -354,16 +356,16 @@ def test_clock_that_stays_back_is_an_error():
 @pytest.mark.parametrize('gap', [5.0, 31.0])
 def test_motion_carried_over_a_long_time_is_the_direct_motion(gap):
     params = Parameters()
-    sequencer = Sequencer(params)
+    synchronizer = Synchronizer(params)
     direct = MotionBuffer(params.motion, 1000.0)
     first, last = T0 + 2 * SECOND, T0 + 2 * SECOND + round(gap * SECOND)
     out = []
     for stamp in range(T0, last + 100 * MS, 20 * MS):
         direct.add_odometry(odometry(stamp))
-        out += add(sequencer, odometry(stamp))
+        out += add(synchronizer, odometry(stamp))
         if stamp in (first, last):
-            out += feed(sequencer, [scan(stamp), detections(stamp)])
-    _, b = out + sequencer.flush()
+            out += feed(synchronizer, [scan(stamp), detections(stamp)])
+    _, b = out + synchronizer.flush()
     expected = direct.motion(first, last)
     assert b.stamp == last
     assert b.motion.known
@@ -373,15 +375,15 @@ def test_motion_carried_over_a_long_time_is_the_direct_motion(gap):
 
 def stalled(imu=False):
     """Observations every 100 ms while odometry stalls, and the first one after it goes on."""
-    sequencer, t = running()
-    out = feed(sequencer, [scan(t), detections(t), odometry(t + 20 * MS)])
+    synchronizer, t = running()
+    out = feed(synchronizer, [scan(t), detections(t), odometry(t + 20 * MS)])
     stamps = [t + k * 100 * MS for k in range(1, 12)]
     for s in stamps:
         if imu:
             rates = [Imu(r, TURN) for r in range(s - 100 * MS, s + 20 * MS, 10 * MS)]
-            out += feed(sequencer, rates)
-        out += feed(sequencer, [scan(s), detections(s)])
-    out += feed(sequencer, [odometry(t + k * 20 * MS) for k in range(52, 60)])
+            out += feed(synchronizer, rates)
+        out += feed(synchronizer, [scan(s), detections(s)])
+    out += feed(synchronizer, [odometry(t + k * 20 * MS) for k in range(52, 60)])
     assert [o.stamp for o in out] == [t, *stamps]
     return t, out[1:]
 
@@ -421,8 +423,8 @@ def test_imu_tells_the_turn_while_odometry_stalls():
 
 
 def test_imu_refines_the_motion_between_observations():
-    sequencer = Sequencer(Parameters())
-    out = feed(sequencer, drive_inputs(imu=True)) + sequencer.flush()
+    synchronizer = Synchronizer(Parameters())
+    out = feed(synchronizer, drive_inputs(imu=True)) + synchronizer.flush()
     m = out[15].motion
     assert m.bias_gain[2] == pytest.approx(-0.1)
     assert m.bias == pytest.approx(0.0, abs=1e-9)
@@ -448,21 +450,21 @@ def two_lidars(offset, delay, seconds=3.0):
 
 
 def two_lidar_sequencer():
-    sequencer = Sequencer(Parameters())
-    sequencer.set_sensor_pose('front', np.array([0.3, 0.0, 0.0]))
-    sequencer.set_sensor_pose('rear', np.array([-0.3, 0.0, np.pi]))
-    return sequencer
+    synchronizer = Synchronizer(Parameters())
+    synchronizer.set_sensor_pose('front', np.array([0.3, 0.0, 0.0]))
+    synchronizer.set_sensor_pose('rear', np.array([-0.3, 0.0, np.pi]))
+    return synchronizer
 
 
 # at once, at the same instant within drivers' rounding, and in between
 @pytest.mark.parametrize('offset', [0, MS, 30 * MS])
 @pytest.mark.parametrize('delay', [0, 90 * MS])
 def test_each_scan_of_two_lidars_is_used_from_its_own_place(offset, delay):
-    sequencer = two_lidar_sequencer()
-    out = feed(sequencer, two_lidars(offset, delay)) + sequencer.flush()
+    synchronizer = two_lidar_sequencer()
+    out = feed(synchronizer, two_lidars(offset, delay)) + synchronizer.flush()
     # the first period is not known yet: by then the rear lidar's first scan may have been used
     lost = 1 if delay > offset else 0
-    assert sequencer.inputs.totals()['scan'].get('late', 0) <= lost
+    assert synchronizer.inputs.totals()['scan'].get('late', 0) <= lost
     stamps = [o.stamp for o in out]
     assert stamps == sorted(set(stamps))
     for frame, x, n in (('front', 0.3, 4), ('rear', -0.3, 2)):
@@ -473,61 +475,61 @@ def test_each_scan_of_two_lidars_is_used_from_its_own_place(offset, delay):
 
 
 def test_silent_lidar_is_not_waited_for():
-    sequencer = two_lidar_sequencer()
+    synchronizer = two_lidar_sequencer()
     inputs = two_lidars(30 * MS, 0)
     half = T0 + SECOND
     silent = [
         m for m in inputs if not isinstance(m, Scan) or m.frame_id == 'rear' or m.stamp < half
     ]
-    out = feed(sequencer, silent) + sequencer.flush()
+    out = feed(synchronizer, silent) + synchronizer.flush()
     assert [o.scan.frame_id for o in out].count('rear') == 30
     # while it may still come, the other waits as long as for anything else
-    assert sequencer.inputs.totals()['scan']['waited_out'] <= 10
+    assert synchronizer.inputs.totals()['scan']['waited_out'] <= 10
 
 
 @pytest.mark.parametrize('increment', [1.0, -1e-4, 1e6])
 def test_sweep_of_impossible_length_is_refused_and_holds_nothing_up(increment):
-    sequencer = Sequencer(Parameters())
+    synchronizer = Synchronizer(Parameters())
     out = []
     for k in range(1, 40):
         stamp = k * 100_000_000
-        out += sequencer.add_odometry(Odometry(stamp, np.array([0.01 * k, 0.0, 0.0])))
+        out += synchronizer.add_odometry(Odometry(stamp, np.array([0.01 * k, 0.0, 0.0])))
         sweep = scan(stamp, time_increment=0.0 if k % 2 else increment)
-        out += sequencer.add_scan(sweep)
-    counts = sequencer.inputs.totals()['scan']
+        out += synchronizer.add_scan(sweep)
+    counts = synchronizer.inputs.totals()['scan']
     assert counts['invalid'] == 19
-    assert 'time_increment' in sequencer.inputs.last_error
+    assert 'time_increment' in synchronizer.inputs.last_error
     assert len(out) >= 18
 
 
 @pytest.mark.parametrize('sigma', [1e-8, 1e5, 1e19])
 def test_sigma_that_nobody_can_mean_is_bounded_and_counted(sigma):
-    sequencer = Sequencer(Parameters())
+    synchronizer = Synchronizer(Parameters())
     d = detections(200_000_000)
     d = replace(d, cov=np.broadcast_to(sigma**2 * np.eye(2), d.cov.shape))
-    sequencer.add_odometry(Odometry(100_000_000, np.zeros(3)))
-    sequencer.add_detections(d)
-    (observation,) = sequencer.flush()
+    synchronizer.add_odometry(Odometry(100_000_000, np.zeros(3)))
+    synchronizer.add_detections(d)
+    (observation,) = synchronizer.flush()
     values = np.sqrt(np.linalg.eigvalsh(observation.detections.cov))
     assert 0.99 * SIGMA[0] <= values.min() <= values.max() <= 1.01 * SIGMA[1]
-    assert sequencer.inputs.totals()['reflectors']['sigma_bounded'] == 1
+    assert synchronizer.inputs.totals()['reflectors']['sigma_bounded'] == 1
 
 
 def test_scan_that_is_sent_again_while_the_robot_drives_is_left_out():
     ranges = np.random.default_rng(0).uniform(1.0, 9.0, 100)
-    sequencer, _ = running(until=T0)
+    synchronizer, _ = running(until=T0)
     stamps = [T0 + k * 100 * MS for k in range(8)]
     inputs = []
     for k, stamp in enumerate(stamps):
         sent = ranges if k < 5 else ranges + 0.01 * k  # then the driver is well again
         inputs += [scan(stamp, sent), detections(stamp)]
         inputs += [odometry(stamp + j * 20 * MS) for j in range(1, 6)]
-    out = feed(sequencer, inputs) + sequencer.flush()
+    out = feed(synchronizer, inputs) + synchronizer.flush()
     assert [o.stamp for o in out] == stamps
     # 8 cm in each interval
     assert [o.points is not None for o in out] == [True, *[False] * 4, True, True, True]
     assert [o.detections is not None for o in out] == [o.points is not None for o in out]
-    assert sequencer.inputs.counts['scan']['repeated'] == 4
+    assert synchronizer.inputs.counts['scan']['repeated'] == 4
     moved = se2.between(pose_at(stamps[0]), pose_at(stamps[5]))
     way = np.zeros(3)
     for o in out[1:6]:

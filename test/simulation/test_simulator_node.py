@@ -29,7 +29,7 @@ from rlml_slam.errors import FileFormatError, ParameterError  # noqa: E402
 from rlml_slam.nodes.simulator import SimulatorNode  # noqa: E402
 from rlml_slam.params import Reflector, SimulatorParameters, from_mapping  # noqa: E402
 from rlml_slam.ros.codecs import decode  # noqa: E402
-from rlml_slam.ros.playback_clock import Pace  # noqa: E402
+from rlml_slam.ros.playback_clock import PlaybackClock  # noqa: E402
 from rlml_slam.simulation.robot import SECOND  # noqa: E402
 from rlml_slam.simulation.simulation import START, GroundTruth, Simulation  # noqa: E402
 from rlml_slam.simulation.world_file import load_world  # noqa: E402
@@ -246,7 +246,7 @@ def test_a_wrong_parameter_refuses_to_start(context):
 
 
 def test_the_pace_does_not_drift_and_forgives_a_stall():
-    pace = Pace(2.0, now=10.0)
+    pace = PlaybackClock(2.0, now=10.0)
     assert pace.is_due(0.0, 10.0)
     assert not pace.is_due(1.0, 10.499)
     assert pace.is_due(1.0, 10.5)

@@ -221,7 +221,9 @@ def test_back_end_in_a_process_changes_no_bit(scan, reflectors):
     """Nor does it where the run is looked back on."""
     sent = messages(ROOM, CURVE, scan=scan, reflectors=reflectors, rng=np.random.default_rng(5))
     # small submaps, so that loops are closed on a short way
-    params = Parameters(back_end=BackEnd(submap_size=4), loop_closure=LoopClosure(every=1))
+    params = Parameters(
+        back_end=BackEnd(submap_size=4), loop_closure=LoopClosure(keyframe_interval=1)
+    )
     slams = [Slam(params, parallel) for parallel in (False, True)]
     one, other = ([f for m in sent for f in add(slam, m)] + slam.finish() for slam in slams)
     assert [f.stamp for f in one] == [f.stamp for f in other]

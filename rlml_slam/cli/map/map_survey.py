@@ -35,15 +35,15 @@ def run(args: argparse.Namespace) -> int:
     """Compare and print."""
     content, surveyed = map_file.load(args.file), survey.load(args.survey)
     own = map_file.survey_of(content)
-    in_plant = own is not None and survey.same(own, surveyed)
-    figures = compare(map_file.saved_map(content).reflectors, surveyed, in_plant)
+    in_survey_frame = own is not None and survey.same(own, surveyed)
+    figures = compare(map_file.saved_map(content).reflectors, surveyed, in_survey_frame)
     print(json.dumps(figures) if args.json else text(figures))
     return 0
 
 
 def text(figures: dict[str, Any]) -> str:
     """The figures for people."""
-    x, y, theta = figures['T_plant_map']
+    x, y, theta = figures['T_survey_map']
     lines = [
         f'the map lies at x = {x:.4f} m, y = {y:.4f} m, {math.degrees(theta):.3f}° in the survey',
         f'{len(figures["residuals"])} reflectors, RMSE {1e3 * figures["rmse_m"]:.1f} mm',

@@ -28,7 +28,7 @@ FEW, MOST = 5, 40
 LITTLE = 1e-5
 
 
-class Live:
+class OnlineSolver:
     """Solves ``graph`` and tells covariances of it; ``steps`` and ``batches`` count what it took.
 
     Who moves the estimate itself has to say so by ``start_over``.

@@ -23,7 +23,7 @@ from rlml_slam.graph.sparse.symbolic_analysis import Ints
 from rlml_slam.se2 import Array
 
 
-class Places(NamedTuple):
+class Buffers(NamedTuple):
     """Address and length of each of the ``buffers``, as rows of ``at`` (k, 2).
 
     The addresses hold as long as this keeps the buffers.
@@ -33,7 +33,7 @@ class Places(NamedTuple):
     buffers: tuple[NDArray[Any], ...]
 
 
-def places_of(buffers: tuple[NDArray[Any], ...], last: Places | None = None) -> Places:
+def buffers_of(buffers: tuple[NDArray[Any], ...], last: Buffers | None = None) -> Buffers:
     """The places of contiguous arrays, each the first rows of its base.
 
     Only those are looked up that have another base than in ``last``, which are few where a graph
@@ -47,7 +47,7 @@ def places_of(buffers: tuple[NDArray[Any], ...], last: Places | None = None) -> 
         if last is None or base is not last.buffers[k].base:
             at[k, 0] = ctypes.addressof(ctypes.c_char.from_buffer(base))
         at[k, 1] = len(buffer)
-    return Places(at, buffers)
+    return Buffers(at, buffers)
 
 
 def _to_pointer(_typing: Any, address: Any) -> Any:

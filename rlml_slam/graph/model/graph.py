@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rlml_slam.errors import SolverError
 from rlml_slam.graph.model import factors
-from rlml_slam.graph.model.buffers import Places, places_of
+from rlml_slam.graph.model.buffers import Buffers, buffers_of
 from rlml_slam.graph.model.factor_table import Column, FactorKind, FactorTable, renumbered
 from rlml_slam.graph.model.packed_system import Tables
 from rlml_slam.graph.model.robust_loss import Losses
@@ -75,7 +75,7 @@ class Graph:
             self._poses, self._landmarks, self._fixed_poses, self._fixed_landmarks,
             *(column for table in tables for column in table.columns),
         )  # fmt: skip
-        self._places: Places | None = None
+        self._places: Buffers | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """All but addresses, which are others in a copy."""
@@ -216,7 +216,7 @@ class Graph:
             self.losses.codes,
         )  # fmt: skip
 
-    def places(self) -> Places:
+    def places(self) -> Buffers:
         """Where the buffers lie, of poses, landmarks and in the order of Tables.
 
         They are looked up again only where one of them has changed its place or its length.
@@ -228,7 +228,7 @@ class Graph:
                     break
             else:
                 return last
-        self._places = places_of(tuple(column.view for column in self._columns), last)
+        self._places = buffers_of(tuple(column.view for column in self._columns), last)
         return self._places
 
     def residuals(self) -> Residuals:

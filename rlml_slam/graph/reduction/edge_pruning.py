@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.graph.batch.marginals import Marginals
-from rlml_slam.graph.incremental.online_solver import Live
+from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.factors import chi2, pose_landmark, relative_pose
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.graph.model.robust_loss import loss
@@ -52,7 +52,7 @@ def prune(graph: Graph, may: NDArray[np.bool_], most: int) -> NDArray[np.int64]:
     return gone
 
 
-def prune_sightings(live: Live, pose: int, most: int) -> NDArray[np.int64]:
+def prune_sightings(live: OnlineSolver, pose: int, most: int) -> NDArray[np.int64]:
     """The same of the sightings of one pose, from the tree of the live solver."""
     s = live.graph.sightings
     use = np.flatnonzero((s.nodes[:, 0] == pose) & s.enabled)
@@ -90,7 +90,7 @@ def leverages(graph: Graph) -> Array:
     return out
 
 
-def sighting_leverages(live: Live, pose: int, sightings: NDArray[np.int64]) -> Array:
+def sighting_leverages(live: OnlineSolver, pose: int, sightings: NDArray[np.int64]) -> Array:
     """Q W (k, 2, 2) of enabled ``sightings`` (k,), all from one ``pose``; robust weights count."""
     graph, s = live.graph, live.graph.sightings
     seen, information = s.nodes[sightings, 1], s.information[sightings]

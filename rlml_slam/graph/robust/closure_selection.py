@@ -33,7 +33,7 @@ from rlml_slam.graph.robust.relative_covariance import (
     left_out,
     most_difference_covs,
 )
-from rlml_slam.graph.robust.spanning_forest import Backbone, Ints
+from rlml_slam.graph.robust.spanning_forest import Ints, SpanningForest
 from rlml_slam.se2 import Array
 
 Flags = NDArray[np.bool_]
@@ -89,21 +89,21 @@ class _Selector:
         self._nodes, self._z = e.nodes[self._edges], e.measured[self._edges]
         self._cov = np.asarray(np.linalg.inv(e.information[self._edges]), dtype=np.float64)
         trusted = np.flatnonzero(e.enabled & ~is_closure)
-        backbone = Backbone(graph, trusted)
-        area = extent2(backbone.poses)
-        self._groups = group(backbone, self._nodes, self._z, self._cov, area)
-        self._held = _bridges(backbone, self._nodes, self._groups, may)
+        spanning_forest = SpanningForest(graph, trusted)
+        area = extent2(spanning_forest.poses)
+        self._groups = group(spanning_forest, self._nodes, self._z, self._cov, area)
+        self._held = _bridges(spanning_forest, self._nodes, self._groups, may)
         if self._held.any():
             held = self._edges[self._held]
-            backbone = Backbone(graph, np.concatenate([trusted, held]))
-            area = extent2(backbone.poses)
+            spanning_forest = SpanningForest(graph, np.concatenate([trusted, held]))
+            area = extent2(spanning_forest.poses)
         self._wrong = uniform(area)
         free = ~graph.fixed_poses
-        graph.poses[free] = backbone.poses[free]
+        graph.poses[free] = spanning_forest.poses[free]
         self._accepted = self._held.copy()
         self._left = np.where(may & ~self._held, TRIES, 0)
         self._evidence = np.where(self._held, np.inf, -np.inf)
-        self._backbone = backbone
+        self._backbone = spanning_forest
         self._solves = 0
 
     def run(self) -> Selection:
@@ -271,18 +271,18 @@ class _Selector:
         return evidence(e, S, self._groups.scale, self._wrong)
 
 
-def _bridges(backbone: Backbone, nodes: Ints, groups: Groups, may: Flags) -> Flags:
+def _bridges(spanning_forest: SpanningForest, nodes: Ints, groups: Groups, may: Flags) -> Flags:
     """Closures that hold pieces of the backbone together: from the largest groups, no loops."""
     held = np.zeros(len(nodes), dtype=np.bool_)
-    if backbone.pieces == 1:
+    if spanning_forest.pieces == 1:
         return held
-    a, b = np.sort(backbone.piece[nodes], axis=1).T
+    a, b = np.sort(spanning_forest.piece[nodes], axis=1).T
     order = np.lexsort((-groups.size[groups.label], b, a))
     order = order[(a[order] != b[order]) & may[order]]
     pairs, first = np.unique(np.stack([a[order], b[order]], -1), axis=0, return_index=True)
     chosen = order[first]
     cost = 1.0 / groups.size[groups.label[chosen]]
-    n = backbone.pieces
+    n = spanning_forest.pieces
     links = sparse.csr_matrix((cost, (pairs[:, 0], pairs[:, 1])), (n, n))
     rows, cols = sparse.csgraph.minimum_spanning_tree(links).nonzero()
     tree = set(zip(rows.tolist(), cols.tolist(), strict=True))

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from rlml_slam import se2
 from rlml_slam.graph.robust.inlier_evidence import evidence, fit_scale, uniform
-from rlml_slam.graph.robust.spanning_forest import Backbone
+from rlml_slam.graph.robust.spanning_forest import SpanningForest
 from rlml_slam.se2 import Array
 
 Ints = NDArray[np.int64]
@@ -36,15 +36,17 @@ class Groups(NamedTuple):
     scale: float
 
 
-def group(backbone: Backbone, nodes: Ints, deltas: Array, covs: Array, area: float) -> Groups:
+def group(
+    spanning_forest: SpanningForest, nodes: Ints, deltas: Array, covs: Array, area: float
+) -> Groups:
     """Groups of closures (k, 2), (k, 3), covariances (k, 3, 3) of their residuals.
 
     ``area`` [m²] is the extent of the map.
     """
     k = len(nodes)
-    a, b = _neighbours(backbone, nodes)
-    e, S = _loops(backbone, nodes, deltas, covs, a, b)
-    wrong = uniform(np.minimum(_reach(backbone, nodes, deltas, a, b), area))
+    a, b = _neighbours(spanning_forest, nodes)
+    e, S = _loops(spanning_forest, nodes, deltas, covs, a, b)
+    wrong = uniform(np.minimum(_reach(spanning_forest, nodes, deltas, a, b), area))
     scale = fit_scale(e, S, wrong)
     linked = evidence(e, S, scale, wrong) > math.log(max(k, 1) / RISK)
     links = sparse.csr_matrix((np.ones(linked.sum()), (a[linked], b[linked])), (k, k))
@@ -52,7 +54,7 @@ def group(backbone: Backbone, nodes: Ints, deltas: Array, covs: Array, area: flo
     return Groups(label.astype(np.int64), np.bincount(label, minlength=count), scale)
 
 
-def _neighbours(backbone: Backbone, nodes: Ints) -> tuple[Ints, Ints]:
+def _neighbours(spanning_forest: SpanningForest, nodes: Ints) -> tuple[Ints, Ints]:
     """Pairs a < b of closures whose ends lie in the same pieces and near each other."""
     if len(nodes) < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -60,16 +62,16 @@ def _neighbours(backbone: Backbone, nodes: Ints) -> tuple[Ints, Ints]:
     near = cKDTree(ends).query(ends, min(NEIGHBOURS + 1, len(nodes)), p=1)[1]
     a, b = np.repeat(np.arange(len(nodes)), near.shape[1]), near.ravel()
     a, b = np.unique(np.sort(np.stack([a, b], -1), axis=1)[a != b], axis=0).T
-    same = (backbone.piece[nodes[a]] == backbone.piece[nodes[b]]).all(1)
+    same = (spanning_forest.piece[nodes[a]] == spanning_forest.piece[nodes[b]]).all(1)
     return a[same], b[same]
 
 
 def _loops(
-    backbone: Backbone, nodes: Ints, deltas: Array, covs: Array, a: Ints, b: Ints
+    spanning_forest: SpanningForest, nodes: Ints, deltas: Array, covs: Array, a: Ints, b: Ints
 ) -> tuple[Array, Array]:
     """Error of closure b against the way over closure a, T_ib_ia z_a T_ja_jb, and covariance."""
-    T_i, S_i = backbone.motion(nodes[b, 0], nodes[a, 0])
-    T_j, S_j = backbone.motion(nodes[a, 1], nodes[b, 1])
+    T_i, S_i = spanning_forest.motion(nodes[b, 0], nodes[a, 0])
+    T_j, S_j = spanning_forest.motion(nodes[a, 1], nodes[b, 1])
     rest = se2.compose(deltas[a], T_j)
     e = se2.between(deltas[b], se2.compose(T_i, rest))
     A, B = se2.adjoint(se2.inverse(T_j)), se2.adjoint(se2.inverse(rest))
@@ -77,11 +79,11 @@ def _loops(
     return e, covs[b] + S_j + way
 
 
-def _reach(backbone: Backbone, nodes: Ints, deltas: Array, a: Ints, b: Ints) -> Array:
+def _reach(spanning_forest: SpanningForest, nodes: Ints, deltas: Array, a: Ints, b: Ints) -> Array:
     """Area [m²] in which the error of a loop can lie at all: that of the length of its sides."""
     sides = (
-        se2.between(backbone.poses[nodes[b, 0]], backbone.poses[nodes[a, 0]]),
-        se2.between(backbone.poses[nodes[a, 1]], backbone.poses[nodes[b, 1]]),
+        se2.between(spanning_forest.poses[nodes[b, 0]], spanning_forest.poses[nodes[a, 0]]),
+        se2.between(spanning_forest.poses[nodes[a, 1]], spanning_forest.poses[nodes[b, 1]]),
         deltas[a], deltas[b],
     )  # fmt: skip
     length = sum(np.hypot(side[:, 0], side[:, 1]) for side in sides)

@@ -18,7 +18,7 @@ from rlml_slam.se2 import Array
 Ints = NDArray[np.int64]
 
 
-class Backbone:
+class SpanningForest:
     """Breadth-first forest over the edges ``use`` (k,) of a graph.
 
     ``poses`` (n, 3) start at the estimate of each root; ``piece`` (n,) numbers the trees.

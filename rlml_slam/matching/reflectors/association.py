@@ -66,7 +66,12 @@ class Associator:
     def __init__(self, params: Reflector) -> None:
         p = params
         self._limits = association_status.Limits(
-            gate(p.gate), gate(p.new_gate), p.min_separation, p.blur, p.density, p.sure
+            gate(p.gate),
+            gate(p.new_gate),
+            p.min_separation,
+            p.separability_sigma,
+            p.unmapped_density,
+            p.match_probability,
         )
         self._joint = [gate(p.gate, 2 * k) for k in range(1, 65)]
 

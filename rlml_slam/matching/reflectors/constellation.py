@@ -120,7 +120,7 @@ def locate(
         best = result.candidates[0]
         dof = 2 * best.num_matches - (3 if prior is None else 0)
         # the noise is larger than stated, and gates by what was stated may have cut off a rival
-        if best.chi2 > gate(1.0 - params.risk, dof):
+        if best.chi2 > gate(1.0 - params.false_positive_probability, dof):
             scale = best.chi2 / dof
             result = _Search(z, scale * z_cov, p, scale * p_cov, params, max_tests).run(prior)
     match = np.full((len(result.candidates), len(points)), -1, dtype=np.int64)
@@ -220,9 +220,12 @@ class _Search:
         chance = self._chance([c.num_matches for c in found], proposals)
         seen = f'{n} of {k} detections match'
         # more ghosts or more missing than there are where the robot stands in this map
-        strange = bdtr(n, k, 1.0 - p.ghosts) < p.risk
-        missed = bdtr(best.num_near, best.num_near + best.num_unseen, 1.0 - p.missing) < p.risk
-        if chance > p.risk:
+        strange = bdtr(n, k, 1.0 - p.ghosts) < p.false_positive_probability
+        missed = (
+            bdtr(best.num_near, best.num_near + best.num_unseen, 1.0 - p.missing)
+            < p.false_positive_probability
+        )
+        if chance > p.false_positive_probability:
             if strange:
                 why = f'no pose explains the detections: only {seen}'
                 return Constellation(Verdict.IMPOSSIBLE, why, chance=chance)
@@ -230,10 +233,10 @@ class _Search:
             return Constellation(Verdict.AMBIGUOUS, why, tuple(found), chance)
         odds = np.exp([c.score - best.score for c in found])  # against the best one
         close = [c.support >= best.support - 1 for c in found]
-        if odds[1:].sum() > p.risk or any(close[1:]):
+        if odds[1:].sum() > p.false_positive_probability or any(close[1:]):
             rivals = [
                 c for c, o, near in zip(found, odds, close, strict=True)
-                if near or o > p.risk / MAX_CANDIDATES
+                if near or o > p.false_positive_probability / MAX_CANDIDATES
             ]  # fmt: skip
             why = f'{len(rivals)} poses fit alike: {seen}, {found[1].num_matches} at the next'
             return Constellation(Verdict.AMBIGUOUS, why, tuple(rivals), chance)

@@ -38,7 +38,7 @@ class Sight:
     R: Array
 
 
-class Hypotheses:
+class MultiHypothesis:
     """Weighted answers; seeded with a pose, known reflectors and their joint covariance."""
 
     def __init__(

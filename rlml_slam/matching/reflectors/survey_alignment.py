@@ -27,12 +27,12 @@ ROUNDS = 5  # of pairing and fitting: the first pairs may lack some at the edge
 
 @dataclass(frozen=True)
 class Placement:
-    """``T_plant_map`` (3,), None where nothing tells it, and ``why`` in words.
+    """``T_survey_map`` (3,), None where nothing tells it, and ``why`` in words.
 
     ``pairs`` (k, 2) are rows of the map and of the survey.
     """
 
-    T_plant_map: Array | None
+    T_survey_map: Array | None
     pairs: NDArray[np.int64]
     why: str
 

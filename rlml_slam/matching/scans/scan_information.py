@@ -156,7 +156,7 @@ def information(
     """Information (3, 3) of a match of ``points`` (n, 2), in scan order, at ``pose`` (3,).
 
     Coordinates are those of the pose in the submap frame. ``params.sigma_point`` is the error of
-    one end point across its surface, neighbours' correlation included; ``params.floor2`` (3,) the
+    one end point across its surface, neighbours' correlation included; ``params.variance_floor`` (3,) the
     variances of what more points do not average out. A direction that the scan leaves open, for
     it has less than OPEN of the information of the strongest one, has information zero.
 
@@ -170,7 +170,7 @@ def information(
         submap.values, float(j), float(i), 1.0 / submap.resolution,
         np.ascontiguousarray(points, dtype=np.float64),
         np.ascontiguousarray(pose, dtype=np.float64),
-        params.sigma_point, np.array(params.floor2), alone,
+        params.sigma_point, np.array(params.variance_floor), alone,
     )  # fmt: skip
 
 

@@ -383,7 +383,7 @@ def match(
     if window is not None:
         other = solve.refined(prior_pose)
         result = other if solve.merit(other) >= solve.merit(result) else result
-    if result.score < max(p.poor_score, usual):
+    if result.score < max(p.wide_search_score, usual):
         other = solve.refined(solve.found(p.wide_window, p.wide_angle, WIDE_STRIDE))
         if solve.merit(other) > solve.merit(result):
             return other
@@ -406,7 +406,7 @@ class _Solve:
         p = self.p
         return correlative_search.window(
             self.submap, self.points, self.prior, half_width, half_angle, self.whitening,
-            p.prior_scale, p.search_share, stride,
+            p.prior_scale, p.search_prior_weight, stride,
         ).pose  # fmt: skip
 
     def refined(self, start: Array) -> ScanMatchResult:
@@ -429,7 +429,7 @@ class _Solve:
         x, y, turn = result.pose - self.prior
         p, turn = self.p, wrapped(turn)
         loss = correlative_search.prior_loss(x, y, turn, self.whitening, p.prior_scale)
-        return result.score - p.search_share * loss
+        return result.score - p.search_prior_weight * loss
 
 
 def warm_up() -> None:
@@ -438,4 +438,4 @@ def warm_up() -> None:
     points = np.array([[1.0, 0.5], [-0.5, 1.0], [0.3, -0.8]])
     submap.insert(points, np.zeros(2))
     linearize(submap, points, np.zeros(3))
-    match(submap, points, np.zeros(3), np.eye(3), params.ScanMatch(poor_score=1.0))
+    match(submap, points, np.zeros(3), np.eye(3), params.ScanMatch(wide_search_score=1.0))

@@ -15,9 +15,9 @@ import numpy as np
 from rlml_slam.maps.map_container import Content
 from rlml_slam.params import Parameters
 from rlml_slam.slam.back_end.back_end import BackEnd
-from rlml_slam.slam.relocalization.global_localization import find_place
+from rlml_slam.slam.relocalization.global_localization import localize_globally
 from rlml_slam.slam.relocalization.scan_relocalization import Relocation, scan_fits
-from rlml_slam.slam.relocalization.search_schedule import SearchPace
+from rlml_slam.slam.relocalization.search_schedule import SearchSchedule
 from rlml_slam.slam.store import map_file
 from rlml_slam.types import Belief, Frame, Verdict
 
@@ -44,7 +44,7 @@ class Continued:
             back_end.reset()
             raise
         self._first = back_end.reflector_graph.next_key
-        self._pace: SearchPace | None = None
+        self._pace: SearchSchedule | None = None
         self._offered = self._begun = self._jumped = False
         self.entered = False
         self.why = 'the place in the map is looked for'
@@ -73,10 +73,12 @@ class Continued:
     def _look(self, frame: Frame) -> Relocation | None:
         """Where a frame was taken, if the map tells."""
         if self._pace is None or frame.stamp < self._pace.since:
-            self._pace = SearchPace(frame.stamp)
+            self._pace = SearchSchedule(frame.stamp)
         if not self._pace.is_due(frame):
             return None
-        found = find_place(self._saved.grid, self._saved.reflectors, frame.observation, self._p)
+        found = localize_globally(
+            self._saved.grid, self._saved.reflectors, frame.observation, self._p
+        )
         self.why = found.why
         return found if found.verdict is Verdict.UNIQUE else None
 

@@ -17,7 +17,7 @@ SUDDEN = np.array([1.0, 0.5])
 TURN = 0.02  # [rad] a correction that turns by more is told as well
 
 
-class SteadyOdom:
+class SmoothedCorrection:
     """Follows map to odom, in steps that move the robot no faster than ``correction_speed``.
 
     ``tell`` is called with the stamp [ns] of each jump and the robot's new pose (3,) as seen from

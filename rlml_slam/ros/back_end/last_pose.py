@@ -20,7 +20,7 @@ from rlml_slam.maps.atomic_file import write_atomically
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
-from rlml_slam.slam.relocalization.global_localization import find_place
+from rlml_slam.slam.relocalization.global_localization import localize_globally
 from rlml_slam.slam.relocalization.scan_relocalization import Relocation
 from rlml_slam.types import Frame, Level, Verdict
 
@@ -60,7 +60,9 @@ class LastPose:
             return None
         if last is None:
             return None
-        start, why = verified(last, find_place(in_map.grid, in_map.reflectors, seen, params))
+        start, why = verified(
+            last, localize_globally(in_map.grid, in_map.reflectors, seen, params)
+        )
         logger.warning(why) if start is None else logger.info(why)
         return start
 

@@ -18,7 +18,7 @@ from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Parameters
 from rlml_slam.ros.back_end.mapper import Mapper
 from rlml_slam.ros.codecs import encode
-from rlml_slam.ros.codecs.frame_messages import FrameJoin
+from rlml_slam.ros.codecs.frame_messages import FrameAssembler
 from rlml_slam.ros.codecs.message_types import make_rclpy
 from rlml_slam.slam.closures.closure_table import closure_table
 from rlml_slam.slam.landmarks.reflector_states import state_table
@@ -27,7 +27,9 @@ from rlml_slam.slam.landmarks.reflector_states import state_table
 class MapServices:
     """Answers in the mapper's thread, between two frames, so that no subscription waits."""
 
-    def __init__(self, node: Any, params: Parameters, mapper: Mapper, join: FrameJoin) -> None:
+    def __init__(
+        self, node: Any, params: Parameters, mapper: Mapper, join: FrameAssembler
+    ) -> None:
         self._node = node
         self._p = params
         self._mapper = mapper

@@ -18,20 +18,20 @@ from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.motion import SECOND
 from rlml_slam.params import Parameters
 from rlml_slam.ros.back_end.continued_map import Continued
-from rlml_slam.ros.back_end.correction_smoothing import SteadyOdom
+from rlml_slam.ros.back_end.correction_smoothing import SmoothedCorrection
 from rlml_slam.ros.back_end.last_pose import LastPose
 from rlml_slam.ros.back_end.map_folder import MapFolder
 from rlml_slam.ros.back_end.map_topics import MapTopics
 from rlml_slam.ros.back_end.worker import Worker
 from rlml_slam.ros.codecs.belief_message import StampedBelief
 from rlml_slam.ros.codecs.frame_messages import Record
-from rlml_slam.ros.map_publisher import MapProducts
+from rlml_slam.ros.map_publisher import MapPublisher
 from rlml_slam.ros.odom_frame import OdomFrame
 from rlml_slam.ros.tf import TransformPublisher
 from rlml_slam.se2 import Array
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.closures.closure_table import told
-from rlml_slam.slam.relocalization.global_localization import find_place
+from rlml_slam.slam.relocalization.global_localization import localize_globally
 from rlml_slam.slam.relocalization.recovery import Recovery
 from rlml_slam.slam.store import map_file
 from rlml_slam.types import Frame, Verdict
@@ -66,7 +66,7 @@ class Mapper:
         self._in_plant = False
         self.recovery = Recovery(params)
         self.worker = Worker()
-        self.products = MapProducts(node, params.node)
+        self.products = MapPublisher(node, params.node)
         self._odom = OdomFrame()
         self._newest: Frame | None = None
         self._session: int | None = None  # of the newest frame that came
@@ -77,7 +77,7 @@ class Mapper:
         self._heard = 0.0
         self._tf = TransformPublisher(node)
         self._topics = MapTopics(node, params.node)
-        self._steady = SteadyOdom(params.back_end, self._topics.jump)
+        self._steady = SmoothedCorrection(params.back_end, self._topics.jump)
         if self.saved is not None:
             self.worker.submit(self._use_saved)
         elif params.node.continue_map:
@@ -185,10 +185,10 @@ class Mapper:
 
     def _tell_of_plant(self) -> None:
         """Say so once when the map has entered the frame of the survey."""
-        plant = self.back_end.plant
-        found = plant is not None and plant.found
-        if plant is not None and found and not self._in_plant:
-            self._logger.info(f'the map has the frame of the survey: {plant.why}')
+        survey_frame = self.back_end.survey_frame
+        found = survey_frame is not None and survey_frame.found
+        if survey_frame is not None and found and not self._in_plant:
+            self._logger.info(f'the map has the frame of the survey: {survey_frame.why}')
         self._in_plant = found
 
     def _recover(self, record: Record) -> None:
@@ -373,7 +373,7 @@ class Mapper:
         """In the worker: find the newest frame anywhere in the map; whether, and what to do."""
         frame, in_map = self._newest, self.current()
         observation = None if frame is None else frame.observation
-        found = find_place(in_map.grid, in_map.reflectors, observation, self._p)
+        found = localize_globally(in_map.grid, in_map.reflectors, observation, self._p)
         if frame is None or found.verdict is Verdict.IMPOSSIBLE or found.pose is None:
             return False, f'not found: {found.why}; {ADVICE}'
         if found.verdict is Verdict.AMBIGUOUS:

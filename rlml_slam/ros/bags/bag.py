@@ -30,7 +30,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 
 from rlml_slam.errors import BagError
 from rlml_slam.params import Node
-from rlml_slam.ros.bags.bag_recovery import Salvage
+from rlml_slam.ros.bags.bag_recovery import BagRecovery
 from rlml_slam.ros.codecs.fast_decode import READERS
 from rlml_slam.ros.codecs.message_types import bag_types
 from rlml_slam.ros.sensor_input import STREAMS, USED_BY, topics_of
@@ -78,7 +78,7 @@ class BagReader:
             reader.open()
         except Exception as e:  # the library lets struct.error, KeyError and others through
             try:
-                reader = Salvage(self.path)
+                reader = BagRecovery(self.path)
             except (ValueError, OSError):
                 raise BagError(f'{self.path}: not a readable bag: {_line(e)}') from e
             self.damage = f'{self.path}: {reader.damage or _line(e)}'

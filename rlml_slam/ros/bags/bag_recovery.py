@@ -43,7 +43,7 @@ class Truncated(Exception):
     """The data end inside of a record."""
 
 
-class Salvage:
+class BagRecovery:
     """Looks like a reader of rosbags; ``damage`` says in one line what is wrong.
 
     Raises ValueError if nothing at all can be read.

@@ -138,7 +138,7 @@ def read_points(msg: Any, topic: str = 'deskewed_points') -> Array:
     return np.stack([cloud['x'], cloud['y']], -1).astype(np.float64)
 
 
-class FrameJoin:
+class FrameAssembler:
     """Records, points and detections of one stamp become frames again, in the records' order.
 
     While ``paused``, so are the frames, and their motion is added to that of the next one.

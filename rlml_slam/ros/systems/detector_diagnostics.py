@@ -55,7 +55,7 @@ class DetectorHealth:
         """Send the status."""
         figures: dict[str, object] = dict(self.counts)
         figures['reflectors in the last scan'] = self._last
-        inputs = self._sensors.sequencer.inputs
+        inputs = self._sensors.synchronizer.inputs
         for stream, counts in inputs.totals().items():
             figures |= {f'{stream} {what}': n for what, n in counts.items()}
         if inputs.last_error:

@@ -48,7 +48,7 @@ class Line(NamedTuple):
     ratio: float
 
 
-class SteadyClock:
+class StampFilter:
     """The line through the newest stamps of one sensor, in whole nanoseconds."""
 
     def __init__(self) -> None:

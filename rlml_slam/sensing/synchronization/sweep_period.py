@@ -18,7 +18,7 @@ SHORT = 0.5  # share of the period that no sweep is shorter than
 OFTEN = 0.1  # share of short intervals; jitter of a quarter of the period makes fewer
 
 
-class SweepClock:
+class SweepPeriod:
     """The newest intervals between the stamps of one laser, in seconds."""
 
     def __init__(self) -> None:

@@ -28,9 +28,9 @@ from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.deskew import project, sweep_time
 from rlml_slam.sensing.detection_frames import placed
-from rlml_slam.sensing.no_return import NoReturns
-from rlml_slam.sensing.repeated_scans import Repeats
-from rlml_slam.sensing.synchronization.stamp_filter import SteadyClock
+from rlml_slam.sensing.no_return import NoReturnRanges
+from rlml_slam.sensing.repeated_scans import RepeatedScans
+from rlml_slam.sensing.synchronization.stamp_filter import StampFilter
 from rlml_slam.types import Detections, Imu, Motion, Observation, Odometry, Scan
 
 PAIRING = 2_000_000  # [ns] stamps of one instant: drivers round to milliseconds
@@ -71,7 +71,7 @@ class Inputs:
         return {k: dict(sorted(v.items())) for k, v in sorted(self.counts.items())}
 
 
-class Sequencer:
+class Synchronizer:
     """Collects the inputs of one robot; each ``add_…`` returns the observations that became ready.
 
     An invalid input is counted in ``inputs`` and left out; it costs nothing that was known before.
@@ -88,14 +88,14 @@ class Sequencer:
         self._sensor_poses: dict[str, Array] = {self._node.base_frame: np.zeros(3)}
         self._default_frame: dict[str, str] = {}
         self._waiting: list[Waiting] = []
-        self._clocks: dict[tuple[str, str], SteadyClock] = {}
+        self._clocks: dict[tuple[str, str], StampFilter] = {}
         # stamps of scans and detections, and how much later they were measured
         self._instants: deque[tuple[int, int]] = deque(maxlen=INSTANTS)
         self._newest: dict[str, int] = {}
         self._newest_of: dict[tuple[str, str], int] = {}
         self._lidars: dict[str, tuple[int, int]] = {}  # by frame: newest stamp and period
-        self._no_returns = NoReturns()
-        self._repeats = Repeats()
+        self._no_returns = NoReturnRanges()
+        self._repeats = RepeatedScans()
         self._newest_any = -(2**62)
         self._first_any: int | None = None
         self._step: dict[str, int] = {}  # by stream: between its last two stamps
@@ -189,7 +189,7 @@ class Sequencer:
             return stamp
         clock = self._clocks.get((stream, source))
         if clock is None:
-            clock = self._clocks[stream, source] = SteadyClock()
+            clock = self._clocks[stream, source] = StampFilter()
         return clock.steady(stamp)
 
     def _clock_of(self, item: Scan | Detections) -> tuple[str, str]:

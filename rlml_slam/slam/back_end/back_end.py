@@ -18,7 +18,7 @@ from rlml_slam import se2
 from rlml_slam.errors import MapError
 from rlml_slam.estimation.correction import Correction, Known, either, turned
 from rlml_slam.graph.batch.marginals import Marginals
-from rlml_slam.graph.incremental.online_solver import Live
+from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.factors import relative_information
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.graph.model.robust_loss import Loss, Losses, LossKind
@@ -26,19 +26,19 @@ from rlml_slam.maps.occupancy import OccupancyGrid, render
 from rlml_slam.maps.survey import Survey, same
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
-from rlml_slam.slam.back_end.path_covariance import SurestWay, held
+from rlml_slam.slam.back_end.path_covariance import PathCovariance, held
 from rlml_slam.slam.back_end.scan_graph import ScanGraph
 from rlml_slam.slam.back_end.sparsification import Sparsifier
 from rlml_slam.slam.back_end.trajectory import Path
-from rlml_slam.slam.closures.closure_monitor import ClosureWatch
+from rlml_slam.slam.closures.closure_monitor import ClosureMonitor
 from rlml_slam.slam.closures.constellation_closure import Constellations
 from rlml_slam.slam.closures.loop_closure import Closure
 from rlml_slam.slam.keyframes import Interval, Keyframe
-from rlml_slam.slam.landmarks.delayed_association import DeferredMatches
-from rlml_slam.slam.landmarks.landmark_persistence import Presence
+from rlml_slam.slam.landmarks.delayed_association import DelayedAssociation
+from rlml_slam.slam.landmarks.landmark_persistence import LandmarkPersistence
 from rlml_slam.slam.landmarks.reflector_graph import ReflectorGraph
 from rlml_slam.slam.landmarks.reflector_states import ReflectorState, reflector_states
-from rlml_slam.slam.landmarks.survey_frame import PlantFrame
+from rlml_slam.slam.landmarks.survey_frame import SurveyFrame
 from rlml_slam.types import Belief, EdgeKind, Frame, Reflectors
 
 
@@ -88,19 +88,19 @@ class BackEnd:
                 reflector=Loss(LossKind.CAUCHY, p.reflector.robust_scale),
             )
         )
-        self.live = Live(self.graph, p.solver)
+        self.live = OnlineSolver(self.graph, p.solver)
         self.keyframes: list[Keyframe] = []
         self.scans = ScanGraph(p, self.live)
         self.reflector_graph = ReflectorGraph(p.reflector, self.live)
         self.constellations = Constellations(p, self.graph, self.reflector_graph)
-        self.deferred = DeferredMatches(p.reflector, self.reflector_graph)
+        self.delayed_association = DelayedAssociation(p.reflector, self.reflector_graph)
         self.sparsifier = Sparsifier(p, self.live, self.scans, self.reflector_graph)
-        self.path = Path(p.back_end.path_frames)
-        self.presence = Presence(p, self.graph, self.reflector_graph)
+        self.path = Path(p.back_end.max_trajectory_frames)
+        self.persistence = LandmarkPersistence(p, self.graph, self.reflector_graph)
         self._gone: tuple[int, ...] = ()  # since the newest keyframe began
-        self.closure_watch = ClosureWatch(p, self.live)
-        self.surest_way = SurestWay()
-        self.plant = self._plant_frame(self._survey)
+        self.closure_monitor = ClosureMonitor(p, self.live)
+        self.path_covariance = PathCovariance()
+        self.survey_frame = self._plant_frame(self._survey)
         self._changed: tuple[Closure, ...] = ()  # since the newest keyframe began
         self.T_map_local = np.zeros(3)
         self.known: Known | None = None
@@ -111,10 +111,10 @@ class BackEnd:
         # a keyframe that had neither, or until the next solve
         self._chores: deque[Callable[[], None]] = deque()
 
-    def _plant_frame(self, survey: Survey | None) -> PlantFrame | None:
+    def _plant_frame(self, survey: Survey | None) -> SurveyFrame | None:
         if survey is None:
             return None
-        return PlantFrame(self._p, self.live, self.reflector_graph, survey)
+        return SurveyFrame(self._p, self.live, self.reflector_graph, survey)
 
     def add(self, frame: Frame) -> Update | None:
         """Take one frame of the front end; an Update where it became a keyframe."""
@@ -178,7 +178,7 @@ class BackEnd:
 
     def _sparsify(self) -> None:
         if self.sparsifier.sparsify(self.keyframes, self.path):
-            self.surest_way.keep(self.keyframes)
+            self.path_covariance.keep(self.keyframes)
 
     def _prune(self) -> None:
         self.sparsifier.prune(len(self.keyframes))
@@ -201,7 +201,7 @@ class BackEnd:
             delta = motion if ours else since.delta
             self.path.begin_keyframe(motion)
             index = self.graph.add_pose(se2.compose(self.graph.poses[last.index], motion))
-            cov = since.cov + np.diag(np.array(self._p.back_end.edge_floor2))
+            cov = since.cov + np.diag(np.array(self._p.back_end.edge_variance_floor))
             if self._p.back_end.edge_covariance == 'sum':
                 # eq. 14 to the letter, in the axes of the frame it is used in
                 R = np.eye(3)
@@ -210,7 +210,7 @@ class BackEnd:
             self.graph.add_edge(
                 EdgeKind.ODOMETRY, index - 1, index, delta, relative_information(delta, cov)
             )
-            self.deferred.move(delta, cov)
+            self.delayed_association.move(delta, cov)
         # a scan that the front end could not place has no place in the map either
         placed = frame.scan_used or not self.keyframes
         points = o.points.astype(np.float32) if placed and o.points is not None else None
@@ -220,7 +220,7 @@ class BackEnd:
         )  # fmt: skip
         self.keyframes.append(key)
         if frame.jumped:
-            self.surest_way.begin(key)
+            self.path_covariance.begin(key)
         self._interval = Interval(frame.T_local_base)
         return key
 
@@ -237,7 +237,7 @@ class BackEnd:
         for old, new in here:
             self.reflector_graph.join(old, new)
         if here:
-            self.deferred.drop()
+            self.delayed_association.drop()
             self.rejoin()
 
     @property
@@ -248,19 +248,19 @@ class BackEnd:
     def _see_reflectors(self, interval: Interval) -> None:
         """The reflectors seen near the newest keyframe, and what they tell of earlier ones."""
         pose = len(self.keyframes) - 1
-        if not self.is_told and self.deferred.begins(interval):
+        if not self.is_told and self.delayed_association.begins(interval):
             if self._is_behind:
                 self.optimize()
-            self.deferred.begin(pose)
-        self.deferred.see(interval)
+            self.delayed_association.begin(pose)
+        self.delayed_association.see(interval)
         self.reflector_graph.add(pose, interval)
-        if self.deferred.decide():
+        if self.delayed_association.decide():
             self.rejoin()
-        self._gone += self.presence.look(self.keyframes, interval)
-        if self._gone and self.plant is not None:
-            self.plant.hold()
+        self._gone += self.persistence.look(self.keyframes, interval)
+        if self._gone and self.survey_frame is not None:
+            self.survey_frame.hold()
         forgotten = interval.last_look - int(2e9 * self._p.reflector.candidate_timeout)
-        self.reflector_graph.drop_candidates(forgotten, self.deferred.pending)
+        self.reflector_graph.drop_candidates(forgotten, self.delayed_association.pending)
 
     def rejoin(self) -> None:
         """Solve after reflectors were joined that stood apart, as far as the drift had gone.
@@ -282,15 +282,19 @@ class BackEnd:
             return
         solve = self.live.solve_all if final else self.live.solve
         solve()
-        if not self.is_told and self.reflector_graph.merge(self.deferred.pending):
+        if not self.is_told and self.reflector_graph.merge(self.delayed_association.pending):
             solve()
         # open hypotheses are about places in the frame of now
-        if self.plant is not None and not self.deferred.pending and self.plant.update():
+        if (
+            self.survey_frame is not None
+            and not self.delayed_association.pending
+            and self.survey_frame.update()
+        ):
             solve()
-        changed = self.closure_watch.review(self.scans.closures, final)
+        changed = self.closure_monitor.review(self.scans.closures, final)
         if changed:
             self._changed += changed
-            self.surest_way.forget()
+            self.path_covariance.forget()
         self.live.solve()
         self._optimized = True
         self._since_optimized = 0
@@ -310,11 +314,11 @@ class BackEnd:
         """
         before, last = self.keyframes[-2:]
         cov = self.live.joint([before.index])
-        if self.plant is None or not self.plant.found:
-            self.surest_way.close(self.scans.closures, self.keyframes, self.graph.edges)
+        if self.survey_frame is None or not self.survey_frame.found:
+            self.path_covariance.close(self.scans.closures, self.keyframes, self.graph.edges)
             if not self._is_held(before):
                 heading = float(self.T_map_local[2] + before.T_local[2])
-                cov = either(cov, turned(self.surest_way.cov(before), heading))
+                cov = either(cov, turned(self.path_covariance.cov(before), heading))
         since = Correction(self.T_map_local, Known(before.T_local, before.cov_local, cov))
         _, cov_map = since.apply(last.T_local, last.cov_local)
         return Known(last.T_local, last.cov_local, cov_map)
@@ -324,14 +328,14 @@ class BackEnd:
         enabled = self.graph.edges.enabled
         if not enabled[self.scans.closures.edges].any():
             return False
-        newest = self.surest_way.newest
+        newest = self.path_covariance.newest
         until = bisect_right(self.keyframes, newest, key=lambda k: k.stamp) - 1
         return held(self.graph.sightings, key.index, until)
 
     def revoke(self, number: int) -> Closure:
         """Take a loop closure out of the map for good; SolverError if there is no such one."""
-        closure = self.closure_watch.revoke(self.scans.closures, number)
-        self.surest_way.forget()
+        closure = self.closure_monitor.revoke(self.scans.closures, number)
+        self.path_covariance.forget()
         self.optimize()
         return closure
 
@@ -347,7 +351,7 @@ class BackEnd:
             self._see_reflectors(self._interval)
             self._interval = Interval(self.keyframes[-1].T_local)
             self.scans.finish()
-            if self.deferred.decide(final=True):
+            if self.delayed_association.decide(final=True):
                 self.rejoin()
             self.optimize(final=True)
 
@@ -365,13 +369,13 @@ class BackEnd:
         if survey is not None:
             if self._survey is not None and not same(survey, self._survey):
                 raise MapError('the map has the frame of another survey')
-            self.plant = self._plant_frame(survey)
-            assert self.plant is not None
-            self.plant.found = True
+            self.survey_frame = self._plant_frame(survey)
+            assert self.survey_frame is not None
+            self.survey_frame.found = True
         last = keys[-1]
         for key in keys:
             if key.jumped:
-                self.surest_way.begin(key)
+                self.path_covariance.begin(key)
         T_map = self.graph.poses[last.index].copy()
         last.cov_local = turned(last.cov_local, float(T_map[2] - last.T_local[2]))
         last.T_local = T_map

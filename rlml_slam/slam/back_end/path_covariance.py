@@ -29,7 +29,7 @@ from rlml_slam.slam.keyframes import Keyframe
 WEIGHTS = np.linspace(0.0, 1.0, 11)  # of one of two that are fused; the best of these is as good
 
 
-class SurestWay:
+class PathCovariance:
     """Covariances (3, 3) of keyframes in the map, each in the axes of its own pose.
 
     They are kept for keyframes at which a way other than the one driven came in. From the one

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.graph.incremental.online_solver import Live
+from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.factors import relative_information
 from rlml_slam.graph.model.graph import Renumbering
 from rlml_slam.graph.robust.inlier_evidence import uniform
@@ -27,13 +27,13 @@ from rlml_slam.matching.scans.scan_match import match
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
-from rlml_slam.slam.closures.closure_ambiguity import told_apart
+from rlml_slam.slam.closures.closure_ambiguity import is_distinct
 from rlml_slam.slam.closures.closure_candidates import Candidate, candidates
-from rlml_slam.slam.closures.closure_consistency import may_enter
+from rlml_slam.slam.closures.closure_consistency import is_consistent
 from rlml_slam.slam.closures.closure_matching import OPEN, UNDECIDED, Match, Matcher
 from rlml_slam.slam.closures.closure_records import ClosureRecords
 from rlml_slam.slam.closures.constellation_closure import Place
-from rlml_slam.slam.closures.keyframe_submap import TURN, KeySubmap
+from rlml_slam.slam.closures.keyframe_submap import TURN, KeyframeSubmap
 from rlml_slam.slam.closures.loop_closure import Closure, Fate, State
 from rlml_slam.slam.keyframes import Keyframe
 from rlml_slam.types import EdgeKind
@@ -53,12 +53,12 @@ class ScanGraph:
     all that were accepted (True) and rejected (False).
     """
 
-    def __init__(self, params: Parameters, live: Live) -> None:
+    def __init__(self, params: Parameters, live: OnlineSolver) -> None:
         self._p = params
         self._live = live
         self._graph = live.graph
-        self._active: list[KeySubmap] = []
-        self._finished: list[KeySubmap] = []
+        self._active: list[KeyframeSubmap] = []
+        self._finished: list[KeyframeSubmap] = []
         self._matcher = Matcher(params)
         self._waiting: list[Match] = []
         self._paired: list[tuple[int, int]] = []
@@ -83,7 +83,10 @@ class ScanGraph:
             self._tie(m, key, points)
         self._insert(key, voxel_filter.thin(whole, p.resolution, p.max_points))
         self._count += 1
-        if not self._p.loop_closure.enabled or self._count % self._p.loop_closure.every:
+        if (
+            not self._p.loop_closure.enabled
+            or self._count % self._p.loop_closure.keyframe_interval
+        ):
             return ()
         return self._close(key, points, self._finished)
 
@@ -114,7 +117,7 @@ class ScanGraph:
     def finish(self) -> None:
         """Nothing is held back for the end."""
 
-    def _tie(self, m: KeySubmap, key: Keyframe, points: Array) -> None:
+    def _tie(self, m: KeyframeSubmap, key: Keyframe, points: Array) -> None:
         """A scan edge from the submap's anchor, where the scan fits."""
         if not m.size:
             return
@@ -128,7 +131,12 @@ class ScanGraph:
         self._edge(EdgeKind.SCAN, m, key, found.pose, information)
 
     def _edge(
-        self, kind: EdgeKind, m: KeySubmap, key: Keyframe, T_grid_key: Array, information: Array
+        self,
+        kind: EdgeKind,
+        m: KeyframeSubmap,
+        key: Keyframe,
+        T_grid_key: Array,
+        information: Array,
     ) -> int:
         self.changed |= kind is EdgeKind.CLOSURE
         delta, information = self._measured(kind, m.T_anchor_grid, T_grid_key, information)
@@ -145,7 +153,11 @@ class ScanGraph:
         cov = R @ cov @ np.swapaxes(R, -1, -2)
         delta = se2.compose(T_anchor_grid, T_grid_key)
         closure = kind is EdgeKind.CLOSURE
-        floor2 = self._p.loop_closure.floor2 if closure else self._p.back_end.scan_floor2
+        floor2 = (
+            self._p.loop_closure.variance_floor
+            if closure
+            else self._p.back_end.scan_edge_variance_floor
+        )
         cov[..., [0, 1, 2], [0, 1, 2]] += floor2
         return delta, relative_information(delta, cov)
 
@@ -154,7 +166,7 @@ class ScanGraph:
         if self._active and self._active[0].size >= size and len(self._active) > 1:
             self._complete(self._active.pop(0))
         if not self._active or (len(self._active) == 1 and self._active[0].size >= size // 2):
-            self._active.append(KeySubmap(key, Submap(self._p.submap)))
+            self._active.append(KeyframeSubmap(key, Submap(self._p.submap)))
         for m in self._active:
             # inside one submap the front end's path is smoother than the graph's
             T = se2.between(se2.compose(m.anchor.T_local, TURN), key.T_local)
@@ -163,14 +175,14 @@ class ScanGraph:
             m.size += 1
             m.centre = m.centre + (T[:2] - m.centre) / m.size
 
-    def _complete(self, new: KeySubmap) -> None:
+    def _complete(self, new: KeyframeSubmap) -> None:
         """A submap is built: it takes the place of those that show nothing else."""
         new.submap.complete()
         if self._p.back_end.keyframes_per_place:
             self._finished = [m for m in self._finished if not self._is_covered(m, new)]
         self._finished.append(new)
 
-    def _is_covered(self, old: KeySubmap, new: KeySubmap) -> bool:
+    def _is_covered(self, old: KeyframeSubmap, new: KeyframeSubmap) -> bool:
         """Whether what one submap shows is known to another one as well."""
         T = se2.between(self._grid(new), self._grid(old))
         return len(old.walls) > 0 and new.submap.knows(se2.transform(T, old.walls)) >= COVERED
@@ -207,7 +219,7 @@ class ScanGraph:
         pose: Array = self._graph.poses[key.index]
         return pose
 
-    def _grid(self, m: KeySubmap) -> Array:
+    def _grid(self, m: KeyframeSubmap) -> Array:
         return se2.compose(self._pose(m.anchor), m.T_anchor_grid)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -249,7 +261,7 @@ class ScanGraph:
             size, submap.insertions = a['submap_size'][k].tolist()
             submap.complete()
             self._finished.append(
-                KeySubmap(
+                KeyframeSubmap(
                     keys[int(a['submap_anchor'][k])], submap, size,
                     a['submap_centre'][k].copy(), a['submap_pose'][k].copy(),
                 )
@@ -271,18 +283,18 @@ class ScanGraph:
         self.tried = {True: accepted, False: rejected}
 
     def _close(
-        self, key: Keyframe, points: Array, among: Sequence[KeySubmap]
+        self, key: Keyframe, points: Array, among: Sequence[KeyframeSubmap]
     ) -> tuple[Closure, ...]:
         """Try those ``among`` finished submaps that are near the keyframe."""
         near = candidates(self._graph, key, among, self._p.loop_closure)
         tried = [self._matcher.match(candidate, key, points) for candidate in near]
-        share = self._p.loop_closure.max_second
-        return self._record(told_apart(self._graph, key, points, tried, share))
+        share = self._p.loop_closure.ambiguity_ratio
+        return self._record(is_distinct(self._graph, key, points, tried, share))
 
     def enter(self, place: Place) -> tuple[Closure, ...]:
         """Close the loop to a place that reflectors tell, unless the scan says otherwise."""
         key, here = place.key, place.T_map_key
-        anchor = KeySubmap(place.anchor, Submap(self._p.submap), T_anchor_grid=np.zeros(3))
+        anchor = KeyframeSubmap(place.anchor, Submap(self._p.submap), T_anchor_grid=np.zeros(3))
         information = np.asarray(np.linalg.inv(place.cov), dtype=np.float64)
         confirmed: Match | Closure = Match(
             anchor, key, place.T_anchor_key, information, place.share, math.nan, math.nan,
@@ -351,7 +363,7 @@ class ScanGraph:
         wrong = uniform(np.array([c.searched for c in matches]))
         odds = np.array([c.odds for c in matches])
         sight = np.array([c.sight for c in matches])
-        may = may_enter(self._live, nodes, deltas, covs, wrong, odds, sight)
+        may = is_consistent(self._live, nodes, deltas, covs, wrong, odds, sight)
         out, waited = [], len(self._waiting)
         for n, (c, enters) in enumerate(zip(matches, may.tolist(), strict=True)):
             if enters:

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from rlml_slam import se2
 from rlml_slam.errors import SolverError
-from rlml_slam.graph.incremental.online_solver import Live
+from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.factor_table import FactorKind
 from rlml_slam.graph.model.graph import Renumbering
 from rlml_slam.graph.reduction.edge_pruning import prune
@@ -39,7 +39,7 @@ class Sparsifier:
     """Judges every keyframe once, when no submap that is being built needs it any more."""
 
     def __init__(
-        self, params: Parameters, live: Live, scans: ScanGraph, reflectors: ReflectorGraph
+        self, params: Parameters, live: OnlineSolver, scans: ScanGraph, reflectors: ReflectorGraph
     ) -> None:
         self._p = params.back_end
         self._live = live
@@ -127,7 +127,7 @@ class Sparsifier:
         """
         edges: dict[int, int] = {}
         ties: dict[int, tuple[int, Ties]] = {}
-        floor2 = np.array(self._p.scan_floor2)
+        floor2 = np.array(self._p.scan_edge_variance_floor)
         e = self._graph.edges
         left = np.array(poses)
         while len(left):  # those with few neighbours first, which ties the fewest anew

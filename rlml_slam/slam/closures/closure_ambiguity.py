@@ -26,7 +26,7 @@ APART = 0.5  # [m] at least between two places, as between those of one search
 KNOWN = 0.5  # share of the end points in cells that a submap knows, where it can tell
 
 
-def told_apart(
+def is_distinct(
     graph: Graph, key: Keyframe, points: Array, tried: Sequence[Tried], share: float
 ) -> list[Match | Closure]:
     """What was ``tried`` of a keyframe with ``points`` (n, 2), those in doubt rejected.

@@ -14,7 +14,7 @@ from rlml_slam.graph.model.graph import Graph
 from rlml_slam.graph.robust.path_bound import reach
 from rlml_slam.params import LoopClosure
 from rlml_slam.se2 import Array
-from rlml_slam.slam.closures.keyframe_submap import KeySubmap
+from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap
 from rlml_slam.slam.keyframes import Keyframe
 
 SIGMAS = 3.0  # how far off a keyframe is looked for: the bound holds all but the ends of the tails
@@ -27,7 +27,7 @@ class Candidate:
     Searched is the square of half width ``window`` [m] around it, turned by up to ``angle`` [rad].
     """
 
-    m: KeySubmap
+    m: KeyframeSubmap
     guess: Array
     window: float
     angle: float
@@ -39,7 +39,7 @@ class Candidate:
 
 
 def candidates(
-    graph: Graph, key: Keyframe, among: Sequence[KeySubmap], p: LoopClosure
+    graph: Graph, key: Keyframe, among: Sequence[KeyframeSubmap], p: LoopClosure
 ) -> list[Candidate]:
     """Those ``among`` submaps where the keyframe may be, the nearest first.
 
@@ -55,19 +55,19 @@ def candidates(
     centres = se2.transform(grids, np.array([m.centre for m in among])[:, None])[:, 0]
     gaps = np.hypot(*(centres - pose[:2]).T).tolist()
     order = np.argsort(gaps, kind='stable').tolist()
-    order = [k for k in order if gaps[k] < p.max_distance + p.widest_window - p.search_window]
+    order = [k for k in order if gaps[k] < p.max_distance + p.max_search_window - p.search_window]
     if not order:
         return []
     anchors = np.array([among[k].anchor.index for k in order], dtype=np.int64)
     off = SIGMAS * reach(graph, key.index, anchors)
-    windows = np.clip(off[:, 0], p.search_window, p.widest_window).tolist()
-    angles = np.clip(off[:, 1], p.search_angle, p.widest_angle).tolist()
+    windows = np.clip(off[:, 0], p.search_window, p.max_search_window).tolist()
+    angles = np.clip(off[:, 1], p.search_angle, p.max_search_angle).tolist()
     found = [
         (among[k], window, angle)
         for k, window, angle in zip(order, windows, angles, strict=True)
         if gaps[k] < p.max_distance + window - p.search_window
     ]
-    first, others = found[: p.candidates], found[p.candidates :]
+    first, others = found[: p.max_candidates], found[p.max_candidates :]
     lost = [c for c in others if c[1] > p.search_window]
     chosen = first + sorted(lost, key=lambda c: c[0].turn)[:1]
     for m, _, _ in chosen:
@@ -78,5 +78,5 @@ def candidates(
     ]
 
 
-def _grid(graph: Graph, m: KeySubmap) -> Array:
+def _grid(graph: Graph, m: KeyframeSubmap) -> Array:
     return se2.compose(graph.poses[m.anchor.index], m.T_anchor_grid)

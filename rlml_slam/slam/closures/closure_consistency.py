@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.graph.incremental.online_solver import Live
+from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model import factors
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.graph.robust.inlier_evidence import evidence
@@ -31,8 +31,8 @@ ALIKE = 0.1
 RISK = 0.1  # chances that any of the closures that wait agrees with another by accident
 
 
-def may_enter(
-    live: Live,
+def is_consistent(
+    live: OnlineSolver,
     nodes: Ints,
     deltas: Array,
     covs: Array,
@@ -62,7 +62,7 @@ def may_enter(
 class _Between:
     """Covariances of where some poses of a graph are from one another."""
 
-    def __init__(self, live: Live, poses: Ints) -> None:
+    def __init__(self, live: OnlineSolver, poses: Ints) -> None:
         n = len(poses)
         self._joint = live.joint(poses).reshape(n, 3, n, 3).swapaxes(1, 2)
         self._poses, self._at = live.graph.poses, poses

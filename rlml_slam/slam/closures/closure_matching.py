@@ -18,7 +18,7 @@ from rlml_slam.matching.scans.scan_match import linearize, match
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.closure_candidates import Candidate
-from rlml_slam.slam.closures.keyframe_submap import KeySubmap
+from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap
 from rlml_slam.slam.closures.loop_closure import Closure
 from rlml_slam.slam.keyframes import Keyframe
 
@@ -41,7 +41,7 @@ class Match:
     Closure.
     """
 
-    m: KeySubmap
+    m: KeyframeSubmap
     key: Keyframe
     T_grid_key: Array
     information: Array
@@ -75,7 +75,7 @@ class Matcher:
 
     def __init__(self, params: Parameters) -> None:
         self._p = params
-        self._pyramids: OrderedDict[KeySubmap, branch_and_bound.Pyramid] = OrderedDict()
+        self._pyramids: OrderedDict[KeyframeSubmap, branch_and_bound.Pyramid] = OrderedDict()
 
     def match(self, candidate: Candidate, key: Keyframe, points: Array) -> Tried:
         """Search and verify ``points`` (n, 2) of a keyframe; the record of what failed."""
@@ -88,11 +88,14 @@ class Matcher:
 
         result = branch_and_bound.wide(
             self._pyramid(m), points, guess, candidate.window, candidate.angle, p.min_score,
-            second_share=p.max_second,
+            second_share=p.ambiguity_ratio,
         )  # fmt: skip
         if result.best is None:
             return rejected('no place in the window fits')
-        if result.second is not None and result.second.score > p.max_second * result.best.score:
+        if (
+            result.second is not None
+            and result.second.score > p.ambiguity_ratio * result.best.score
+        ):
             return rejected(SECOND, result.best.score, result.best.pose, result.second.pose)
         weak = np.diag(1.0 / np.array([0.5, 0.5, 0.2]) ** 2)
         found = match(m.submap, points, result.best.pose, weak, self._p.scan_match, searched=False)
@@ -114,7 +117,7 @@ class Matcher:
         )  # fmt: skip
         return Tried(candidate, fit, found.pose[None])
 
-    def _pyramid(self, m: KeySubmap) -> branch_and_bound.Pyramid:
+    def _pyramid(self, m: KeyframeSubmap) -> branch_and_bound.Pyramid:
         if m not in self._pyramids:
             self._pyramids[m] = branch_and_bound.Pyramid(m.submap)
             if len(self._pyramids) > PYRAMIDS:

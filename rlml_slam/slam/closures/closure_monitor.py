@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.errors import SolverError
-from rlml_slam.graph.incremental.online_solver import Live
+from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model import factors
 from rlml_slam.graph.model.robust_loss import weights
 from rlml_slam.graph.robust.closure_selection import select_closures
@@ -31,10 +31,10 @@ MAJORITY = 0.9  # share of all closures that must be right where some are called
 CHANGED = 0.05  # change of a weight that is noted
 
 
-class ClosureWatch:
+class ClosureMonitor:
     """Notes residuals and weights, disables, revokes; closures are those of a ScanGraph."""
 
-    def __init__(self, params: Parameters, live: Live) -> None:
+    def __init__(self, params: Parameters, live: OnlineSolver) -> None:
         self._p = params
         self._live = live
         self._graph = live.graph

@@ -17,7 +17,7 @@ TURN = np.array([0.0, 0.0, GRID_TURN])
 
 
 @dataclass(eq=False)
-class KeySubmap:
+class KeyframeSubmap:
     """A submap of ``size`` keyframes, at ``T_anchor_grid`` (3,) from keyframe ``anchor``.
 
     While it is being built that is the first of them, and the submap is turned by GRID_TURN.

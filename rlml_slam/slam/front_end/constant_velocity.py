@@ -20,7 +20,7 @@ from rlml_slam.compiled import brief
 from rlml_slam.estimation.correction import positive
 from rlml_slam.params import MotionNoise
 from rlml_slam.se2 import Array, wrapped
-from rlml_slam.sensing.synchronization.sweep_period import SweepClock
+from rlml_slam.sensing.synchronization.sweep_period import SweepPeriod
 from rlml_slam.slam.front_end.joint_state import BIAS, VELOCITY, JointState
 from rlml_slam.slam.front_end.scan_update import relative
 from rlml_slam.types import Motion
@@ -30,12 +30,12 @@ OPEN = 1e-6  # [1/m^2, 1/rad^2] information of a direction in which nothing was 
 COVERED = 0.99  # share of the time that a gyro has to cover for its turn to be taken
 
 
-class Coasting:
+class ConstantVelocity:
     """Predicts the pose of a robot without odometry, and says afterwards how it moved."""
 
     def __init__(self, params: MotionNoise) -> None:
         self._p = params
-        self._clock = SweepClock()
+        self._clock = SweepPeriod()
         self._pose = np.zeros(3)
         self._cov = np.zeros((3, 3))  # of the pose in the submap, before
         self._way = np.zeros((3, 3))  # covariance of the motion that was predicted
@@ -47,9 +47,9 @@ class Coasting:
         """
         p = self._p
         self._pose, (_, self._cov) = state.pose, relative(state.x, state.P)
-        (elapsed, error), sigma = self._clock.elapsed(dt), np.array(p.free_speeds)
-        jitter = math.hypot(p.free_jitter, error)
-        self._way = coast(state, elapsed, sigma, p.free_time, jitter, motion)
+        (elapsed, error), sigma = self._clock.elapsed(dt), np.array(p.constant_velocity_sigma)
+        jitter = math.hypot(p.constant_velocity_stamp_sigma, error)
+        self._way = coast(state, elapsed, sigma, p.constant_velocity_time, jitter, motion)
         state.P[BIAS, BIAS] += p.imu_bias_walk**2 * dt
 
     def found(self, state: JointState, motion: Motion) -> Motion:

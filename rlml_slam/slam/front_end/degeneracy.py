@@ -22,7 +22,7 @@ from rlml_slam.slam.front_end.scan_update import MIN_INFORMATION
 SAME = 0.02
 
 
-class OpenDirection:
+class Degeneracy:
     """The mean direction (3,) of the pose, in local axes, that the last scans left open."""
 
     def __init__(self) -> None:

@@ -17,16 +17,16 @@ import numpy as np
 from rlml_slam import se2
 from rlml_slam.estimation.correction import Correction, Known
 from rlml_slam.estimation.health import Evidence, HealthMonitor
-from rlml_slam.estimation.kidnapping_detection import Doubt
-from rlml_slam.estimation.landmark_tracks import Tracks
+from rlml_slam.estimation.kidnapping_detection import KidnappingDetection
+from rlml_slam.estimation.landmark_tracks import LandmarkTracks
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
-from rlml_slam.slam.front_end.constant_velocity import Coasting
-from rlml_slam.slam.front_end.grid_localization import Fix, SavedGrid
+from rlml_slam.slam.front_end.constant_velocity import ConstantVelocity
+from rlml_slam.slam.front_end.grid_localization import Fix, GridLocalizer
 from rlml_slam.slam.front_end.joint_state import STANDING, SYSTEMATIC, JointState
-from rlml_slam.slam.front_end.map_confirmation import START_SIGMA, Confirmation
+from rlml_slam.slam.front_end.map_confirmation import START_SIGMA, MapConfirmation
 from rlml_slam.slam.front_end.odometry_scale import went_on
 from rlml_slam.slam.front_end.reflector_term import USED, Matched, ReflectorTerm
 from rlml_slam.slam.front_end.scan_term import ScanTerm
@@ -59,19 +59,21 @@ class FrontEnd:
     def reset(self, pose: Array, cov: Array) -> None:
         """Forget everything and start at a pose (3,) of the map with covariance (3, 3)."""
         m = self._p.motion
-        self.state = JointState(pose, cov, m.imu_bias, m.free_speeds, m.wheels)
+        self.state = JointState(
+            pose, cov, m.imu_bias_sigma, m.constant_velocity_sigma, m.scale_error_sigma
+        )
         self._reflectors = ReflectorTerm(self._p, self.state)
         self._scans = ScanTerm(self._p, self.state)
         self.health = HealthMonitor(self._p.health)
-        self._grid: SavedGrid | None = None
+        self._grid: GridLocalizer | None = None
         self._fix = Fix(math.nan)
         self._jumped = False
         self._correction = Correction(np.zeros(3))
         self._velocity = np.zeros(3)
         self._since: tuple[int, Array] | None = None
-        self._coasting = Coasting(self._p.motion)
+        self._coasting = ConstantVelocity(self._p.motion)
         self._map: SavedMap | None = None
-        self.confirmation = Confirmation(self._p)
+        self.confirmation = MapConfirmation(self._p)
         self._last_stamp: int | None = None
         self._settling = 0.0  # [s] since the last frame
         self._is_settled = True
@@ -96,7 +98,7 @@ class FrontEnd:
         self._map = replace(self._map, grid=grid)
         self._grid = None
         if grid is not None and is_mapped(grid):
-            self._grid = SavedGrid(grid, self._p)
+            self._grid = GridLocalizer(grid, self._p)
 
     def relocate(self, T_map_base: Array, cov: Array) -> None:
         """Go on from another place (3,), (3, 3) of the map.
@@ -142,7 +144,7 @@ class FrontEnd:
         return self._correction.T_map_local
 
     @property
-    def tracks(self) -> Tracks:
+    def tracks(self) -> LandmarkTracks:
         """Whose the landmarks of the state are."""
         return self._reflectors.tracks
 
@@ -152,7 +154,7 @@ class FrontEnd:
         return self._scans.submaps
 
     @property
-    def doubt(self) -> Doubt:
+    def doubt(self) -> KidnappingDetection:
         """Whether what is seen contradicts the map."""
         return self._scans.doubt
 
@@ -239,7 +241,7 @@ class FrontEnd:
         else:
             p, motion = self._p.motion, observation.motion
             went = went_on(self._velocity, dt, p) if motion.known else STANDING
-            kept = math.exp(-dt / p.wheels_time)
+            kept = math.exp(-dt / p.scale_error_time)
             self.state.predict(motion, p.imu_bias_walk**2 * dt, kept, went)
         return coasts
 

@@ -40,14 +40,14 @@ class Fix:
     contradicts: bool = False
 
 
-class SavedGrid:
+class GridLocalizer:
     """The grid; ``fix`` updates a state with a scan where the robot has moved on."""
 
     def __init__(self, grid: OccupancyGrid, params: Parameters) -> None:
         self._p = params
         self._submap = submap_of(grid, params.submap)
         self._floor = np.zeros((3, 3))
-        self._floor[[0, 1, 2], [0, 1, 2]] = params.submap.grid_bias2
+        self._floor[[0, 1, 2], [0, 1, 2]] = params.submap.grid_bias_variance
         self._gate = [gate(OUTLIER, dof) for dof in (1, 2, 3)]
         self._last: Array | None = None
 
@@ -66,11 +66,11 @@ class SavedGrid:
         prior, cov = state.pose, state.pose_cov
         strength = np.asarray(np.linalg.inv(cov + self._floor), dtype=np.float64)
         found = match(self._submap, points, prior, strength, p, searched=False)
-        if found.score < p.good_score:
+        if found.score < p.search_score:
             searched = match(self._submap, points, prior, strength, p)
             found = searched if searched.score > found.score else found
         if found.score < p.min_score:
-            may_be = possible(self._submap, points[::FEW], found.pose, found.score, p.good_score)
+            may_be = possible(self._submap, points[::FEW], found.pose, found.score, p.search_score)
             return Fix(found.score, contradicts=may_be < p.min_score)
         information = scan_information.information(self._submap, points, found.pose, p)
         # the error of the map at this place, which more beams do not lower
@@ -88,5 +88,5 @@ class SavedGrid:
             return Fix(found.score)
         state.apply(POSE, root, np.eye(len(v)), v)
         self._last = state.pose
-        weakest = self._p.health.weak_sigma**-2
+        weakest = self._p.health.degenerate_sigma**-2
         return Fix(found.score, True, len(v) == 3 and float(values[0]) >= weakest)

@@ -20,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.estimation.landmark_tracks import Tracks
+from rlml_slam.estimation.landmark_tracks import LandmarkTracks
 from rlml_slam.se2 import Array
 from rlml_slam.slam.front_end.joint_state import LANDMARKS, JointState
 from rlml_slam.slam.front_end.map_window import MARGIN
@@ -63,17 +63,17 @@ class LeftOut:
         return b.reshape(-1, 2), C + WP @ W.transpose(0, 2, 1)
 
 
-class Distant:
+class InactiveLandmarks:
     """Keeps the confirmed reflectors beyond ``reach`` [m] out of a state and its tracks."""
 
     def __init__(self, reach: float, min_sightings: int) -> None:
         self._reach = reach
         self._min_sightings = min_sightings
         self._left_out: LeftOut | None = None
-        self._tracks = Tracks()
+        self._tracks = LandmarkTracks()
         self._middle, self._sigma = np.full(2, np.inf), 0.0
 
-    def follow(self, state: JointState, tracks: Tracks, ids: NDArray[np.int64]) -> None:
+    def follow(self, state: JointState, tracks: LandmarkTracks, ids: NDArray[np.int64]) -> None:
         """Exchange reflectors where the pose left the middle of the part that is in the state.
 
         One that tells by ``ids`` (k,) that it is seen is in reach, wherever it was believed.
@@ -95,7 +95,7 @@ class Distant:
             self._tracks = tracks.take(away)
 
     def everything(
-        self, state: JointState, tracks: Tracks
+        self, state: JointState, tracks: LandmarkTracks
     ) -> tuple[NDArray[np.int64], Array, Array]:
         """Keys (n,), places (n, 2) and covariances (n, 2, 2) of those in and out of the state."""
         if self._left_out is None:
@@ -107,7 +107,7 @@ class Distant:
             np.concatenate([state.landmark_covs(), covs]),
         )
 
-    def all_tracks(self, tracks: Tracks) -> Tracks:
+    def all_tracks(self, tracks: LandmarkTracks) -> LandmarkTracks:
         """The tracks of those in and out of the state, in the order of :meth:`everything`."""
         every = replace(tracks)
         every.extend(self._tracks)
@@ -117,12 +117,12 @@ class Distant:
         """Whether any of ``keys`` (k,) is out of the state."""
         return bool(np.isin(self._tracks.keys, keys).any())
 
-    def gather(self, state: JointState, tracks: Tracks) -> None:
+    def gather(self, state: JointState, tracks: LandmarkTracks) -> None:
         """Put all of them back."""
         if self._left_out is not None:
             self._left_out.put_back(state)
             tracks.extend(self._tracks)
-            self._left_out, self._tracks = None, Tracks()
+            self._left_out, self._tracks = None, LandmarkTracks()
         self._middle = np.full(2, np.inf)
 
 

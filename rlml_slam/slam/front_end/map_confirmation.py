@@ -16,7 +16,7 @@ from rlml_slam.slam.front_end.grid_localization import Fix
 START_SIGMA = np.array([0.5, 0.5, 0.26])
 
 
-class Confirmation:
+class MapConfirmation:
     """Judges frame by frame; ``reason`` says what is missing, empty where nothing is.
 
     ``is_pending``: the pose is still the one that was told or assumed. ``is_lost``: it is for too

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rlml_slam.estimation.landmark_tracks import Tracks
+from rlml_slam.estimation.landmark_tracks import LandmarkTracks
 from rlml_slam.slam.front_end.joint_state import JointState
 from rlml_slam.types import Reflectors
 
@@ -24,7 +24,7 @@ class MapWindow:
         self._reach = reach
         self._middle = np.full(2, np.inf)
 
-    def follow(self, state: JointState, tracks: Tracks) -> None:
+    def follow(self, state: JointState, tracks: LandmarkTracks) -> None:
         """Exchange reflectors where the pose left the middle of the part that is in the state."""
         at = state.pose[:2]
         sigma = float(np.sqrt(np.trace(state.pose_cov[:2, :2])))

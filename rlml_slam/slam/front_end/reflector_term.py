@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from rlml_slam import se2
 from rlml_slam.estimation.kidnapping_detection import consents
-from rlml_slam.estimation.landmark_tracks import Tracks
+from rlml_slam.estimation.landmark_tracks import LandmarkTracks
 from rlml_slam.matching.reflectors import association
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
-from rlml_slam.slam.front_end.inactive_landmarks import Distant
+from rlml_slam.slam.front_end.inactive_landmarks import InactiveLandmarks
 from rlml_slam.slam.front_end.joint_state import JointState
 from rlml_slam.slam.front_end.map_window import MapWindow
 from rlml_slam.slam.front_end.reflector_update import use_reflectors
@@ -64,12 +64,12 @@ class ReflectorTerm:
     def __init__(self, params: Parameters, state: JointState) -> None:
         self._p = params
         self._state = state
-        self.tracks = Tracks()
+        self.tracks = LandmarkTracks()
         self._associator = association.Associator(params.reflector)
         self._contradiction = association.gate(params.reflector.new_gate)
         self._window: MapWindow | None = None
         r = params.reflector
-        self._distant = Distant(r.max_range, r.min_sightings)
+        self._distant = InactiveLandmarks(r.max_range, r.min_sightings)
         self._reach = 0.0
 
     def use_map(self, reflectors: Reflectors) -> None:

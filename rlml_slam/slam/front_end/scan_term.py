@@ -10,18 +10,18 @@ import numpy as np
 
 from rlml_slam import se2
 from rlml_slam.estimation.health import Evidence, ends_of, weak_direction
-from rlml_slam.estimation.kidnapping_detection import Doubt
+from rlml_slam.estimation.kidnapping_detection import KidnappingDetection
 from rlml_slam.matching.scans import scan_information, voxel_filter
 from rlml_slam.matching.scans.scan_match import UNKNOWN, ScanMatchResult, match
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
-from rlml_slam.slam.front_end.degeneracy import OpenDirection
+from rlml_slam.slam.front_end.degeneracy import Degeneracy
 from rlml_slam.slam.front_end.joint_state import JointState
 from rlml_slam.slam.front_end.scan_update import fuse, prior_of, relative
 from rlml_slam.slam.front_end.submaps import Submaps
 from rlml_slam.slam.front_end.velocity_deskew import Sweep, deskewed
-from rlml_slam.slam.relocalization.local_recovery import AS_USUAL, TURN, second_look
+from rlml_slam.slam.relocalization.local_recovery import AS_USUAL, TURN, recover_locally
 from rlml_slam.types import Observation
 
 FAR = 3.0  # [sigma] a search without odometry reaches
@@ -44,8 +44,8 @@ class ScanTerm:
     def begin_anew(self) -> None:
         """Forget the submaps: the robot is somewhere else."""
         self.submaps = Submaps(self._p.submap)
-        self.doubt = Doubt(self._p.health)
-        self._open = OpenDirection()
+        self.doubt = KidnappingDetection(self._p.health)
+        self._open = Degeneracy()
         self._last_fit = 0
 
     def deskewed(self, observation: Observation) -> tuple[Observation, Sweep]:
@@ -61,14 +61,14 @@ class ScanTerm:
         state = copy.deepcopy(self._state)
         prior, strength = self._prior(sweep)
         found = match(submap, points, prior, strength, p, searched=False)
-        if found.score < max(p.good_score, AS_USUAL * self.doubt.usual):
+        if found.score < max(p.search_score, AS_USUAL * self.doubt.usual):
             return first, sweep
         self._fuse(state, found, self._information(submap, points, found), sweep)
         return deskewed(observation, state.velocity, reach)
 
     def _prior(self, sweep: Sweep) -> tuple[Array, Array]:
         """Where a match is expected in the submap (3,), and its information (3, 3)."""
-        floor2 = np.array(self._p.scan_match.floor2)
+        floor2 = np.array(self._p.scan_match.variance_floor)
         return prior_of(self._state.x, self._state.P, floor2, sweep.half, sweep.velocity)
 
     def _information(self, submap: Submap, points: Array, found: ScanMatchResult) -> Array:
@@ -134,7 +134,7 @@ class ScanTerm:
             found = self._matched_freely(submap, points, prior, strength, p.search_window)
         usual = AS_USUAL * self.doubt.usual
         # where nothing but the speed leads to the start, a fit that is worse is of another place
-        least = p.good_score if self.has_odometry else max(p.good_score, usual)
+        least = p.search_score if self.has_odometry else max(p.search_score, usual)
         if found.score < least or found.prior_weight < 0.5:
             searched = match(submap, points, prior, strength, p)
             found = searched if searched.score > found.score else found
@@ -145,7 +145,9 @@ class ScanTerm:
         misfit = self._misfits(submap, points, found)
         if misfit and not agrees and not self.lasts(observation.stamp):
             turn = TURN if self.has_odometry else math.pi
-            found = second_look(submap, points, prior, self.doubt.usual, self._p, turn) or found
+            found = (
+                recover_locally(submap, points, prior, self.doubt.usual, self._p, turn) or found
+            )
             misfit = self._misfits(submap, points, found)
         if found.score < p.min_score or (misfit and not agrees):
             return Evidence(scan=True, misfit=misfit, beams=len(points), score=found.score)
@@ -159,7 +161,7 @@ class ScanTerm:
             misfit=misfit,
             beams=len(points),
             score=found.score,
-            weak=weak_direction(information, heading, self._p.health.weak_sigma),
+            weak=weak_direction(information, heading, self._p.health.degenerate_sigma),
             prior_weight=found.prior_weight,
             iterations=found.iterations,
         )
@@ -177,7 +179,7 @@ class ScanTerm:
             return
         if evidence.used or self.submaps.target is None:
             self._last_fit = observation.stamp
-        elif observation.stamp - self._last_fit < self._p.health.patience * 1e9:
+        elif observation.stamp - self._last_fit < self._p.health.input_timeout * 1e9:
             return
         if evidence.used and not self.has_odometry and self._is_loose():
             self.submaps.forget()

@@ -30,7 +30,7 @@ class Submaps:
         self._open: list[list[Placed]] = []  # of each submap, scans that are still to be carved
         self._last: Array | None = None
         self.bias = np.zeros((3, 3))
-        self.bias[[0, 1, 2], [0, 1, 2]] = parameters.bias2
+        self.bias[[0, 1, 2], [0, 1, 2]] = parameters.bias_variance
 
     @property
     def target(self) -> Submap | None:
@@ -83,10 +83,12 @@ class Submaps:
 
     def _turn_over(self, state: JointState) -> None:
         """Retire a full submap, begin the next one at half of it."""
-        if len(self._maps) > 1 and self._inserted(0) >= self._p.size:
+        if len(self._maps) > 1 and self._inserted(0) >= self._p.insertions:
             del self._maps[0], self._open[0]
             state.move_anchor(1, 0)
-        if not self._maps or (len(self._maps) == 1 and self._inserted(0) >= self._p.size // 2):
+        if not self._maps or (
+            len(self._maps) == 1 and self._inserted(0) >= self._p.insertions // 2
+        ):
             state.clone_pose(len(self._maps), GRID_TURN, self.bias)
             self._maps.append(Submap(self._p))
             self._open.append([])

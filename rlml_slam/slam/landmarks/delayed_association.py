@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rlml_slam.matching.reflectors.multi_hypothesis import Hypotheses, Sight
+from rlml_slam.matching.reflectors.multi_hypothesis import MultiHypothesis, Sight
 from rlml_slam.params import Reflector
 from rlml_slam.se2 import Array
 from rlml_slam.slam.keyframes import Interval, Sighting
@@ -21,7 +21,7 @@ DECIDED = 0.999  # probability of a match that joins two reflectors of the map
 LIKELY = 0.5  # the same when there will be no more evidence
 
 
-class DeferredMatches:
+class DelayedAssociation:
     """Nothing, until a keyframe brings an unknown reflector; then hypotheses, until all is told.
 
     They are seeded from the graph's own covariance, so that what it knows from scans and closures
@@ -31,7 +31,7 @@ class DeferredMatches:
     def __init__(self, params: Reflector, reflectors: ReflectorGraph) -> None:
         self._p = params
         self._reflectors = reflectors
-        self._hypotheses: Hypotheses | None = None
+        self._hypotheses: MultiHypothesis | None = None
 
     @property
     def pending(self) -> frozenset[int]:
@@ -54,8 +54,8 @@ class DeferredMatches:
     def begin(self, pose: int) -> None:
         """Open the question at keyframe ``pose``, from what the graph knows."""
         belief = self._reflectors.belief(pose)
-        self._hypotheses = Hypotheses(
-            belief.T_map_base, belief.keys, belief.points, belief.cov, self._p.density
+        self._hypotheses = MultiHypothesis(
+            belief.T_map_base, belief.keys, belief.points, belief.cov, self._p.unmapped_density
         )
 
     def drop(self) -> None:

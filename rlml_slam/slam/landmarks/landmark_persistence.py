@@ -7,7 +7,8 @@ this cell; at an empty place something is detected with q, the density of ghosts
 
     log odds += log(p / q) if it is seen, log((1 - p) / (1 - q)) if not
 
-and they stay within the odds of ``reflector.gone`` either way, for anything may be moved later.
+and they stay within the odds of ``reflector.persistence_threshold`` either way, for anything may
+be moved later.
 A probability of the reflector alone would not do: a flat one, or one behind a corner that the
 beams pass, is missed from the same places again and again. Misses in a row have a common cause
 now and then, such as a person whom the beams of a coarse scan pass: with the probability h, a
@@ -49,14 +50,14 @@ class _Misses:
     sum: float = 0.0
 
 
-class Presence:
+class LandmarkPersistence:
     """Looks after each keyframe which of the mapped reflectors were seen that were due."""
 
     def __init__(self, params: Parameters, graph: Graph, reflectors: ReflectorGraph) -> None:
         p = params.reflector
         self._p = p
         self._missing = params.relocalization.missing
-        self._empty = min(p.density * math.pi * p.min_separation**2, 0.5)
+        self._empty = min(p.unmapped_density * math.pi * p.min_separation**2, 0.5)
         self._graph = graph
         self._reflectors = reflectors
         self._missed: dict[int, Array] = {}  # from where, the last time that counted, by key
@@ -67,7 +68,7 @@ class Presence:
         key = keys[-1]
         key.looked = interval.looked
         alive = self._reflectors.alive()
-        if not (alive and self._p.gone and interval.looked):
+        if not (alive and self._p.persistence_threshold and interval.looked):
             return ()
         if key.points is None or key.origin is None:
             return ()
@@ -124,7 +125,7 @@ class Presence:
         life.hits += is_seen
         life.misses += not is_seen
         p, q = (0.5 * TWO + hits) / (TWO + hits + misses), self._empty
-        most = math.log((1.0 - self._p.gone) / self._p.gone)
+        most = math.log((1.0 - self._p.persistence_threshold) / self._p.persistence_threshold)
         if is_seen:
             self._misses.pop(m.key, None)
             life.odds = min(life.odds + math.log(p / q), most)
@@ -150,7 +151,7 @@ class Presence:
             if k.points is not None and k.origin is not None:
                 scan = k.points.astype(np.float64)
                 unseen += bool(expected(pose, place, scan, k.origin, math.inf)[0])
-        return bool(self._missing**unseen < self._p.gone)
+        return bool(self._missing**unseen < self._p.persistence_threshold)
 
 
 def cell_of(pose: Array) -> Cell:

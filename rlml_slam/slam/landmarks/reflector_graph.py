@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from rlml_slam.graph.batch.marginals import Marginals
-from rlml_slam.graph.incremental.online_solver import Live
+from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.graph import Renumbering
 from rlml_slam.graph.reduction.edge_pruning import prune_sightings
 from rlml_slam.graph.reduction.marginalization import Ties, limited
@@ -22,7 +22,7 @@ from rlml_slam.params import Reflector
 from rlml_slam.se2 import Array, rotation, transform
 from rlml_slam.slam.keyframes import AGREE, Interval
 from rlml_slam.slam.landmarks.landmark import LIFE, SIGHTING, VIEW, Landmark, Life
-from rlml_slam.slam.landmarks.removed_landmarks import GoneList
+from rlml_slam.slam.landmarks.removed_landmarks import RemovedLandmarks
 from rlml_slam.types import ANONYMOUS, Belief, Reflectors
 
 Records = NDArray[np.void]
@@ -36,13 +36,13 @@ COMMON2 = np.array([1e-4, 1e-4])
 class ReflectorGraph:
     """Sightings (e^R of eq. 12) and landmarks; keys are the front end's."""
 
-    def __init__(self, params: Reflector, live: Live) -> None:
+    def __init__(self, params: Reflector, live: OnlineSolver) -> None:
         self._p = params
         self._live = live
         self._graph = live.graph
         self._landmarks: dict[int, Landmark] = {}
         self._alias: dict[int, int] = {}
-        self.gone = GoneList()
+        self.gone = RemovedLandmarks()
         self._given_up: set[int] = set()  # keys that the front end may still have
         self._came = np.zeros(2, dtype=np.int64)  # keyframes with sightings, and how many of these
         self.changed = False
@@ -65,7 +65,7 @@ class ReflectorGraph:
             landmark.life.seen(interval.first_look, interval.last_look)
             landmark.beside |= together
             # errors of a sensor are alike from one message to the next: many do not average out
-            worth = 1.0 / (1.0 + self._p.alike * (s.count - 1))
+            worth = 1.0 / (1.0 + self._p.correlated_share * (s.count - 1))
             row = np.zeros(1, dtype=SIGHTING)
             row['pose'], row['factor'] = pose, -1
             row['z'], row['information'] = s.z, worth * s.information
@@ -169,7 +169,7 @@ class ReflectorGraph:
                 continue
             cov = _difference_cov(joint, *np.searchsorted(close, (i, j))) + 1e-6 * np.eye(2)
             peak = 1.0 / (2.0 * math.pi * math.sqrt(np.linalg.det(cov)))
-            if peak < self._p.sure * (peak + self._p.density):
+            if peak < self._p.match_probability * (peak + self._p.unmapped_density):
                 continue
             d = points[i] - points[j]
             near = gap < self._p.min_separation

@@ -25,7 +25,7 @@ GONE = np.dtype(
 )  # fmt: skip
 
 
-class GoneList:
+class RemovedLandmarks:
     """Rows of GONE, the oldest first."""
 
     def __init__(self) -> None:

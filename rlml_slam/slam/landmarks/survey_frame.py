@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rlml_slam.graph.incremental.online_solver import Live
+from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.maps.survey import Survey
 from rlml_slam.matching.reflectors.association import gate
 from rlml_slam.matching.reflectors.pair_votes import MIN_MATCHES
@@ -22,11 +22,11 @@ from rlml_slam.types import ANONYMOUS
 GROWTH = 1.1  # the constellation is looked at again when it has grown by this, or by one
 
 
-class PlantFrame:
+class SurveyFrame:
     """Ties the reflectors of a graph to a survey; ``why`` says in words how far that has come."""
 
     def __init__(
-        self, params: Parameters, live: Live, reflectors: ReflectorGraph, survey: Survey
+        self, params: Parameters, live: OnlineSolver, reflectors: ReflectorGraph, survey: Survey
     ) -> None:
         self.survey = survey
         self.found = False
@@ -54,9 +54,9 @@ class PlantFrame:
         """Put the graph where the survey says, if it does."""
         placed = place(self._reflectors.reflectors(), self.survey, self._sigma)
         self.why = placed.why
-        if placed.T_plant_map is None:
+        if placed.T_survey_map is None:
             return False
-        self._graph.move(placed.T_plant_map)
+        self._graph.move(placed.T_survey_map)
         self._live.start_over()
         self._reflectors.forget_views()
         self.found = True

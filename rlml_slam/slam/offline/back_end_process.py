@@ -31,7 +31,7 @@ MAP, HOME = 'map', 'home'  # asked instead of frames
 Answer: TypeAlias = list[Update | None] | BackEnd | SavedMap
 
 
-class Apart:
+class BackEndProcess:
     """A back end that takes frames and is asked for what they did later."""
 
     def __init__(self, back_end: BackEnd, add: Callable[[BackEnd, Frame], Update | None]) -> None:

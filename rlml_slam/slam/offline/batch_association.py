@@ -3,7 +3,7 @@
 
 A detection is of one reflector, or of nothing (hypotheses.OUTLIER); a reflector is seen once in a
 look. How many there are is told by the likelihood of all answers, with two prices. One is for the
-place of each: a prior of ``reflector.density`` against how surely its detections tell it
+place of each: a prior of ``reflector.unmapped_density`` against how surely its detections tell it
 (Laplace), which is the penalty of the BIC with its constants. The other is for what two close ones
 leave open: which of them is seen in a look is an answer as well, and costs its entropy (integrated
 completed likelihood: Biernacki, Celeux, Govaert 2000). So one cloud of detections stays one
@@ -56,7 +56,7 @@ class Pairs(NamedTuple):
     gain: Array
 
 
-class SecondMatch:
+class BatchAssociation:
     """All detections of a run."""
 
     def __init__(self, seen: Sequence[Detections | None], params: Reflector) -> None:
@@ -68,7 +68,7 @@ class SecondMatch:
         self._ids = np.concatenate([d.ids for _, d in kept])
         self._ends = np.cumsum([0 if d is None else len(d) for d in seen])
         self._limit = gate(params.gate)
-        self._density = params.density
+        self._density = params.unmapped_density
         self._fewest = params.min_sightings
         self._separation = params.min_separation
 

@@ -31,7 +31,7 @@ from rlml_slam.estimation.smoother import Sight, Smoothed, Start, Step, smooth
 from rlml_slam.matching.reflectors.association import gate
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
-from rlml_slam.slam.offline.batch_association import Marks, SecondMatch
+from rlml_slam.slam.offline.batch_association import BatchAssociation, Marks
 from rlml_slam.types import ANONYMOUS, Frame, Observation, Reflectors
 
 TURNS = 20
@@ -41,7 +41,7 @@ STEPS = 3  # Gauss-Newton steps of a turn: the next one corrects what is left
 Indices = NDArray[np.int64]
 
 
-class Hindsight:
+class BatchReassociation:
     """Keeps what was measured, as long as it is reflectors and odometry alone."""
 
     def __init__(self, params: Parameters) -> None:
@@ -60,14 +60,14 @@ class Hindsight:
         """Keep an observation and what the front end made of it; with a scan, none is kept."""
         if not self._is_open:
             return
-        is_long = len(self._steps) >= self._p.back_end.path_frames
+        is_long = len(self._steps) >= self._p.back_end.max_trajectory_frames
         known = observation.motion.known or not self._frames
         if observation.points is not None or frame.jumped or not known or is_long:
             self.close()
             return
         m = self._p.motion
         dt = 1e-9 * (frame.stamp - self._frames[-1].stamp) if self._frames else 0.0
-        walk, kept = m.imu_bias_walk**2 * dt, math.exp(-dt / m.wheels_time)
+        walk, kept = m.imu_bias_walk**2 * dt, math.exp(-dt / m.scale_error_time)
         self._steps.append(Step(observation.motion, walk, kept))
         # as measured: what the front end grants the detections of a group is no noise in the end
         measured = dataclasses.replace(frame.observation, detections=observation.detections)
@@ -81,7 +81,9 @@ class Hindsight:
         """
         if not self._is_open or not len(reflectors) or len(poses) != len(self._steps):
             return []
-        match = SecondMatch([f.observation.detections for f in self._frames], self._p.reflector)
+        match = BatchAssociation(
+            [f.observation.detections for f in self._frames], self._p.reflector
+        )
         marks = Marks(reflectors.points, reflectors.ids)
         answers: Indices = np.zeros(0, dtype=np.int64)
         for turn in range(TURNS):
@@ -107,11 +109,16 @@ class Hindsight:
     def _start(self) -> Start:
         """Where the run began, which defines the map, and what is not known of gyro and wheels."""
         m = self._p.motion
-        sigma = np.array([0.0, 0.0, 0.0, m.imu_bias, *m.wheels])
+        sigma = np.array([0.0, 0.0, 0.0, m.imu_bias_sigma, *m.scale_error_sigma])
         return Start(np.append(self._p.node.map_start_pose, np.zeros(3)), np.diag(sigma**2))
 
     def _sights(
-        self, match: SecondMatch, answers: Indices, poses: Array, points: Array, granted: float
+        self,
+        match: BatchAssociation,
+        answers: Indices,
+        poses: Array,
+        points: Array,
+        granted: float,
     ) -> list[Step]:
         """The steps with what each one saw; by Cauchy's loss, what is far off counts less.
 

@@ -28,7 +28,7 @@ from rlml_slam.slam.relocalization.scan_relocalization import (
 from rlml_slam.types import Observation, Reflectors, Verdict
 
 
-def find_place(
+def localize_globally(
     grid: OccupancyGrid | None,
     reflectors: Reflectors,
     observation: Observation | None,
@@ -74,7 +74,7 @@ def _of_several(
     complete: bool,
 ) -> Relocation:
     """The verdict where the reflectors allow several places, or may fit by chance."""
-    by_chance = stars.chance > p.relocalization.risk
+    by_chance = stars.chance > p.relocalization.false_positive_probability
     scores = None if by_chance else _scores(grid, points, stars, p)
     if not complete and scores is not None and _is_twin(scores):
         why = f'{stars.why}; the scan may fit at more than one of these, as far as they are mapped'

@@ -27,7 +27,7 @@ AS_USUAL = 0.9
 NEAR = np.diag(1.0 / SPREAD**2)  # a weak prior at the place found: odometry is no evidence here
 
 
-def second_look(
+def recover_locally(
     submap: Submap,
     points: Array,
     guess: Array,

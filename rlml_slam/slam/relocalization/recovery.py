@@ -11,9 +11,9 @@ from collections.abc import Callable
 
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Parameters
-from rlml_slam.slam.relocalization.global_localization import find_place
+from rlml_slam.slam.relocalization.global_localization import localize_globally
 from rlml_slam.slam.relocalization.scan_relocalization import Relocation
-from rlml_slam.slam.relocalization.search_schedule import SearchPace
+from rlml_slam.slam.relocalization.search_schedule import SearchSchedule
 from rlml_slam.types import Frame, Level, Verdict
 
 
@@ -23,7 +23,7 @@ class Recovery:
     def __init__(self, params: Parameters) -> None:
         self._p = params
         self._map: SavedMap | None = None  # as it was when the robot was lost: nothing is added
-        self._pace: SearchPace | None = None
+        self._pace: SearchSchedule | None = None
         self.why = ''
 
     def look(
@@ -35,13 +35,13 @@ class Recovery:
             self._pace, self._map, self.why = None, None, ''
             return None
         if self._pace is None or frame.stamp < self._pace.since:
-            self._pace = SearchPace(frame.stamp)
+            self._pace = SearchSchedule(frame.stamp)
         waited = frame.stamp - self._pace.since >= self._p.health.lost_time * 1e9
         if not (lost or waited) or not self._pace.is_due(frame):
             return None
         if self._map is None:
             self._map = current()
         grid, reflectors = self._map.grid, self._map.reflectors
-        found = find_place(grid, reflectors, frame.observation, self._p, complete)
+        found = localize_globally(grid, reflectors, frame.observation, self._p, complete)
         self.why = found.why
         return found if found.verdict is Verdict.UNIQUE else None

@@ -172,4 +172,6 @@ def _covariance(submap: Submap, points: Array, pose: Array, p: Parameters) -> Ar
     information = scan_information.information(submap, points, pose, p.scan_match)
     # a direction that the scan leaves open still needs a regular covariance
     regular = information + np.diag([1e-2, 1e-2, 1e-2])
-    return np.asarray(np.linalg.inv(regular) + np.diag(p.loop_closure.floor2), dtype=np.float64)
+    return np.asarray(
+        np.linalg.inv(regular) + np.diag(p.loop_closure.variance_floor), dtype=np.float64
+    )

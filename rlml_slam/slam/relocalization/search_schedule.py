@@ -21,7 +21,7 @@ LONGEST = 30_000_000_000  # [ns] of stamps between two searches at most
 MOVED, TURNED = 1.0, 0.5  # [m], [rad] since the last search: from there, it may see what tells
 
 
-class SearchPace:
+class SearchSchedule:
     """Times of the searches from a stamp on, which is that of the first frame without a place."""
 
     def __init__(self, since: int) -> None:

@@ -92,9 +92,11 @@ def content_of(back_end: BackEnd, params: Parameters, grid: OccupancyGrid | None
         'program': __version__,
         'parameters': dataclasses.asdict(params),
     }
-    plant = back_end.plant
-    if plant is not None and plant.found:
-        arrays |= {f'survey_{name}': array for name, array in plant.survey._asdict().items()}
+    survey_frame = back_end.survey_frame
+    if survey_frame is not None and survey_frame.found:
+        arrays |= {
+            f'survey_{name}': array for name, array in survey_frame.survey._asdict().items()
+        }
     if grid is not None:
         arrays['grid'] = grid.cells
         description['grid'] = {'resolution': grid.resolution, 'origin': list(grid.origin)}

@@ -80,7 +80,9 @@ def merge_maps(first: Content, second: Content, params: Parameters) -> Merged:
     back_end.rejoin()
     accepted = 0
     if params.loop_closure.enabled:
-        accepted = _close(back_end, len(first.arrays['pose']), params.loop_closure.every)
+        accepted = _close(
+            back_end, len(first.arrays['pose']), params.loop_closure.keyframe_interval
+        )
     back_end.optimize(final=True)
     grid = back_end.occupancy_grid()
     made = map_file.content_of(back_end, params, grid)

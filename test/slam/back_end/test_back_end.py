@@ -20,7 +20,7 @@ from made_worlds import (
 )
 
 from rlml_slam import se2
-from rlml_slam.graph.incremental.online_solver import Live
+from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.factors import relative_information
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.matching.scans.submap import Submap
@@ -30,7 +30,7 @@ from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.back_end.scan_graph import ScanGraph
 from rlml_slam.slam.closures.closure_candidates import candidates
 from rlml_slam.slam.closures.closure_matching import Matcher
-from rlml_slam.slam.closures.keyframe_submap import KeySubmap
+from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap
 from rlml_slam.slam.keyframes import Interval, Keyframe, Sighting
 from rlml_slam.types import ANONYMOUS, EdgeKind, Frame, Motion, Observation, Status
 
@@ -142,7 +142,7 @@ def test_edge_has_the_covariance_of_the_relative_motion():
         P = J_a @ P @ J_a.T + J_b @ motion_cov(delta) @ J_b.T
         T = se2.compose(T, delta)
     np.testing.assert_allclose(back_end.graph.edges.measured[1], T, atol=1e-12)
-    expected = relative_information(T, P + np.diag(params.back_end.edge_floor2))
+    expected = relative_information(T, P + np.diag(params.back_end.edge_variance_floor))
     np.testing.assert_allclose(back_end.graph.edges.information[1], expected, rtol=1e-9)
 
 
@@ -443,7 +443,7 @@ def test_loop_is_closed_only_by_a_scan_that_holds_its_place(open_):
     across = np.arange(-1.0, 1.2, 0.04)
     end = np.column_stack([np.full(len(across), 4.0), across])
     walls = np.concatenate(sides if open_ else [*sides, end])
-    m = KeySubmap(keys[0], Submap())
+    m = KeyframeSubmap(keys[0], Submap())
     for _ in range(5):
         m.submap.insert(se2.transform(se2.inverse(m.T_anchor_grid), walls), np.zeros(2))
     m.submap.complete()
@@ -459,12 +459,12 @@ def test_loop_is_closed_only_by_a_scan_that_holds_its_place(open_):
 
 def test_edge_of_a_scan_that_leaves_a_direction_open_enters_the_graph():
     graph = Graph()
-    scans = ScanGraph(Parameters(), Live(graph))
+    scans = ScanGraph(Parameters(), OnlineSolver(graph))
     keys = [
         Keyframe(graph.add_pose(pose), FIRST, pose, EYE, None, None, FIRST)
         for pose in (np.zeros(3), np.array([1.0, 0.0, 0.2]))
     ]
-    submap = KeySubmap(keys[0], Submap())
+    submap = KeyframeSubmap(keys[0], Submap())
     rng = np.random.default_rng(0)
     for k in range(300):
         # a corridor in any direction: nothing is known along it, much across it

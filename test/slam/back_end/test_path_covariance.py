@@ -16,7 +16,7 @@ from rlml_slam.graph.batch.marginals import Marginals
 from rlml_slam.graph.batch.solver import optimize
 from rlml_slam.graph.model.factors import relative_information
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.slam.back_end.path_covariance import SurestWay, held, intersection
+from rlml_slam.slam.back_end.path_covariance import PathCovariance, held, intersection
 from rlml_slam.slam.closures.closure_records import ClosureRecords
 from rlml_slam.slam.closures.loop_closure import Closure
 from rlml_slam.slam.front_end.joint_state import JointState
@@ -68,7 +68,7 @@ def closure(graph, number, i, j, delta, cov):
 
 
 def test_way_driven_is_known_as_the_front_end_knows_it():
-    way = SurestWay()
+    way = PathCovariance()
     for key in chain(STEPS):
         assert_allclose(turned(way.cov(key), key.T_local[2]), key.cov_local, atol=1e-15)
 
@@ -82,7 +82,7 @@ def test_other_end_of_a_closure_is_known_as_a_graph_of_the_closure_alone_knows_i
         graph = Graph()
         graph.add_poses([i.T_local, j.T_local])
         graph.add_pose_prior(0, i.T_local, np.linalg.inv(i.cov_local))
-        way = SurestWay()
+        way = PathCovariance()
         way.close(ClosureRecords([closure(graph, 0, 0, 1, delta, cov)]), [i, j], graph.edges)
         expected = Marginals(graph).poses([1])[0]
         assert_allclose(turned(way.cov(j), j.T_local[2]), expected, rtol=1e-6, atol=1e-12)
@@ -90,7 +90,7 @@ def test_other_end_of_a_closure_is_known_as_a_graph_of_the_closure_alone_knows_i
 
 def test_nothing_gets_less_sure_by_a_closure_and_what_was_driven_before_it_gets_surer():
     keys = chain(STEPS)
-    graph, way, before = graph_of(keys), SurestWay(), SurestWay()
+    graph, way, before = graph_of(keys), PathCovariance(), PathCovariance()
     way.close(
         ClosureRecords([closure(graph, 0, 2, 28, [0.0, 0.0, np.pi], MATCH)]), keys, graph.edges
     )
@@ -103,7 +103,7 @@ def test_nothing_gets_less_sure_by_a_closure_and_what_was_driven_before_it_gets_
 
 def test_closures_that_are_none_leave_nothing_behind():
     keys = chain(STEPS)
-    graph, way = graph_of(keys), SurestWay()
+    graph, way = graph_of(keys), PathCovariance()
     closures = [closure(graph, n, 2 + n, 28 - n, [0.0, 0.0, np.pi], MATCH) for n in range(3)]
     way.close(ClosureRecords(closures), keys, graph.edges)
     surer = way.cov(keys[-1])
@@ -115,12 +115,12 @@ def test_closures_that_are_none_leave_nothing_behind():
         graph.edges.enabled[c.edge] = False
     way.forget()
     way.close(ClosureRecords(closures), keys, graph.edges)
-    assert_allclose(way.cov(keys[-1]), SurestWay().cov(keys[-1]), atol=1e-15)
+    assert_allclose(way.cov(keys[-1]), PathCovariance().cov(keys[-1]), atol=1e-15)
 
 
 def test_place_found_anew_counts_for_what_comes_after_it_alone():
     keys = chain(STEPS)
-    way, found = SurestWay(), 1e-4 * np.eye(3)
+    way, found = PathCovariance(), 1e-4 * np.eye(3)
     before = way.cov(keys[14])
     for key in keys[15:]:
         key.cov_local = found + key.cov_local - keys[15].cov_local
@@ -134,7 +134,7 @@ def test_place_found_anew_counts_for_what_comes_after_it_alone():
 def test_letting_go_of_keyframes_changes_nothing_for_those_that_stay():
     rng = np.random.default_rng(3)
     keys = chain(8 * STEPS)
-    graph, way = graph_of(keys), SurestWay()
+    graph, way = graph_of(keys), PathCovariance()
     way.begin(keys[40])
     pairs = [np.sort(rng.choice(len(keys), 2, replace=False)) for _ in range(150)]
     pairs.sort(key=lambda pair: pair[1])
@@ -149,7 +149,7 @@ def test_letting_go_of_keyframes_changes_nothing_for_those_that_stay():
     # two between each two that stay, and what began there
     assert len(way._stamps) <= 2 * len(kept) + 1
     way.forget()
-    again = SurestWay()
+    again = PathCovariance()
     again.begin(keys[40])
     for key in kept:
         np.testing.assert_array_equal(way.cov(key), again.cov(key))
@@ -203,7 +203,7 @@ def test_wheels_that_err_for_long_are_in_the_covariance_after_a_loop(honest):
             moved = share * step + np.sqrt(np.diag(NOISE)) * rng.standard_normal(3)
             poses[k + 1] = se2.compose(poses[k], moved)
         keys = chain(steps)
-        graph, way = graph_of(keys), SurestWay()
+        graph, way = graph_of(keys), PathCovariance()
         # a short loop, which tells next to nothing of the shares
         true = se2.between(poses[12], poses[15])
         seen = se2.compose(true, np.sqrt(np.diag(MATCH)) * rng.standard_normal(3))

@@ -82,7 +82,7 @@ def test_what_closures_leave_behind_does_not_grow_with_the_laps():
     """Neither edges that were replaced, nor records of closures that others stand for now."""
     path = drive(*ROUND * 8, start=START)
     observed = observations(SQUARE, path, reflectors=False, rng=np.random.default_rng(0))
-    closes = LoopClosure(max_distance=4.0, every=1)
+    closes = LoopClosure(max_distance=4.0, keyframe_interval=1)
     parameters = replace(
         params(), node=replace(Parameters().node, map_start_pose=START), loop_closure=closes
     )
@@ -125,7 +125,7 @@ def test_nothing_that_is_kept_grows_with_the_laps():
     sizes = []
     for k, back_end, _ in driven(observed, parameters):
         if (k + 1) % (len(observed) // laps) == 0:
-            graph, way = back_end.graph, back_end.surest_way
+            graph, way = back_end.graph, back_end.path_covariance
             sizes.append(
                 (len(back_end.keyframes), len(graph.edges), len(graph.sightings),
                  len(back_end.scans.closures), len(way._stamps), len(pickle.dumps(back_end)))
@@ -271,7 +271,7 @@ def test_estimate_is_that_of_the_batch_solver_all_along_a_drive(seed):
     parameters = replace(
         params(),
         node=replace(Parameters().node, map_start_pose=START),
-        loop_closure=LoopClosure(max_distance=4.0, every=1),
+        loop_closure=LoopClosure(max_distance=4.0, keyframe_interval=1),
     )
     front_end, back_end = FrontEnd(parameters), BackEnd(parameters)
     graph, live = back_end.graph, back_end.live

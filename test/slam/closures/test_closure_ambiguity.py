@@ -9,10 +9,10 @@ import pytest
 from rlml_slam import se2
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.matching.scans.submap import Submap
-from rlml_slam.slam.closures.closure_ambiguity import told_apart
+from rlml_slam.slam.closures.closure_ambiguity import is_distinct
 from rlml_slam.slam.closures.closure_candidates import Candidate
 from rlml_slam.slam.closures.closure_matching import SECOND, Match, Tried
-from rlml_slam.slam.closures.keyframe_submap import KeySubmap
+from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap
 from rlml_slam.slam.closures.loop_closure import Closure
 from rlml_slam.slam.keyframes import Keyframe
 from rlml_slam.types import EdgeKind
@@ -39,7 +39,7 @@ def tried_alike(rival, at, score=SCORE):
     for (i, j), sigma in SIGMAS.items():
         delta = se2.between(graph.poses[i], graph.poses[j])
         graph.add_edge(EdgeKind.ODOMETRY, i, j, delta, np.eye(3) / sigma**2)
-    maps = [KeySubmap(key, Submap(), 1, T_anchor_grid=np.zeros(3)) for key in keys[:KEY]]
+    maps = [KeyframeSubmap(key, Submap(), 1, T_anchor_grid=np.zeros(3)) for key in keys[:KEY]]
     maps[OLD].submap.insert(WALLS, np.zeros(2))
     maps[OLD].submap.complete()
     found = Match(maps[OLD], keys[KEY], WRONG, np.eye(3), SCORE, 1.0, np.nan, 36.0, sight=2.0)
@@ -48,7 +48,7 @@ def tried_alike(rival, at, score=SCORE):
     doubt = Closure(rival, KEY, np.zeros(3), score, -1, SECOND)
     place = se2.between(graph.poses[rival], np.array(at))
     others = Tried(Candidate(maps[rival], np.zeros(3), 12.0, 1.5), doubt, place[None])
-    out = told_apart(graph, keys[KEY], WALLS, [fits, others], SHARE)
+    out = is_distinct(graph, keys[KEY], WALLS, [fits, others], SHARE)
     assert out[1] is doubt
     return out[0]
 

@@ -11,7 +11,7 @@ from rlml_slam.graph.model.graph import Graph
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import LoopClosure
 from rlml_slam.slam.closures.closure_candidates import SIGMAS, candidates
-from rlml_slam.slam.closures.keyframe_submap import KeySubmap
+from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap
 from rlml_slam.slam.keyframes import Keyframe
 from rlml_slam.types import EdgeKind
 
@@ -33,7 +33,7 @@ def way(sigma, sigma_turn=1e-6, steps=40):
 
 
 def submaps(keys, *indices):
-    return [KeySubmap(keys[k], Submap(), 1, np.zeros(2)) for k in indices]
+    return [KeyframeSubmap(keys[k], Submap(), 1, np.zeros(2)) for k in indices]
 
 
 def test_sure_pose_is_searched_in_the_least_window_of_the_nearest():
@@ -61,7 +61,7 @@ def test_window_is_the_drift_since_the_submap():
 def test_window_has_an_end():
     graph, keys = way(1.0, 0.1)
     (c,) = candidates(graph, keys[39], submaps(keys, 30), LoopClosure(max_distance=9.5))
-    assert (c.window, c.angle) == (P.widest_window, P.widest_angle)
+    assert (c.window, c.angle) == (P.max_search_window, P.max_search_angle)
     assert c.searched > 16.0 * P.searched
 
 

@@ -8,11 +8,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 from rlml_slam import se2
-from rlml_slam.graph.incremental.online_solver import Live
+from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.graph.robust.inlier_evidence import uniform
-from rlml_slam.graph.robust.spanning_forest import Backbone
-from rlml_slam.slam.closures.closure_consistency import _Between, may_enter
+from rlml_slam.graph.robust.spanning_forest import SpanningForest
+from rlml_slam.slam.closures.closure_consistency import _Between, is_consistent
 from rlml_slam.types import EdgeKind
 
 SIGMA = np.array([0.02, 0.02, 0.005])
@@ -46,7 +46,7 @@ def tried(graph, ends, shift=(0.0, 0.0, 0.0), sight=0.0):
     off = se2.compose(np.asarray(shift, dtype=np.float64), true(nodes[:, 1]))
     deltas = se2.between(true(nodes[:, 0]), off)
     covs = np.broadcast_to(COV, (len(nodes), 3, 3))
-    return may_enter(Live(graph), nodes, deltas, covs, WRONG, sight=sight)
+    return is_consistent(OnlineSolver(graph), nodes, deltas, covs, WRONG, sight=sight)
 
 
 def sure(graph):
@@ -65,8 +65,8 @@ def sure(graph):
 
 def test_covariance_of_where_a_pose_is_adds_up_along_a_chain(graph):
     i, j = np.array([3, 90, 7, 0]), np.array([100, 20, 8, 159])
-    covs = _Between(Live(graph), np.unique([i, j])).covs(i, j)
-    chain = Backbone(graph, np.arange(len(graph.edges))).motion(i, j)[1]
+    covs = _Between(OnlineSolver(graph), np.unique([i, j])).covs(i, j)
+    chain = SpanningForest(graph, np.arange(len(graph.edges))).motion(i, j)[1]
     assert_allclose(covs, chain, rtol=1e-6, atol=1e-12)
 
 
@@ -122,7 +122,7 @@ def test_wrong_ones_that_disagree_help_no_one(graph):
     shift[:, :2] += 2.0 * np.sign(shift[:, :2])
     deltas = se2.between(true(nodes[:, 0]), se2.compose(shift, true(nodes[:, 1])))
     covs = np.broadcast_to(COV, (len(nodes), 3, 3))
-    assert not may_enter(Live(sure(graph)), nodes, deltas, covs, WRONG).any()
+    assert not is_consistent(OnlineSolver(sure(graph)), nodes, deltas, covs, WRONG).any()
 
 
 def test_nothing_depends_on_the_order_of_submaps_or_on_the_frame(graph):

@@ -14,13 +14,13 @@ from rlml_slam.cli import closures as command
 from rlml_slam.cli.main import main
 from rlml_slam.errors import InputError, MapError, SolverError
 from rlml_slam.graph.batch.solver import optimize
-from rlml_slam.graph.incremental.online_solver import Live
+from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.graph import Graph, Renumbering
 from rlml_slam.graph.model.robust_loss import Loss, Losses, LossKind
 from rlml_slam.params import Parameters
 from rlml_slam.slam.back_end.scan_graph import ScanGraph
 from rlml_slam.slam.closures import closure_records
-from rlml_slam.slam.closures.closure_monitor import ClosureWatch
+from rlml_slam.slam.closures.closure_monitor import ClosureMonitor
 from rlml_slam.slam.closures.closure_records import ClosureRecords
 from rlml_slam.slam.closures.closure_table import closure_table, told, weight
 from rlml_slam.slam.closures.loop_closure import NOTES, Closure, State
@@ -37,7 +37,7 @@ class Drive:
         self.graph = Graph(Losses(closure=Loss(LossKind.HUBER, 2.0)))
         self.closures = ClosureRecords()
         self.rng = np.random.default_rng(0)
-        self.watch = ClosureWatch(Parameters(), Live(self.graph))
+        self.watch = ClosureMonitor(Parameters(), OnlineSolver(self.graph))
 
     def true(self, k):
         phi = 2.0 * np.pi * np.asarray(k) / PER_LAP
@@ -78,7 +78,7 @@ def drive():
 def test_record_of_a_closure_stays_as_long_as_its_edge(monkeypatch):
     """Without it, nobody would know that the closure was revoked, and it would come back."""
     monkeypatch.setattr(closure_records, 'RECORDS', 4)
-    scans = ScanGraph(Parameters(), Live(Graph()))
+    scans = ScanGraph(Parameters(), OnlineSolver(Graph()))
     edges = [0, -1, -1, 1, -1, 2, -1, 3]
     scans.closures = ClosureRecords(
         Closure(k, k + 9, np.zeros(3), 0.7, e, '') for k, e in enumerate(edges)

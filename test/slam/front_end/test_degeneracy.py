@@ -8,7 +8,7 @@ from rlml_lab.studies.study_front_end import system
 from rlml_lab.support.drives import feed, simulate
 from rlml_slam.params import SimulatorParameters, from_mapping
 from rlml_slam.simulation.simulation import START
-from rlml_slam.slam.front_end.degeneracy import OpenDirection
+from rlml_slam.slam.front_end.degeneracy import Degeneracy
 from rlml_slam.types import Level
 
 STRONG = 1e6  # [1/m^2, 1/rad^2]
@@ -36,7 +36,7 @@ def noisy(rng, angle=0.4):
 
 
 def test_noise_of_many_normals_does_not_hold_a_pose_along_the_wall():
-    rng, steady = np.random.default_rng(0), OpenDirection()
+    rng, steady = np.random.default_rng(0), Degeneracy()
     raw = [held_across(noisy(rng)) for _ in range(2000)]
     sums = np.array(
         [np.sum(raw[1000:], 0), np.sum([steady.cleared(H, 0.0) for H in raw][1000:], 0)]
@@ -48,7 +48,7 @@ def test_noise_of_many_normals_does_not_hold_a_pose_along_the_wall():
 
 
 def test_a_direction_is_of_the_map_while_submaps_are_turned():
-    steady = OpenDirection()
+    steady = Degeneracy()
     for heading in (0.0, 0.53, -1.0):
         open_ = np.array([np.cos(0.4 - heading), np.sin(0.4 - heading), 0.0])
         cleared = steady.cleared(held_across(open_), heading)
@@ -56,7 +56,7 @@ def test_a_direction_is_of_the_map_while_submaps_are_turned():
 
 
 def test_another_wall_begins_anew():
-    steady = OpenDirection()
+    steady = Degeneracy()
     steady.cleared(held_across([1.0, 0.0, 0.0]), 0.0)
     H = held_across([np.cos(0.1), np.sin(0.1), 0.0])
     np.testing.assert_allclose(steady.cleared(H, 0.0), H, atol=1e-6 * STRONG)
@@ -64,7 +64,7 @@ def test_another_wall_begins_anew():
 
 def test_what_holds_all_directions_is_left_as_it_is():
     H = np.diag([1.0, 2.0, 3.0])
-    np.testing.assert_array_equal(OpenDirection().cleared(H, 0.3), H)
+    np.testing.assert_array_equal(Degeneracy().cleared(H, 0.3), H)
 
 
 def driven(world, p, seed, seconds):

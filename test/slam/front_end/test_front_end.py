@@ -312,7 +312,7 @@ def test_bare_corridor_is_degraded_with_the_reason_and_uncertain_along_it():
     assert (np.diff(var_x) > -1e-12).all()
     odometry_alone = 60 * motion_cov(np.array([0.1, 0.0, 0.0]))[0, 0]
     # and the share by which the wheels may err in speed, over all of the 6 m
-    odometry_alone += (6.0 * Parameters().motion.wheels[0]) ** 2
+    odometry_alone += (6.0 * Parameters().motion.scale_error_sigma[0]) ** 2
     assert 0.8 * odometry_alone < var_x[-1] < 1.3 * odometry_alone
     assert last.cov_local[1, 1] < 0.05 * var_x[-1] or last.cov_local[1, 1] < 0.03**2
 

@@ -8,10 +8,10 @@ import pytest
 from made_states import made
 from made_worlds import TinyWorld, drive, errors, observations, within
 
-from rlml_slam.estimation.landmark_tracks import Tracks
+from rlml_slam.estimation.landmark_tracks import LandmarkTracks
 from rlml_slam.params import Parameters, Reflector
 from rlml_slam.slam.front_end.front_end import FrontEnd
-from rlml_slam.slam.front_end.inactive_landmarks import FEW, Distant, LeftOut
+from rlml_slam.slam.front_end.inactive_landmarks import FEW, InactiveLandmarks, LeftOut
 from rlml_slam.slam.front_end.joint_state import LANDMARKS, JointState
 from rlml_slam.slam.front_end.map_window import MARGIN
 from rlml_slam.slam.front_end.reflector_update import use_reflectors
@@ -79,7 +79,7 @@ def test_state_that_leaves_them_out_does_not_grow_by_those_that_come_and_go():
 
 def aisle(length):
     """A state and tracks with a reflector every 2 m along x, all seen often."""
-    state, tracks = JointState(np.zeros(3), 1e-4 * np.eye(3), 0.01), Tracks()
+    state, tracks = JointState(np.zeros(3), 1e-4 * np.eye(3), 0.01), LandmarkTracks()
     points = np.stack([np.arange(0.0, length, 2.0), np.ones(int(length / 2))], -1)
     state.fix_landmarks(points, np.tile(1e-4 * np.eye(2), (len(points), 1, 1)))
     for k in range(len(points)):
@@ -90,7 +90,7 @@ def aisle(length):
 
 def test_only_what_is_in_reach_is_in_the_state():
     state, tracks, points = aisle(400.0)
-    distant = Distant(20.0, 3)
+    distant = InactiveLandmarks(20.0, 3)
     for x in np.arange(0.0, 400.0, 4.0):
         state.x[0] = x
         distant.follow(state, tracks, NOBODY)
@@ -108,17 +108,17 @@ def test_only_what_is_in_reach_is_in_the_state():
 def test_candidates_and_few_reflectors_stay():
     state, tracks, _ = aisle(400.0)
     tracks.sightings[150:] = 1
-    Distant(20.0, 3).follow(state, tracks, NOBODY)
+    InactiveLandmarks(20.0, 3).follow(state, tracks, NOBODY)
     assert set(range(150, 200)) <= set(tracks.keys.tolist())
     near = int((20.0 + MARGIN) / 2.0)
     state, tracks, _ = aisle(2.0 * (near + FEW))
-    Distant(20.0, 3).follow(state, tracks, NOBODY)
+    InactiveLandmarks(20.0, 3).follow(state, tracks, NOBODY)
     assert len(tracks) == near + FEW
 
 
 def test_reflector_that_tells_its_id_is_in_reach_wherever_it_was_believed():
     state, tracks, _ = aisle(400.0)
-    distant = Distant(20.0, 3)
+    distant = InactiveLandmarks(20.0, 3)
     distant.follow(state, tracks, np.array([ANONYMOUS]))
     assert 190 not in tracks.ids
     distant.follow(state, tracks, np.array([ANONYMOUS, 190]))
@@ -158,7 +158,7 @@ def test_drive_is_the_same_with_and_without_those_out_of_reach():
 def test_reflector_that_may_be_in_reach_stays():
     state, tracks, points = aisle(400.0)
     state.P[LANDMARKS + 2 * 60, LANDMARKS + 2 * 60] = 40.0**2
-    Distant(20.0, 3).follow(state, tracks, NOBODY)
+    InactiveLandmarks(20.0, 3).follow(state, tracks, NOBODY)
     assert points[60, 0] > 2.0 * (20.0 + MARGIN)
     assert 60 in tracks.keys
     assert 61 not in tracks.keys

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from made_worlds import TinyWorld, drive, errors, observations, within
 
-from rlml_slam.estimation.landmark_tracks import Tracks
+from rlml_slam.estimation.landmark_tracks import LandmarkTracks
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Node, Parameters, Reflector
 from rlml_slam.slam.front_end import map_window
@@ -30,7 +30,7 @@ def at(x):
 
 
 def test_state_has_what_is_in_reach_as_the_map_has_it():
-    state, tracks, window = at(0.0), Tracks(), MapWindow(MAP, REACH)
+    state, tracks, window = at(0.0), LandmarkTracks(), MapWindow(MAP, REACH)
     for x in np.arange(0.0, 290.0, 3.0):
         state.x[0] = x
         window.follow(state, tracks)
@@ -44,7 +44,7 @@ def test_state_has_what_is_in_reach_as_the_map_has_it():
 
 
 def test_what_stays_in_reach_keeps_what_is_known_of_it():
-    state, tracks, window = at(100.0), Tracks(), MapWindow(MAP, REACH)
+    state, tracks, window = at(100.0), LandmarkTracks(), MapWindow(MAP, REACH)
     window.follow(state, tracks)
     index = int(np.argmin(np.abs(AISLE[tracks.keys, 0] - 106.0)))
     key = tracks.keys[index]
@@ -58,7 +58,7 @@ def test_what_stays_in_reach_keeps_what_is_known_of_it():
 
 
 def test_nothing_changes_while_the_pose_stays_near(monkeypatch):
-    state, tracks, window = at(100.0), Tracks(), MapWindow(MAP, REACH)
+    state, tracks, window = at(100.0), LandmarkTracks(), MapWindow(MAP, REACH)
     window.follow(state, tracks)
     monkeypatch.setattr(map_window.np, 'setdiff1d', None)
     state.x[0] += 0.9 * MARGIN

@@ -19,8 +19,8 @@ def drive(rng, shares, steps, turning=0.6):
 
     It goes at 1 m/s and turns at ``turning`` [rad/s], to the left and to the right by turns.
     """
-    state = JointState(np.zeros(3), np.zeros((3, 3)), 0.0, wheels=NOISE.wheels)
-    pose, velocity, kept = np.zeros(3), np.zeros(3), np.exp(-DT / NOISE.wheels_time)
+    state = JointState(np.zeros(3), np.zeros((3, 3)), 0.0, wheels=NOISE.scale_error_sigma)
+    pose, velocity, kept = np.zeros(3), np.zeros(3), np.exp(-DT / NOISE.scale_error_time)
     shares = np.array(shares)
     for k in range(steps):
         v, w = 1.0, turning * (-1.0) ** (k // 100)
@@ -40,7 +40,7 @@ def drive(rng, shares, steps, turning=0.6):
         error[2] = se2.wrapped(error[2])
         state.apply(np.arange(3), np.eye(3), np.diag(SIGMA**2), error)
         velocity = se2.log(se2.between(before, state.pose)) / DT
-        innovation = np.sqrt(1.0 - kept**2) * np.array(NOISE.wheels)
+        innovation = np.sqrt(1.0 - kept**2) * np.array(NOISE.scale_error_sigma)
         shares = kept * shares + innovation * rng.standard_normal(2)
     return state.x[WHEELS], state.P[WHEELS, WHEELS], shares
 
@@ -50,7 +50,7 @@ def test_worn_wheels_are_found_out():
     drives = [drive(rng, (0.04, -0.05), 800) for _ in range(8)]
     error = np.mean([x - true for x, _, true in drives], axis=0)
     sigma = np.sqrt(np.mean([np.diag(P) for _, P, _ in drives], axis=0))
-    assert (sigma < 0.5 * np.array(NOISE.wheels)).all()
+    assert (sigma < 0.5 * np.array(NOISE.scale_error_sigma)).all()
     # a mean of eight: four sigmas of it
     assert (np.abs(error) < 4.0 * sigma / np.sqrt(8.0)).all()
 
@@ -60,7 +60,7 @@ def test_shares_are_as_sure_as_they_are_said_to_be():
     runs = 60
     nees = []
     for _ in range(runs):
-        x, P, true = drive(rng, rng.normal(0.0, NOISE.wheels), 300)
+        x, P, true = drive(rng, rng.normal(0.0, NOISE.scale_error_sigma), 300)
         e = x - true
         nees.append(e @ np.linalg.solve(P, e))
     # chi-square of 2 degrees of freedom: a mean of 2, the sigma of which is 2 / sqrt(runs)
@@ -71,7 +71,7 @@ def test_noise_of_the_wheels_is_not_taken_for_a_share():
     # with what the wheels tell as the derivative, the share of turn comes to -0.4 here
     x, P, _ = drive(np.random.default_rng(2), (0.0, 0.0), 2000, turning=0.0)
     assert abs(x[1]) < 0.01
-    assert P[1, 1] == pytest.approx(NOISE.wheels[1] ** 2, rel=0.02)
+    assert P[1, 1] == pytest.approx(NOISE.scale_error_sigma[1] ** 2, rel=0.02)
 
 
 def test_what_may_be_no_way_at_all_tells_nothing():

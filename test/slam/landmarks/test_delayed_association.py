@@ -45,7 +45,7 @@ def test_reflectors_seen_again_after_a_blind_stretch_are_told_in_the_end(seed):
     again = frames[BLIND.stop]
     assert (again.statuses == Status.DOUBTFUL).any()
     assert not (again.statuses == Status.USED).any()
-    assert not back_end.deferred.pending
+    assert not back_end.delayed_association.pending
     mapped = back_end.reflectors().points
     assert len(mapped) == len(ROOM.reflectors)
     gap = np.linalg.norm(mapped[:, None] - ROOM.reflectors[None], axis=-1)
@@ -73,7 +73,7 @@ def test_with_ids_nothing_is_ever_asked():
     observed = observations(ROOM, LOOP, scan=False, rng=np.random.default_rng(2), ids=True)
     frames, back_end = run(observed)
     assert not any((f.statuses == Status.DOUBTFUL).any() for f in frames)
-    assert back_end.deferred.pending == frozenset()
+    assert back_end.delayed_association.pending == frozenset()
 
 
 def test_reflectors_with_ids_among_anonymous_ones_keep_their_names():

@@ -10,13 +10,13 @@ from made_worlds import ROOM, SECOND, STEP, TinyWorld, drive, messages, polygon
 
 from rlml_slam.cli.main import main
 from rlml_slam.cli.map import map_reflectors
-from rlml_slam.graph.incremental.online_solver import Live
+from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.params import Parameters
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.keyframes import Interval, Sighting
 from rlml_slam.slam.landmarks.landmark import Landmark
-from rlml_slam.slam.landmarks.landmark_persistence import HIDDEN, WHILE, Presence
+from rlml_slam.slam.landmarks.landmark_persistence import HIDDEN, WHILE, LandmarkPersistence
 from rlml_slam.slam.landmarks.reflector_graph import ReflectorGraph
 from rlml_slam.slam.landmarks.reflector_states import reflector_states, state_table
 from rlml_slam.slam.store import map_file
@@ -178,7 +178,7 @@ def test_hall_without_reflectors_is_mapped():
 
 
 def test_nothing_is_given_up_where_that_is_not_wanted():
-    params = replace(PARAMS, reflector=replace(PARAMS.reflector, gone=0.0))
+    params = replace(PARAMS, reflector=replace(PARAMS.reflector, persistence_threshold=0.0))
     slam = Slam(params)
     laps(slam, ROOM, 3)
     laps(slam, replace(ROOM, reflectors=CHANGED), 8, start=3)
@@ -188,45 +188,51 @@ def test_nothing_is_given_up_where_that_is_not_wanted():
 
 def test_odds_follow_bayes():
     graph = Graph()
-    presence = Presence(PARAMS, graph, ReflectorGraph(PARAMS.reflector, Live(graph)))
+    persistence = LandmarkPersistence(
+        PARAMS, graph, ReflectorGraph(PARAMS.reflector, OnlineSolver(graph))
+    )
     m, pose = Landmark(0), np.zeros(3)
-    empty = PARAMS.reflector.density * math.pi * PARAMS.reflector.min_separation**2
+    empty = PARAMS.reflector.unmapped_density * math.pi * PARAMS.reflector.min_separation**2
     m.views[0, 0] = (2, 1)
-    assert not presence._weigh(m, False, pose, SECOND)
+    assert not persistence._weigh(m, False, pose, SECOND)
     first = (1 - 3 / 5) / (1 - empty)  # (1 + 2) of (2 + 3)
     assert m.life.odds == pytest.approx(math.log(HIDDEN + (1 - HIDDEN) * first), rel=1e-12)
     # from the same spot, the same miss tells nothing more
     before = m.life.odds
-    presence._weigh(m, False, np.array([0.2, 0.0, 0.0]), SECOND)
+    persistence._weigh(m, False, np.array([0.2, 0.0, 0.0]), SECOND)
     assert m.life.odds == before
     # a moment later they have a common cause now and then
-    presence._weigh(m, False, np.array([0.7, 0.0, 0.0]), 2 * SECOND)
+    persistence._weigh(m, False, np.array([0.7, 0.0, 0.0]), 2 * SECOND)
     both = first * 0.5 / (1 - empty)
     assert m.life.odds == pytest.approx(math.log(HIDDEN + (1 - HIDDEN) * both), rel=1e-12)
     # much later they have not
     before = m.life.odds
-    presence._weigh(m, False, np.array([1.7, 0.0, 0.0]), SECOND + WHILE)
+    persistence._weigh(m, False, np.array([1.7, 0.0, 0.0]), SECOND + WHILE)
     once = HIDDEN + (1 - HIDDEN) * 0.5 / (1 - empty)
     assert m.life.odds == pytest.approx(before + math.log(once), rel=1e-12)
     before = m.life.odds
-    presence._weigh(m, True, pose, SECOND + WHILE)
+    persistence._weigh(m, True, pose, SECOND + WHILE)
     assert m.life.odds == pytest.approx(before + math.log(3 / 6 / empty), rel=1e-12)
     for k in range(20):
-        presence._weigh(m, True, np.array([1.0 * k, 0.0, 0.0]), SECOND)
-    gone = PARAMS.reflector.gone
+        persistence._weigh(m, True, np.array([1.0 * k, 0.0, 0.0]), SECOND)
+    gone = PARAMS.reflector.persistence_threshold
     assert m.life.odds == pytest.approx(math.log((1 - gone) / gone), rel=1e-12)
 
 
 def test_no_single_while_ends_a_reflector():
     """However often it is missed meanwhile, from wherever it was always seen."""
     graph = Graph()
-    presence = Presence(PARAMS, graph, ReflectorGraph(PARAMS.reflector, Live(graph)))
+    persistence = LandmarkPersistence(
+        PARAMS, graph, ReflectorGraph(PARAMS.reflector, OnlineSolver(graph))
+    )
     m = Landmark(0)
     for k in range(100):
         m.views[2 * k, 0] = (1000, 0)
-    m.life.odds = math.log((1 - PARAMS.reflector.gone) / PARAMS.reflector.gone)
+    m.life.odds = math.log(
+        (1 - PARAMS.reflector.persistence_threshold) / PARAMS.reflector.persistence_threshold
+    )
     given_up = [
-        presence._weigh(m, False, np.array([1.0 * k, 0.0, 0.0]), SECOND + k * WHILE // 20)
+        persistence._weigh(m, False, np.array([1.0 * k, 0.0, 0.0]), SECOND + k * WHILE // 20)
         for k in range(100)
     ]
     assert not any(given_up[:80])
@@ -237,7 +243,7 @@ def test_candidates_do_not_pile_up():
     """What was seen once is let go of, and listed as a ghost."""
     graph = Graph()
     graph.add_pose([1.0, 0.0, 0.0])
-    reflectors = ReflectorGraph(PARAMS.reflector, Live(graph))
+    reflectors = ReflectorGraph(PARAMS.reflector, OnlineSolver(graph))
     interval, sighting = Interval(np.zeros(3)), Sighting()
     interval.first_look = interval.last_look = SECOND
     sighting.add(np.array([0.5, 0.5]), 1e-4 * np.eye(2))

@@ -5,7 +5,7 @@ import tracemalloc
 
 import numpy as np
 
-from rlml_slam.graph.incremental.online_solver import Live
+from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.params import Reflector
 from rlml_slam.slam.keyframes import Interval, Sighting
@@ -16,7 +16,7 @@ def test_pairs_of_thousands_are_merged_without_a_table_of_all():
     """Two that are one stand among five thousand; a table of all has 25 million rows."""
     x, y = np.meshgrid(np.arange(71) * 4.0, np.arange(71) * 4.0)
     posts = np.vstack([np.stack([x.ravel(), y.ravel()], -1), [[8.01, 12.0]]])
-    live = Live(Graph())
+    live = OnlineSolver(Graph())
     live.graph.add_pose(np.zeros(3), fixed=True)
     reflectors = ReflectorGraph(Reflector(min_sightings=1), live)
     for keys in np.array_split(np.arange(len(posts)), 72):  # each row was seen by itself

@@ -4,7 +4,7 @@
 import numpy as np
 
 from rlml_slam.slam.landmarks.landmark import Landmark
-from rlml_slam.slam.landmarks.removed_landmarks import MOST, GoneList
+from rlml_slam.slam.landmarks.removed_landmarks import MOST, RemovedLandmarks
 
 
 def landmark(key, mapped):
@@ -14,7 +14,7 @@ def landmark(key, mapped):
 
 
 def test_ghosts_make_room_before_what_was_in_the_map():
-    gone = GoneList()
+    gone = RemovedLandmarks()
     for key in range(3 * MOST):
         gone.add(landmark(key, key % 100 == 7), np.array([float(key), 0.0]))
     keys = gone.keys
@@ -26,7 +26,7 @@ def test_ghosts_make_room_before_what_was_in_the_map():
 
 
 def test_of_what_was_in_the_map_the_first_make_room():
-    gone = GoneList()
+    gone = RemovedLandmarks()
     for key in range(2 * MOST + 1):
         gone.add(landmark(key, True), np.zeros(2))
     assert gone.keys == list(range(MOST + 1, 2 * MOST + 1))

@@ -44,12 +44,12 @@ def run(survey, world=ROOM, slam=None, poses=CURVE, **options):
 
 
 @pytest.fixture(scope='module')
-def in_plant():
+def in_survey_frame():
     return run(surveyed(ROOM.reflectors))
 
 
-def test_map_gets_the_frame_of_the_survey(in_plant):
-    slam, frames = in_plant
+def test_map_gets_the_frame_of_the_survey(in_survey_frame):
+    slam, frames = in_survey_frame
     truth = se2.compose(T_PLANT, CURVE)
     distance, turn = errors(slam.trajectory()[1], truth)
     # 5 mm of survey and 2 cm of detection noise, averaged over the drive
@@ -59,8 +59,8 @@ def test_map_gets_the_frame_of_the_survey(in_plant):
     assert last[0] < 0.03
 
 
-def test_reflectors_get_the_ids_and_the_places_of_the_survey(in_plant):
-    found = in_plant[0].reflectors()
+def test_reflectors_get_the_ids_and_the_places_of_the_survey(in_survey_frame):
+    found = in_survey_frame[0].reflectors()
     survey = surveyed(ROOM.reflectors)
     np.testing.assert_array_equal(np.sort(found.ids), survey.ids)
     gap = found.points - survey.points[found.ids - 50]
@@ -69,8 +69,8 @@ def test_reflectors_get_the_ids_and_the_places_of_the_survey(in_plant):
     assert np.linalg.eigvalsh(found.cov).max() <= PARAMS.back_end.survey_sigma**2
 
 
-def test_gauge_is_the_survey_alone(in_plant):
-    graph = in_plant[0].back_end.graph
+def test_gauge_is_the_survey_alone(in_survey_frame):
+    graph = in_survey_frame[0].back_end.graph
     assert not graph.fixed_poses.any()
     assert graph.landmark_priors.enabled.sum() == len(ROOM.reflectors)
 
@@ -85,9 +85,9 @@ def test_no_frame_is_guessed(twins):
     }[twins]
     world = TinyWorld(ROOM.walls, square if twins == 'symmetric' else ROOM.reflectors)
     slam, frames = run(surveyed(points), world)
-    plant = slam.back_end.plant
-    assert not plant.found
-    assert plant.why
+    survey_frame = slam.back_end.survey_frame
+    assert not survey_frame.found
+    assert survey_frame.why
     assert slam.back_end.graph.fixed_poses.sum() == 1
     assert errors(frames[-1].T_map_base[None], CURVE[-1:])[0][0] < 0.05
 
@@ -96,14 +96,14 @@ def test_moved_reflector_does_not_bend_the_map():
     survey = surveyed(ROOM.reflectors)
     survey.points[2] += [0.6, 0.0]
     slam, _ = run(survey)
-    assert slam.back_end.plant.found
+    assert slam.back_end.survey_frame.found
     assert sorted(slam.back_end.reflector_graph.surveyed().values()) == [0, 1, 3, 4, 5]
     assert errors(slam.trajectory()[1], se2.compose(T_PLANT, CURVE))[0].max() < 0.03
 
 
-def test_prior_that_the_sightings_contradict_is_dropped(in_plant, tmp_path):
-    content = map_file.content_of(in_plant[0].back_end, PARAMS, None)
-    rows = in_plant[0].back_end.reflector_graph.surveyed()
+def test_prior_that_the_sightings_contradict_is_dropped(in_survey_frame, tmp_path):
+    content = map_file.content_of(in_survey_frame[0].back_end, PARAMS, None)
+    rows = in_survey_frame[0].back_end.reflector_graph.surveyed()
     key = next(k for k, row in rows.items() if row == 3)
     node = content.arrays['reflector_node'][content.arrays['reflector_key'] == key]
     wrong = content.arrays['landmark_prior_measured'].copy()
@@ -113,7 +113,7 @@ def test_prior_that_the_sightings_contradict_is_dropped(in_plant, tmp_path):
     map_file.restore(content._replace(arrays=arrays), again)
     again.optimize()
     assert sorted(again.reflector_graph.surveyed().values()) == [0, 1, 2, 4, 5]
-    moved = again.reflectors().points - in_plant[0].reflectors().points
+    moved = again.reflectors().points - in_survey_frame[0].reflectors().points
     assert np.hypot(*moved.T).max() < 0.01
 
 
@@ -125,20 +125,20 @@ def test_ids_tell_the_place_where_the_constellation_does_not():
     anonymous = Reflectors(
         np.arange(4), moved, cov, np.full(4, ANONYMOUS), np.full(4, 5), np.full(4, np.nan)
     )
-    assert place(anonymous, survey, 0.02).T_plant_map is None
+    assert place(anonymous, survey, 0.02).T_survey_map is None
     named = replace(anonymous, ids=np.arange(4))
-    np.testing.assert_allclose(place(named, survey, 0.02).T_plant_map, T_PLANT, atol=1e-9)
+    np.testing.assert_allclose(place(named, survey, 0.02).T_survey_map, T_PLANT, atol=1e-9)
     # ids that stand elsewhere than surveyed tell nothing
     swapped = replace(anonymous, ids=np.array([1, 0, 2, 3]))
-    assert place(swapped, survey, 0.02).T_plant_map is None
+    assert place(swapped, survey, 0.02).T_survey_map is None
 
 
-def test_saved_map_keeps_its_survey(in_plant, tmp_path):
-    back_end = in_plant[0].back_end
+def test_saved_map_keeps_its_survey(in_survey_frame, tmp_path):
+    back_end = in_survey_frame[0].back_end
     content = map_file.load(map_file.save(tmp_path / 'a.rlml', back_end, PARAMS))
     again = Slam(PARAMS)
     again.continue_map(content)
-    assert again.back_end.plant.found
+    assert again.back_end.survey_frame.found
     assert again.back_end.reflector_graph.surveyed() == back_end.reflector_graph.surveyed()
     slam, _ = run(None, slam=again, poses=CURVE[40:])
     assert errors(slam.trajectory()[1][-1:], se2.compose(T_PLANT, CURVE[-1:]))[0][0] < 0.05

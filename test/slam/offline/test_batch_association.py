@@ -6,7 +6,7 @@ import pytest
 from rlml.made_worlds import detections_of
 
 from rlml_slam.params import Reflector
-from rlml_slam.slam.offline.batch_association import Marks, SecondMatch
+from rlml_slam.slam.offline.batch_association import BatchAssociation, Marks
 from rlml_slam.types import ANONYMOUS
 
 GAP = 0.18  # [m]
@@ -36,7 +36,7 @@ def answered(match, poses, marks, granted):
 @pytest.mark.parametrize('aside', [-GAP, GAP])
 def test_pass_that_is_off_by_a_gap_of_a_row_sees_as_many_as_there_are(aside):
     """Each fits the neighbour of its own; one at the end fits none."""
-    match = SecondMatch(seen(ROW), Reflector())
+    match = BatchAssociation(seen(ROW), Reflector())
     off = np.zeros((LOOKS, 3))
     off[LAST:, 1] = aside
     count, answers = answered(match, off, marks_at(ROW), 0.0)
@@ -47,7 +47,7 @@ def test_pass_that_is_off_by_a_gap_of_a_row_sees_as_many_as_there_are(aside):
 
 
 def test_one_more_than_there_are_marks_is_a_new_one_however_much_is_granted():
-    match = SecondMatch(seen(ROW), Reflector())
+    match = BatchAssociation(seen(ROW), Reflector())
     count, answers = answered(match, np.zeros((LOOKS, 3)), marks_at(ROW[:2]), 0.25**2)
     assert count == len(ROW)
     assert (np.sort(answers, axis=1) == np.arange(len(ROW))).all()
@@ -57,7 +57,7 @@ def test_one_cloud_of_many_detections_is_one_reflector():
     """Each is near all others, which are too many to be listed pair by pair."""
     looks = 20_000
     far = np.array([[20.0, 0.0]])
-    match = SecondMatch(seen(ROW[:1], looks), Reflector())
+    match = BatchAssociation(seen(ROW[:1], looks), Reflector())
     marks, answers = match.answer(np.zeros((looks, 3)), marks_at(far), 0.0)
     assert len(marks.points) == 1
     assert (answers == 0).mean() > 0.99
@@ -65,16 +65,16 @@ def test_one_cloud_of_many_detections_is_one_reflector():
 
 
 def test_only_what_is_anonymous_is_open():
-    assert SecondMatch(seen(ROW), Reflector()).is_open
+    assert BatchAssociation(seen(ROW), Reflector()).is_open
     told = [detections_of(ROW, 0, [1, 2, 3])]
-    assert not SecondMatch(told, Reflector()).is_open
+    assert not BatchAssociation(told, Reflector()).is_open
 
 
 def test_a_ghost_that_nothing_repeats_is_no_reflector():
     rng = np.random.default_rng(3)
     ghosts = rng.uniform(-30.0, 30.0, (200, 1, 2))
     looks = [detections_of(np.vstack([ROW, g]), k, None, 0.02) for k, g in enumerate(ghosts)]
-    match = SecondMatch(looks, Reflector())
+    match = BatchAssociation(looks, Reflector())
     marks, answers = match.answer(np.zeros((len(looks), 3)), marks_at(ROW), 0.0)
     assert len(marks.points) == len(ROW)
     assert (answers.reshape(-1, 4)[:, 3] == -1).all()
@@ -88,7 +88,7 @@ def joined(groups, points, sigma=0.1, ids=None):
     for k, group in enumerate(map(list, groups)):
         seen = points[group] + sigma * rng.standard_normal((len(group), 2))
         looks.append(detections_of(seen, k, marks.ids[group], 0.02))
-    match = SecondMatch(looks, Reflector())
+    match = BatchAssociation(looks, Reflector())
     match.answer(np.zeros((len(looks), 3)), marks, 0.0)  # takes the detections to the map
     return match.joined(marks, np.concatenate(groups))
 
@@ -142,7 +142,7 @@ def test_ids_are_kept_and_not_mixed(ids, left):
 
 
 def test_without_any_nothing_is_joined():
-    match = SecondMatch([detections_of([[1.0, 1.0]], 0)], Reflector())
+    match = BatchAssociation([detections_of([[1.0, 1.0]], 0)], Reflector())
     none = Marks(np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
     marks, answers = match.joined(none, np.array([-1]))
     assert len(marks.points) == 0
@@ -154,7 +154,9 @@ def test_a_cloud_that_scatters_more_than_it_tells_is_not_spread_over_many():
     rng, num = np.random.default_rng(0), 400
     still = np.array([[2.0, 1.0], [5.0, 1.0], [5.0, 4.0], [2.0, 4.0]])
     at = still + np.array([0.12, 0.02, 0.02, 0.02])[:, None] * rng.standard_normal((num, 4, 2))
-    match = SecondMatch([detections_of(p, k, None, 0.02) for k, p in enumerate(at)], Reflector())
+    match = BatchAssociation(
+        [detections_of(p, k, None, 0.02) for k, p in enumerate(at)], Reflector()
+    )
     marks, answers = match.answer(np.zeros((num, 3)), marks_at(still), 0.0)
     before = len(marks.points) - 3
     marks, _ = match.joined(marks, answers)

@@ -103,7 +103,7 @@ def test_rows_are_told_apart_though_the_path_is_off_by_their_gaps(seed):
     slam = Slam(Parameters())
     slam.process(made)
     slam.back_end.finish()
-    frames = slam.hindsight.look_back(slam.back_end.trajectory()[1], slam.reflectors())
+    frames = slam.batch_reassociation.look_back(slam.back_end.trajectory()[1], slam.reflectors())
     told, of = np.concatenate([f.landmarks for f in frames]), np.concatenate(truth)
     pairs = np.unique(np.stack([of, told])[:, told >= 0], axis=1, return_counts=True)[1]
     assert np.sort(pairs)[-15:].sum() > 0.9 * len(of)  # one of the answers for each of the 15
@@ -130,7 +130,7 @@ def test_what_is_told_apart_is_as_sure_as_it_was_measured():
     ]
     assert max(granted) > 0.05**2
     slam.back_end.finish()
-    told = slam.hindsight.look_back(slam.back_end.trajectory()[1], slam.reflectors())
+    told = slam.batch_reassociation.look_back(slam.back_end.trajectory()[1], slam.reflectors())
     for frame, o in zip(told, made, strict=True):
         np.testing.assert_array_equal(frame.observation.detections.cov, o.detections.cov)
 
@@ -219,7 +219,9 @@ def test_a_run_that_no_reflector_explains_keeps_its_map():
     slam.process(made)
     slam.finish()
     assert len(slam.reflectors()) == 1
-    assert slam.hindsight.look_back(slam.back_end.trajectory()[1], slam.reflectors()) == []
+    assert (
+        slam.batch_reassociation.look_back(slam.back_end.trajectory()[1], slam.reflectors()) == []
+    )
 
 
 def test_ids_are_kept():
@@ -230,7 +232,9 @@ def test_ids_are_kept():
 
 def test_with_scans_there_is_nothing_to_look_back_on():
     slam = run(ROOM, 4)
-    assert slam.hindsight.look_back(slam.back_end.trajectory()[1], slam.reflectors()) == []
+    assert (
+        slam.batch_reassociation.look_back(slam.back_end.trajectory()[1], slam.reflectors()) == []
+    )
 
 
 def test_map_that_is_gone_on_with_stays_what_it_was():
@@ -245,4 +249,4 @@ def test_map_that_is_gone_on_with_stays_what_it_was():
     again.process([replace(o, stamp=o.stamp + 10**12) for o in made])
     again.finish()
     assert len(again.back_end.keyframes) >= keyframes
-    assert again.hindsight.look_back(np.zeros((60, 3)), again.reflectors()) == []
+    assert again.batch_reassociation.look_back(np.zeros((60, 3)), again.reflectors()) == []

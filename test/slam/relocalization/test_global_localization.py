@@ -12,7 +12,7 @@ from made_worlds import CORRIDOR, OTHER_ROOM, ROOM, TinyWorld, drive, observatio
 from rlml_slam import se2
 from rlml_slam.maps.occupancy import render
 from rlml_slam.params import Node, Parameters
-from rlml_slam.slam.relocalization.global_localization import find_place
+from rlml_slam.slam.relocalization.global_localization import localize_globally
 from rlml_slam.types import ANONYMOUS, Reflectors, Verdict
 
 P = Parameters()
@@ -52,7 +52,7 @@ def assert_here(found, truth=HERE):
 @pytest.mark.parametrize('walls', [ROOM.walls, HALL])
 def test_reflectors_tell_the_place_and_the_scan_fits_there(walls):
     world = TinyWorld(walls, SOME)
-    found = find_place(grid_of(world), map_of(SOME), seen(world), P)
+    found = localize_globally(grid_of(world), map_of(SOME), seen(world), P)
     assert found.verdict is Verdict.UNIQUE
     assert 'the scan fits' in found.why
     assert_here(found)
@@ -61,7 +61,7 @@ def test_reflectors_tell_the_place_and_the_scan_fits_there(walls):
 def test_reflectors_tell_the_place_without_scans():
     world = TinyWorld(HALL, SOME)
     for grid, observation in ((None, seen(world)), (grid_of(world), seen(world, scan=False))):
-        found = find_place(grid, map_of(SOME), observation, P)
+        found = localize_globally(grid, map_of(SOME), observation, P)
         assert found.verdict is Verdict.UNIQUE
         assert 'no scan to confirm it' in found.why
         assert_here(found)
@@ -73,7 +73,7 @@ def test_corridor_is_told_by_its_reflectors():
     world = replace(CORRIDOR, reflectors=np.stack([x, np.array([1.1, -1.1] * 3)], -1))
     path = drive((1.0, 0.0, 20.0))[::10]
     here = np.array([7.0, 0.2, 0.1])
-    found = find_place(grid_of(world, path), map_of(world.reflectors), seen(world, here), P)
+    found = localize_globally(grid_of(world, path), map_of(world.reflectors), seen(world, here), P)
     assert found.verdict is Verdict.UNIQUE
     assert_here(found, here)
 
@@ -84,7 +84,7 @@ def test_scan_tells_twins_apart():
         (-4.0, 3.0),
     )  # fmt: skip
     world = TinyWorld(recess, TURNED)
-    found = find_place(grid_of(world), map_of(TURNED), seen(world), P)
+    found = localize_globally(grid_of(world), map_of(TURNED), seen(world), P)
     assert found.verdict is Verdict.UNIQUE
     assert_here(found)
 
@@ -94,30 +94,32 @@ def test_reflectors_and_scan_each_in_doubt_tell_the_place_together():
     world = TinyWorld(HALL, SOME)
     twice = np.vstack([SOME, SOME + np.array([60.0, 0.0])])
     grid = grid_of(world)
-    found = find_place(grid, map_of(twice), seen(world), P)
+    found = localize_globally(grid, map_of(twice), seen(world), P)
     assert found.verdict is Verdict.UNIQUE
     assert 'of these, the scan fits one' in found.why
     assert_here(found)
-    assert find_place(None, map_of(twice), seen(world), P).verdict is Verdict.AMBIGUOUS
+    assert localize_globally(None, map_of(twice), seen(world), P).verdict is Verdict.AMBIGUOUS
 
 
 def test_unique_scan_is_not_believed_where_reflectors_stand_elsewhere():
     """The map has the reflectors twice, but neither where the scan says."""
     moved = np.vstack([SOME + np.array([60.0, 0.0]), SOME + np.array([0.0, 60.0])])
-    found = find_place(grid_of(ROOM), map_of(moved), seen(replace(ROOM, reflectors=SOME)), P)
+    found = localize_globally(
+        grid_of(ROOM), map_of(moved), seen(replace(ROOM, reflectors=SOME)), P
+    )
     assert found.verdict is Verdict.AMBIGUOUS
     assert 'the scan fits where the reflectors do not' in found.why
 
 
 def test_what_looks_the_same_turned_to_both_is_ambiguous():
     world = TinyWorld(HALL, TURNED)
-    found = find_place(grid_of(world), map_of(TURNED), seen(world), P)
+    found = localize_globally(grid_of(world), map_of(TURNED), seen(world), P)
     assert found.verdict is Verdict.AMBIGUOUS
     assert 'fit alike' in found.why
 
 
 def test_scan_that_does_not_fit_where_the_reflectors_do_makes_it_ambiguous():
-    found = find_place(grid_of(OTHER_ROOM), map_of(SOME), seen(TinyWorld(HALL, SOME)), P)
+    found = localize_globally(grid_of(OTHER_ROOM), map_of(SOME), seen(TinyWorld(HALL, SOME)), P)
     assert found.verdict is Verdict.AMBIGUOUS
     assert 'but there the scan has a score' in found.why
 
@@ -126,7 +128,7 @@ def test_scan_alone_tells_the_place_where_reflectors_cannot():
     grid = grid_of(ROOM)
     few = replace(ROOM, reflectors=ROOM.reflectors[:2])
     for observation in (seen(few), seen(ROOM, reflectors=False)):
-        found = find_place(grid, map_of(ROOM.reflectors), observation, P)
+        found = localize_globally(grid, map_of(ROOM.reflectors), observation, P)
         assert found.verdict is Verdict.UNIQUE
         assert_here(found)
 
@@ -134,17 +136,19 @@ def test_scan_alone_tells_the_place_where_reflectors_cannot():
 def test_scan_tells_the_place_where_reflectors_are_too_many_to_be_searched():
     x, y = np.meshgrid(np.arange(68), np.arange(68))
     far = np.stack([x.ravel(), y.ravel()], -1)
-    plant = map_of(np.vstack([ROOM.reflectors, 20.0 + 0.1 * far]))
-    found = find_place(grid_of(ROOM), plant, seen(ROOM), P)
+    survey_frame = map_of(np.vstack([ROOM.reflectors, 20.0 + 0.1 * far]))
+    found = localize_globally(grid_of(ROOM), survey_frame, seen(ROOM), P)
     assert found.verdict is Verdict.UNIQUE
     assert_here(found)
     # a place that nothing was searched for is not impossible
-    found = find_place(None, plant, seen(ROOM), P)
+    found = localize_globally(None, survey_frame, seen(ROOM), P)
     assert found.verdict is Verdict.NOT_SEARCHED
     assert found.pose is None
     assert 'too many to be searched' in found.why
     # as many that do not stand that close are searched
-    found = find_place(None, map_of(np.vstack([ROOM.reflectors, 20.0 + 4.0 * far])), seen(ROOM), P)
+    found = localize_globally(
+        None, map_of(np.vstack([ROOM.reflectors, 20.0 + 4.0 * far])), seen(ROOM), P
+    )
     assert found.verdict is Verdict.UNIQUE
     assert_here(found)
 
@@ -152,9 +156,12 @@ def test_scan_tells_the_place_where_reflectors_are_too_many_to_be_searched():
 def test_reflectors_that_are_switched_off_do_not_count():
     world = TinyWorld(HALL, SOME)
     off = replace(P, node=replace(Node(), use_reflectors=False))
-    assert find_place(grid_of(world), map_of(SOME), seen(world), off).verdict is Verdict.AMBIGUOUS
+    assert (
+        localize_globally(grid_of(world), map_of(SOME), seen(world), off).verdict
+        is Verdict.AMBIGUOUS
+    )
 
 
 def test_without_a_frame_there_is_no_place():
-    found = find_place(None, map_of(SOME), None, P)
+    found = localize_globally(None, map_of(SOME), None, P)
     assert found.verdict is Verdict.IMPOSSIBLE

@@ -12,7 +12,7 @@ from made_worlds import CORRIDOR, ROOM, TinyWorld, drive, errors, observations, 
 from rlml_slam import se2
 from rlml_slam.params import Parameters
 from rlml_slam.slam.front_end.front_end import FrontEnd
-from rlml_slam.slam.relocalization.local_recovery import AS_USUAL, second_look
+from rlml_slam.slam.relocalization.local_recovery import AS_USUAL, recover_locally
 from rlml_slam.types import Level, Motion
 
 PATH = drive((0.6, 0.0, 2.0), (0.5, 0.7, 2.0))
@@ -32,7 +32,7 @@ def mapped(world):
 def test_scan_is_found_where_it_was_taken(slip):
     front_end, place, points = mapped(ROOM)
     submap, usual = front_end.submaps.target, front_end.doubt.usual
-    found = second_look(submap, points, place + slip, usual, Parameters())
+    found = recover_locally(submap, points, place + slip, usual, Parameters())
     assert found is not None
     assert found.score >= AS_USUAL * usual
     assert found.prior_weight == 0.0
@@ -45,14 +45,14 @@ def test_nothing_is_found_beyond_its_reach_in_the_same_room():
     front_end, place, points = mapped(ROOM)
     submap, usual = front_end.submaps.target, front_end.doubt.usual
     for far in ([2.2, 0.0, 0.0], [0.0, 0.0, 2.5], [-1.5, -1.5, 1.5]):
-        assert second_look(submap, points, place + far, usual, Parameters()) is None
+        assert recover_locally(submap, points, place + far, usual, Parameters()) is None
 
 
 def test_place_along_a_corridor_is_not_guessed():
     front_end, place, points = mapped(CORRIDOR)
     submap, usual = front_end.submaps.target, front_end.doubt.usual
     turned = place + np.array([0.0, 0.0, 0.8])
-    assert second_look(submap, points, turned, usual, Parameters()) is None
+    assert recover_locally(submap, points, turned, usual, Parameters()) is None
 
 
 @pytest.mark.parametrize('slip', [(0.6, 0.0, 0.7), (0.0, 0.0, -0.85)], ids=['both', 'turn'])

@@ -24,11 +24,11 @@ def searched(monkeypatch, lasts, pose, period=SECOND // 10):
     """Seconds since it was lost at which a robot is looked for."""
     now, at = [0], []
 
-    def find_place(*_):
+    def localize_globally(*_):
         at.append(now[0] / SECOND)
         return Relocation(Verdict.IMPOSSIBLE, 'no place fits')
 
-    monkeypatch.setattr(recovery, 'find_place', find_place)
+    monkeypatch.setattr(recovery, 'find_place', localize_globally)
     looks, health = Recovery(Parameters()), Health(Level.LOST, ())
     saved = SavedMap(no_reflectors())
     for stamp in range(0, lasts * SECOND, period):

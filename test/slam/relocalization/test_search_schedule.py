@@ -14,7 +14,7 @@ from rlml_slam.slam.relocalization.search_schedule import (
     PERIOD,
     RARER,
     TURNED,
-    SearchPace,
+    SearchSchedule,
 )
 
 SECOND = 1_000_000_000
@@ -22,7 +22,7 @@ SECOND = 1_000_000_000
 
 def searched(lasts, pose=lambda _: np.zeros(3), period=SECOND // 10):
     """Seconds since the first frame without a place at which there is a search."""
-    pace, at = SearchPace(SECOND), []
+    pace, at = SearchSchedule(SECOND), []
     for stamp in range(0, lasts * SECOND, period):
         if pace.is_due(SimpleNamespace(stamp=SECOND + stamp, T_map_base=pose(stamp / SECOND))):
             at.append(stamp / SECOND)
@@ -60,7 +60,7 @@ def test_once_it_moves_on_it_is_looked_for_where_it_comes(step):
 
 
 def test_stamps_that_jump_back_do_not_end_the_search():
-    pace = SearchPace(50 * SECOND)
+    pace = SearchSchedule(50 * SECOND)
     frame = SimpleNamespace(stamp=100 * SECOND, T_map_base=np.zeros(3))
     assert pace.is_due(frame)
     assert not pace.is_due(frame)

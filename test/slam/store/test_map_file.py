@@ -94,10 +94,10 @@ def test_a_jump_is_one_in_the_saved_map_as_well(saved):
     same = map_file.content_of(again, PARAMS, again.occupancy_grid())
     np.testing.assert_array_equal(same.arrays['key_jumped'], jumped)
     keys = again.keyframes
-    before, after = (again.surest_way.cov(keys[k]) for k in (5, 6))
-    assert_allclose(before, without.surest_way.cov(keys[5]), atol=1e-15)
+    before, after = (again.path_covariance.cov(keys[k]) for k in (5, 6))
+    assert_allclose(before, without.path_covariance.cov(keys[5]), atol=1e-15)
     assert_allclose(after, turned(keys[6].cov_local, -keys[6].T_local[2]), atol=1e-12)
-    assert again.surest_way.newest == keys[6].stamp
+    assert again.path_covariance.newest == keys[6].stamp
 
 
 def test_saved_map_keeps_its_sightings_whatever_comes_after(saved):
