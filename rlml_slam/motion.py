@@ -178,8 +178,8 @@ def _drive(
         sigma_v, sigma_w = n.max_speed / 5.0, n.max_turn_rate / 5.0
         if known:
             speed, turn = v[at], w[at]
-            # when inside a long interval the motion happened is a long_interval_noise
-            long_interval_noise = n.guess if gap > 2.0 * n.interval else 0.0
+            # when inside a long interval the motion happened is uncertain
+            long_interval_noise = n.long_interval_noise if gap > 2.0 * n.interval else 0.0
             sigma_v = (n.a + long_interval_noise) * abs(speed) + n.b
             sigma_w = (n.c + long_interval_noise) * abs(turn) + n.d
         # the wheels do not turn: so does the robot not, and the IMU shows its bias

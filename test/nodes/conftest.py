@@ -14,11 +14,11 @@ if importlib.util.find_spec('rclpy') is None:
 @pytest.fixture
 def live(monkeypatch, tmp_path):
     """A ROS context that hears nothing but the test, in a folder of its own for its maps."""
-    from live import OnlineSolver
+    from live import LiveNodes
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    context = OnlineSolver()
+    context = LiveNodes()
     yield context
     context.close()
 

@@ -34,7 +34,7 @@ def overrides(**values):
     return [Parameter(name.replace('__', '.'), value=value) for name, value in values.items()]
 
 
-class OnlineSolver:
+class LiveNodes:
     """A ROS context of its own with nodes, one of which listens."""
 
     def __init__(self):
