@@ -157,8 +157,9 @@ def information(
 
     Coordinates are those of the pose in the submap frame. ``params.sigma_point`` is the error of
     one end point across its surface, neighbours' correlation included; ``params.variance_floor``
-    (3,) the variances of what more points do not average out. A direction that the scan leaves open,
-    for it has less than OPEN of the information of the strongest one, has information zero.
+    (3,) the variances of what more points do not average out. A direction that the scan leaves
+    open, for it has less than OPEN of the information of the strongest one, has information
+    zero.
 
     Along a corridor, odometry is better than what the beams on a door frame or two say. A robot
     that is ``alone`` with its scans has nothing better. Then they are believed, and so are the few
