@@ -3,6 +3,7 @@
 PYTHON ?= python3
 PYTEST_ARGS ?= -n 2
 VENV := .venv
+DOCS := .venv-docs
 BIN := $(VENV)/bin
 SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
@@ -20,7 +21,7 @@ MADE := $(VENV)/.made-for-$(ROS)
 # the wheels mark a process that has set itself up; another environment's Python must not see it
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help env demo test lint types ci tf config clean
+.PHONY: help env demo test lint types docs ci tf config clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile | expand -t 16
@@ -28,7 +29,7 @@ help:  ## this list
 env: $(MADE)  ## make .venv, in which .venv/bin/rlml is the command
 	@echo "== $(VENV) is ready"
 
-$(MADE): setup.py $(wildcard requirements/*.txt) requirements/install
+$(MADE): setup.py $(wildcard requirements/python*.txt) requirements/ros.txt requirements/install
 	@PYTHON='$(PYTHON)' requirements/install $(VENV) $(ROS)
 	@touch $@
 
@@ -44,7 +45,17 @@ lint: env  ## ruff: rules and format
 types: env  ## mypy, strict
 	@$(BIN)/mypy
 
-config: env  ## write config/*.yaml anew from the declared parameters
+docs: $(DOCS)/.made  ## build the documentation: site/index.html
+	@NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/mkdocs build --quiet --strict && echo "site/index.html"
+
+$(DOCS)/.made: $(wildcard requirements/docs-*.txt)
+	@echo "== making $(DOCS) for the documentation"
+	@lock=$$($(PYTHON) -c 'import sys; print("requirements/docs-python%d.%d.txt" % sys.version_info[:2])') && \
+	  $(PYTHON) -m venv --clear $(DOCS) && \
+	  $(DOCS)/bin/python -m pip --disable-pip-version-check --quiet install -r $$lock
+	@touch $@
+
+config: env  ## write config/*.yaml from the declared parameters
 	@for name in default simulator deformable_slam carrier_simulator ekf_slam \
 	  reflector_detector; do \
 	  $(BIN)/python -m rlml_slam.cli.config_file $$name.yaml >config/.new && \
@@ -57,4 +68,4 @@ ci:  ## all that is checked before a change is taken
 	@.ci/run
 
 clean:  ## remove what make made
-	rm -rf $(VENV) build install log out
+	rm -rf $(VENV) $(DOCS) build install log out site

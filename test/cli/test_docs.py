@@ -20,7 +20,7 @@ NODES = (
     'reflector_detector',
 )  # fmt: skip
 ROOT = Path(__file__).resolve().parents[2]
-TABLED = (ROOT / 'docs' / 'nodes.md', ROOT / 'docs' / 'parameters.md')
+TABLED = (ROOT / 'docs' / 'topics.md', ROOT / 'docs' / 'parameters.md')
 # what every node of rclpy has
 OF_EVERY_NODE = {'/rosout', '/parameter_events'}
 
@@ -45,7 +45,7 @@ def test_every_command_has_its_row():
 
 
 def test_messages_that_the_docs_explain_are_those_of_the_code():
-    page = (ROOT / 'docs' / 'nodes.md').read_text(encoding='utf-8')
+    page = (ROOT / 'docs' / 'topics.md').read_text(encoding='utf-8')
     rows = page.split('| what you see |')[1].split('\n\n')[0].splitlines()[2:]
     code = '\n'.join(p.read_text(encoding='utf-8') for p in (ROOT / 'rlml_slam').rglob('*.py'))
     messages = [m[1] for row in rows if (m := re.match(r'\| `([^`]*)` +\|', row))]
@@ -87,9 +87,9 @@ def test_tables_are_put_between_the_marks(tmp_path, capsys):
 @pytest.mark.parametrize('times', [0, 2])
 def test_marks_that_are_not_there_once_are_named(times):
     marks = '<!-- begin topics --><!-- end topics -->'
-    texts = {Path('nodes.md'): marks, Path('other.md'): marks} if times else {Path('nodes.md'): ''}
+    texts = {Path('topics.md'): marks, Path('other.md'): marks} if times else {Path('topics.md'): ''}
     with pytest.raises(
-        FileFormatError, match=r'nodes.md.*: <!-- begin topics --> … .* not there exactly once'
+        FileFormatError, match=r'topics.md.*: <!-- begin topics --> … .* not there exactly once'
     ):
         filled(texts)
 

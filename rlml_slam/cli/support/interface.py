@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the nodes offer, as data: docs/nodes.md is made of it, and tests hold it to the code."""
+"""What the nodes offer, as data: docs/topics.md is made of it, and tests hold it to the code."""
 
 from __future__ import annotations
 
