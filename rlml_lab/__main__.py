@@ -3,6 +3,6 @@
 
 import sys
 
-from rlml_lab.main import run
+from rlml_lab.main import main
 
-sys.exit(run())
+sys.exit(main())

@@ -7,8 +7,10 @@ They are not part of what a robot installs; ``make env`` puts the command into `
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 
-from rlml_slam.cli.main import Command, Group, Table, main
+from rlml_slam.cli import main as command_line
+from rlml_slam.cli.main import Command, Group, Table
 
 COMMANDS: Table = {
     'study': Group(
@@ -87,12 +89,12 @@ COMMANDS: Table = {
 }
 
 
-def run() -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     """Run one command line of ``rlml-lab``; the exit code."""
-    return main(
-        None, COMMANDS, 'rlml-lab', 'Studies and benchmarks of rlml_slam, for its developers.'
+    return command_line.main(
+        argv, COMMANDS, 'rlml-lab', 'Studies and benchmarks of rlml_slam, for its developers.'
     )
 
 
 if __name__ == '__main__':
-    sys.exit(run())
+    sys.exit(main())

@@ -22,8 +22,8 @@ def package(tmp_path):
     (folder / 'kernels.py').write_text(
         'from pathlib import Path\n'
         'from rlml_slam.compiled import kernel\n'
-        'from rlml_slam.kernel_cache import forget_stale\n'
-        'forget_stale(Path(__file__).parent)\n'
+        'from rlml_slam.kernel_cache import remove_stale\n'
+        'remove_stale(Path(__file__).parent)\n'
         'from some.constants import N\n'
         '@kernel\n'
         'def answer(x):\n'

@@ -66,7 +66,7 @@ SHARED = """
 /**:
   ros__parameters: {use_sim_time: true, odom_topic: wheels, detector.threshold: fixed}
 /robot1/front_end:
-  ros__parameters: {submap: {size: 80}}
+  ros__parameters: {submap: {insertions: 80}}
 back_end: {ros__parameters: {map_file_name: hall, qos_overrides: {/clock: {depth: 1}}}}
 simulator:
   ros__parameters: {laser_frame: eye}
@@ -164,7 +164,7 @@ from rlml_slam import warm_up
 from rlml_slam.params import Parameters
 from rlml_slam.slam.system import Slam
 from rlml_slam.ros.bags.bag import BagReader, choose_topics
-from rlml_slam.ros.sensor_input import Feed
+from rlml_slam.ros.sensor_input import SensorInput
 
 def compiled():
     return {
@@ -178,7 +178,7 @@ warm_up.compile_loaded()
 before = compiled()
 params = Parameters()
 slam = Slam(params)
-feed = Feed(params, slam, slam.sequencer.inputs)
+feed = SensorInput(params, slam, slam.synchronizer.inputs)
 with BagReader(sys.argv[1]) as bag:
     stream_of = {topic: s for s, topic in choose_topics(bag.topics, params.node).items()}
     for time, topic, message in bag.messages(stream_of):

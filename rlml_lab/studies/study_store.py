@@ -34,13 +34,13 @@ WHOLE, OLDER, LOST, WRONG, CRASHED = 'whole', 'older', 'lost', 'wrong', 'crashed
 BAD = [f'{p}{what}' for p in ('', 'previous ') for what in (LOST, WRONG, CRASHED)]
 WRITER = textwrap.dedent("""
     import sys
-    from rlml_slam.maps import container
+    from rlml_slam.maps import map_container
     from rlml_lab.studies.study_store import version
     which = int(sys.argv[2])
     while True:
         which += 1
         print(which, flush=True)
-        container.write(sys.argv[1], version(which))
+        map_container.write(sys.argv[1], version(which))
 """)
 
 

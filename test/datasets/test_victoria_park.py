@@ -11,7 +11,7 @@ import pytest
 import scipy.io
 from numpy.testing import assert_allclose, assert_array_equal
 
-from rlml_slam.cli.main import main
+from rlml_lab.main import main
 from rlml_slam.datasets.victoria_park import HALF_TRACK, WHEEL_BASE, read_victoria_park
 from rlml_slam.errors import FileFormatError
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rlml.made_worlds import ROOM, drive, observations
+from made_worlds import ROOM, drive, observations
 
 from rlml_slam import se2
 from rlml_slam.ekf.estimator import Estimator
@@ -67,7 +67,8 @@ def test_reflectors_are_told_so_by_default():
 
 
 @pytest.mark.parametrize(
-    ('extractor', 'deferred'), [('reflectors', True), ('spikes', False), ('lines', False)]
+    ('extractor', 'delayed_association'),
+    [('reflectors', True), ('spikes', False), ('lines', False)],
 )
 def test_answers_are_deferred_for_reflectors_alone(extractor, delayed_association):
     params = from_mapping({'ekf.extractor': extractor}, EkfParameters)

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 from differences import central_differences
-from rlml.made_worlds import ROOM, drive, observations
+from made_worlds import ROOM, drive, observations
 from scipy.stats import chi2
 
 from rlml_slam import se2

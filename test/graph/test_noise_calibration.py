@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
-from test_graph_selection import laps, optimum
+from test_closure_selection import laps, optimum
 
 from rlml_slam.graph.batch.marginals import Marginals
 from rlml_slam.graph.model.factor_table import FactorKind

@@ -8,7 +8,7 @@ import json
 
 import numpy as np
 
-from rlml_slam.cli import main
+from rlml_lab import main
 
 GRAPH = """VERTEX_SE2 0 0 0 0
 VERTEX_SE2 1 1.1 0 0

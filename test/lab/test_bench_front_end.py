@@ -10,7 +10,7 @@ import json
 import pytest
 
 from rlml_lab.bench import bench_front_end
-from rlml_slam.cli.main import main
+from rlml_lab.main import main
 
 FEW = ['bench', 'front-end', '--scans', '70', '--beams', '180']
 

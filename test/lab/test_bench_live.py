@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip('rclpy', reason='needs ROS 2 or its wheels')
 
 from rlml_lab.bench.bench_live import text
-from rlml_slam.cli.main import main
+from rlml_lab.main import main
 
 
 def test_every_scan_that_is_sent_gets_its_pose(capsys):

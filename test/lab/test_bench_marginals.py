@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from rlml_lab.bench.bench_marginals import compare, without_residuals
 from rlml_lab.bench.generated_graphs import city, warehouse
-from rlml_slam.cli.main import main
+from rlml_lab.main import main
 from rlml_slam.graph.g2o import write_graph
 
 

@@ -11,8 +11,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from rlml_lab.bench.generated_graphs import city
 from rlml_lab.bench.wrong_closures import add_clustered, add_random
+from rlml_lab.main import main
 from rlml_slam import se2
-from rlml_slam.cli.main import main
+from rlml_slam.cli.main import main as rlml
 from rlml_slam.graph.g2o import read_graph, write_graph
 from rlml_slam.graph.model.factor_table import FactorKind
 
@@ -151,7 +152,7 @@ def test_optimize_tells_which_closures_it_disabled(graph_file, tmp_path, capsys,
     told = [graph_file, tmp_path / 'wrong.g2o']
     figures = []
     for path in told:
-        assert main(['optimize', str(path), '--robust', robust, '--json']) == 0
+        assert rlml(['optimize', str(path), '--robust', robust, '--json']) == 0
         figures.append(json.loads(capsys.readouterr().out))
     assert figures[1]['refused'][-2:] == [before, before + 1]
     if robust == 'select':

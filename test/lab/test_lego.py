@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from rlml_lab.main import main
 from rlml_lab.studies.lego_scale import Ranges, fit_scale
 from rlml_lab.studies.lego_time import camera_lag, scan_lag
 from rlml_lab.studies.study_lego import camera_view
 from rlml_slam import se2
-from rlml_slam.cli.main import main
 from rlml_slam.datasets.lego import (
     BEAM,
     BEAM_TIME,

@@ -8,9 +8,9 @@ import json
 import numpy as np
 import pytest
 
+from rlml_lab.main import main
 from rlml_lab.studies import study_front_end as study
 from rlml_lab.support.drives import simulate
-from rlml_slam.cli.main import main
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.evaluation.run_record import Truth
 from rlml_slam.simulation.robot import SECOND

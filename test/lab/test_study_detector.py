@@ -7,8 +7,8 @@ import json
 
 import numpy as np
 
+from rlml_lab.main import main
 from rlml_lab.studies.study_detector import DIAMETERS, DISTANCES, matched
-from rlml_slam.cli.main import main
 
 
 def test_the_study_prints_every_figure(capsys):

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 from rlml_lab.ekf import study_ekf_consistency as consistency
 from rlml_lab.ekf.association_truth import AssociationLog, association_figures
 from rlml_lab.ekf.study_ekf_report import verdicts
-from rlml_slam.cli.main import main
+from rlml_lab.main import main
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.estimation.landmark_models import POINT, line_model
 from rlml_slam.types import Reflectors

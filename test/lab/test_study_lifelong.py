@@ -4,8 +4,8 @@ import json
 import numpy as np
 import pytest
 
+from rlml_lab.main import main
 from rlml_lab.studies import study_lifelong as study
-from rlml_slam.cli.main import main
 from rlml_slam.simulation.world_file import load_world
 
 

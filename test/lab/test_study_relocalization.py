@@ -8,9 +8,9 @@ import json
 import numpy as np
 import pytest
 
+from rlml_lab.main import main
 from rlml_lab.studies import study_relocalization as study
 from rlml_slam import se2
-from rlml_slam.cli.main import main
 
 
 @pytest.fixture(scope='module')

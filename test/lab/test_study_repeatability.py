@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from rlml_lab.main import main
 from rlml_lab.studies.study_repeatability import count_sightings, repeatability
-from rlml_slam.cli.main import main
 
 A, B = np.array([1.0, 2.0]), np.array([4.0, -1.0])
 

@@ -3,8 +3,8 @@ import json
 
 import numpy as np
 
+from rlml_lab.main import main
 from rlml_lab.studies import study_store as study
-from rlml_slam.cli.main import main
 from rlml_slam.maps import map_container
 
 

@@ -101,11 +101,11 @@ def test_damaged_map_does_not_replace_the_one_before(tmp_path):
 WRITER = textwrap.dedent("""
     import sys
     import numpy as np
-    from rlml_slam.maps import container
+    from rlml_slam.maps import map_container
     which = 3
     while True:
         arrays = {'poses': np.full((20, 3), float(which)), 'grid': np.full((600, 600), which)}
-        container.write(sys.argv[1], container.Content(arrays, {'which': which}))
+        map_container.write(sys.argv[1], map_container.Content(arrays, {'which': which}))
         print(which, flush=True)
         which += 1
 """)

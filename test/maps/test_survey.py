@@ -101,7 +101,7 @@ def compared():
 def test_map_is_found_in_the_plant(compared):
     true, figures = compared
     # a centimetre of noise, 18 reflectors over 40 m
-    np.testing.assert_allclose(figures['T_plant_map'], true, atol=0.01)
+    np.testing.assert_allclose(figures['T_survey_map'], true, atol=0.01)
     assert figures['rmse_m'] == pytest.approx(0.014, abs=0.005)
     assert [r['id'] for r in figures['residuals']] == [k for k in range(20) if k not in (3, 5)]
 

@@ -286,7 +286,7 @@ def test_three_that_fit_by_chance_are_not_unique():
         found = search(rng.uniform(-8.0, 8.0, (3, 2)), reflectors, z_cov=covs(3, 0.05))
         verdicts.append(found.verdict)
         if found.verdict is Verdict.AMBIGUOUS:
-            assert found.chance > P.risk
+            assert found.chance > P.false_positive_probability
     assert Verdict.UNIQUE not in verdicts
     assert verdicts.count(Verdict.AMBIGUOUS) > 10
 

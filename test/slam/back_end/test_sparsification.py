@@ -118,7 +118,7 @@ def test_nothing_that_is_kept_grows_with_the_laps():
     path = drive(*ROUND * laps, start=START)
     observed = observations(SQUARE, path, rng=np.random.default_rng(0))
     parameters = replace(
-        params(path_frames=1000),
+        params(max_trajectory_frames=1000),
         node=replace(Parameters().node, map_start_pose=START),
         loop_closure=LoopClosure(max_distance=4.0),
     )

@@ -75,7 +75,7 @@ def test_others_in_reach_of_a_lost_robot_get_their_turns():
     graph, keys = way(0.3)
     among = submaps(keys, *range(28, 40, 2))
     tried = [{c.m.anchor.index for c in candidates(graph, key, among, P)} for key in keys[34:40]]
-    assert all(len(t) == P.candidates + 1 for t in tried)
+    assert all(len(t) == P.max_candidates + 1 for t in tried)
     assert set.union(*tried) == set(range(28, 40, 2))
 
 

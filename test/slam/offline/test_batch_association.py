@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from rlml.made_worlds import detections_of
+from made_worlds import detections_of
 
 from rlml_slam.params import Reflector
 from rlml_slam.slam.offline.batch_association import BatchAssociation, Marks

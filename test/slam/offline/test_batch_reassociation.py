@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rlml.made_worlds import ROOM, TinyWorld, detections_of, drive, errors, observations
+from made_worlds import ROOM, TinyWorld, detections_of, drive, errors, observations
 
 from rlml_slam import se2
 from rlml_slam.params import Parameters

@@ -28,7 +28,7 @@ def searched(monkeypatch, lasts, pose, period=SECOND // 10):
         at.append(now[0] / SECOND)
         return Relocation(Verdict.IMPOSSIBLE, 'no place fits')
 
-    monkeypatch.setattr(recovery, 'find_place', localize_globally)
+    monkeypatch.setattr(recovery, 'localize_globally', localize_globally)
     looks, health = Recovery(Parameters()), Health(Level.LOST, ())
     saved = SavedMap(no_reflectors())
     for stamp in range(0, lasts * SECOND, period):
