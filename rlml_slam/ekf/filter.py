@@ -72,7 +72,7 @@ class Filter:
     # --- step 1 ----------------------------------------------------------------------------
 
     def predict(self, motion: Motion, walk: float = 0.0, kept: float = 1.0) -> bool:
-        """Move the robot: P_rr <- A P_rr A^T + Q, P_ri <- A P_ri (eq. 7, 8), in O(n).
+        """Move the robot: P_rr <- A P_rr A^T + Q, P_ri <- A P_ri (eq. 15, 16), in O(n).
 
         Q = W C W^T is the motion's covariance turned into the map. Meanwhile the gyro's bias
         gained the variance ``walk``, and of what the wheels err by a share of ``kept`` is left,

@@ -31,7 +31,7 @@ class Model:
 
 
 def observe_points(pose: Array, landmarks: Array) -> tuple[Array, Array, Array]:
-    """Range and bearing of points, eq. 4 with both squares, and H, eq. 5 and 6."""
+    """Range and bearing of points (eq. 17) and their Jacobian H (eq. 18)."""
     d = landmarks - pose[:2]
     q = d[:, 0] ** 2 + d[:, 1] ** 2
     r = np.sqrt(q)

@@ -87,7 +87,8 @@ def test_tables_are_put_between_the_marks(tmp_path, capsys):
 @pytest.mark.parametrize('times', [0, 2])
 def test_marks_that_are_not_there_once_are_named(times):
     marks = '<!-- begin topics --><!-- end topics -->'
-    texts = {Path('topics.md'): marks, Path('other.md'): marks} if times else {Path('topics.md'): ''}
+    others = {Path('other.md'): marks}
+    texts = {Path('topics.md'): marks, **others} if times else {Path('topics.md'): ''}
     with pytest.raises(
         FileFormatError, match=r'topics.md.*: <!-- begin topics --> … .* not there exactly once'
     ):

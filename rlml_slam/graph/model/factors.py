@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The factors of the graph: batched pure functions (residual, J_0, J_1), equations.md section 2.
+"""The factors of the graph: batched pure functions (residual, J_0, J_1), eq. 31-34.
 
 Every residual is "predicted minus measured" and every Jacobian is with respect to the raw
 coordinates (x, y, theta) or (x, y) of its nodes, so an update adds to them and wraps theta. For
@@ -42,7 +42,7 @@ def relative_pose(X_i: ArrayLike, X_j: ArrayLike, delta: ArrayLike) -> tuple[Arr
 def pose_landmark(X: ArrayLike, m: ArrayLike, z: ArrayLike) -> tuple[Array, Array, Array]:
     """E = R(theta)^T (m - p) - z ``(..., 2)``, J_X ``(..., 2, 3)``, J_m ``(..., 2, 2)``.
 
-    ``z`` is the (x, y) of the landmark seen from the pose. Equations.md writes z - R^T (m - p);
+    ``z`` is the (x, y) of the landmark seen from the pose. Eq. 2 writes z - R^T (m - p);
     the sign is chosen here so that all factors are predicted minus measured.
     """
     X, m, z = (np.asarray(a, dtype=np.float64) for a in (X, m, z))

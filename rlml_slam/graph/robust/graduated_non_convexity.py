@@ -2,7 +2,7 @@
 """Graduated non-convexity: truncated least squares over the closures, from a convex cost on.
 
 With s = e^T I e, c the truncation and mu the convexity, the weights in closed form are (Yang,
-Antonante, Tzoumas & Carlone, RA-L 5 (2020), eq. 14)
+Antonante, Tzoumas & Carlone, RA-L 5 (2020); eq. 43)
 
     w = 1                               s <= mu / (mu + 1) c^2
         c / sqrt(s) sqrt(mu (mu + 1)) - mu    between

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scan term (equations 1, 2 of the RLML front end): e_k = 1 - M(X + p_k), and its solution.
+"""The scan term (eq. 1, 2): e_k = 1 - M(X + p_k), and its solution.
 
 M is the submap's occupancy probability, interpolated by a uniform cubic B-spline: twice
 continuously differentiable, without overshoot, and a slight blur that widens the basin. Unknown
