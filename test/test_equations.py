@@ -22,7 +22,7 @@ def numbers(reference):
 
 
 def test_equations_are_numbered_from_1_on_without_gaps():
-    assert NUMBERED == list(range(1, len(NUMBERED) + 1))
+    assert list(range(1, len(NUMBERED) + 1)) == NUMBERED
 
 
 def test_every_reference_to_an_equation_resolves():
