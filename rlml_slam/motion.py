@@ -117,14 +117,14 @@ STILL = Motion(np.zeros(3), np.zeros((3, 3)))
 class _Noise(NamedTuple):
     """MotionNoise as kernels take it."""
 
-    a: float
-    b: float
-    c: float
-    d: float
-    lateral: float
-    imu_c: float
-    imu_d: float
-    interval: float
+    speed_noise: float
+    speed_noise_floor: float
+    turn_noise: float
+    turn_noise_floor: float
+    lateral_noise: float
+    imu_turn_noise: float
+    imu_turn_noise_floor: float
+    noise_interval: float
     long_interval_noise: float
     max_gap: float
     max_speed: float
@@ -169,7 +169,7 @@ def _drive(
         middle = (cuts[k] + cuts[k + 1]) // 2
         at = np.searchsorted(stamps, middle)
         # a robot goes within a control interval before its first odometry as at its beginning
-        if at == 0 and len(stamps) > 1 and stamps[0] - start <= n.interval * SECOND:
+        if at == 0 and len(stamps) > 1 and stamps[0] - start <= n.noise_interval * SECOND:
             at = 1
         known = 0 < at < len(stamps) and not math.isnan(v[at])
         gap = (stamps[at] - stamps[at - 1]) / SECOND if known else 0.0
@@ -179,30 +179,30 @@ def _drive(
         if known:
             speed, turn = v[at], w[at]
             # when inside a long interval the motion happened is uncertain
-            long_interval_noise = n.long_interval_noise if gap > 2.0 * n.interval else 0.0
-            sigma_v = (n.a + long_interval_noise) * abs(speed) + n.b
-            sigma_w = (n.c + long_interval_noise) * abs(turn) + n.d
+            long_interval_noise = n.long_interval_noise if gap > 2.0 * n.noise_interval else 0.0
+            sigma_v = (n.speed_noise + long_interval_noise) * abs(speed) + n.speed_noise_floor
+            sigma_w = (n.turn_noise + long_interval_noise) * abs(turn) + n.turn_noise_floor
         # the wheels do not turn: so does the robot not, and the IMU shows its bias
         stands = known and speed == 0.0 and turn == 0.0
         if stands:
-            sigma_v, sigma_w = STANDING * n.b, STANDING * n.d
+            sigma_v, sigma_w = STANDING * n.speed_noise_floor, STANDING * n.turn_noise_floor
         rate = _rate(middle, imu_stamps, rates, n.max_gap)
-        sigma_rate = n.imu_c * abs(rate) + n.imu_d
+        sigma_rate = n.imu_turn_noise * abs(rate) + n.imu_turn_noise_floor
         bias, bias_sigma = rate - turn, math.hypot(sigma_rate, sigma_w)
         says_bias = known and not math.isnan(rate)
         gyro = 0.0
         if not stands and not math.isnan(rate):
             turn, sigma_w, gyro = rate, sigma_rate, 1.0
-        # the figures hold for n.interval: a shorter one has the same accumulated noise; where
-        # the motion is too fast for its interval, the stamps are wrong, not the noise larger
+        # The noise is given for n.noise_interval; a shorter interval accumulates the same noise.
+        # Where the motion is too fast for its interval, the stamps are wrong, not the noise.
         lasted = max(dt, abs(speed) * dt / n.max_speed, abs(turn) * dt / n.max_turn_rate)
-        scale = along = n.interval / lasted
-        lateral = n.lateral * abs(speed)
+        scale = along = n.noise_interval / lasted
+        lateral = n.lateral_noise * abs(speed)
         if not known:
             # one unknown speed for all of a gap: the variance of the way goes with the square of
             # the time since odometry ended, and that of a part is what it grows by
             lateral, since = n.max_speed / 5.0, _since(middle, stamps, at)
-            along = max(n.interval, 2.0 * since) / dt
+            along = max(n.noise_interval, 2.0 * since) / dt
         rows[0, k], rows[1, k], rows[2, k], rows[6, k] = speed, turn, dt, gyro
         rows[3, k], rows[4, k] = sigma_v**2 * along, sigma_w**2 * scale
         rows[5, k] = lateral**2 * along
@@ -292,7 +292,7 @@ class MotionBuffer:
         step = se2.log(se2.between(pose, sample.pose))
         n = self._noise
         # stamps of one burst are too close to divide by: a jump is judged over an interval
-        over = max(dt, n.interval)
+        over = max(dt, n.noise_interval)
         if abs(step[0]) > n.max_speed * over or abs(step[2]) > n.max_turn_rate * over:
             return None
         return float(step[0]) / dt, float(step[2]) / dt

@@ -96,9 +96,9 @@ def test_one_file_may_serve_all_nodes_of_a_robot(of, values, tmp_path):
 @pytest.mark.parametrize(
     ('text', 'why'),
     [
-        ('controller_server: {ros__parameters: {use_odom: false}}', 'no section of front_end or'),
+        ('controller_server: {ros__parameters: {use_odom: false}}', 'no section for front_end or'),
         ('use_odom: false', "'use_odom' has no ros__parameters"),
-        ('[1, 2]', 'no parameters in it'),
+        ('[1, 2]', 'no parameters in this file'),
         ('a: [', 'not YAML'),
     ],
 )
@@ -110,7 +110,7 @@ def test_file_without_parameters_of_the_nodes_is_refused(text, why, tmp_path):
 
 
 @pytest.mark.parametrize('of', NODES)
-def test_wrong_value_is_told_by_the_name_of_its_parameter(of):
+def test_error_names_the_parameter_of_a_wrong_value(of):
     for d in declarations(of):
         with pytest.raises(ParameterError, match=f'^{re.escape(d.name)} = None is '):
             from_mapping({d.name: None}, of)
@@ -119,7 +119,7 @@ def test_wrong_value_is_told_by_the_name_of_its_parameter(of):
 def test_misspelt_parameter_is_refused(tmp_path):
     path = tmp_path / 'robot.yaml'
     path.write_text('front_end: {ros__parameters: {use_odon: false}}')
-    with pytest.raises(ParameterError, match="unknown parameter 'use_odon'; known are use_odom"):
+    with pytest.raises(ParameterError, match="unknown parameter 'use_odon'; similar: use_odom"):
         from_mapping(read_yaml(path))
 
 

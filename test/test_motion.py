@@ -227,12 +227,12 @@ def test_covariance_does_not_depend_on_the_rates():
 @pytest.mark.parametrize(('v', 'w'), [(0.9, 0.5), (-0.9, 0.5), (0.9, -0.5), (0.0, 0.4)])
 def test_variances_are_those_of_equation_6(v, w):
     n = NOISE
-    duration = n.interval
+    duration = n.noise_interval
     m = filled(line(v, w)).motion(T0 + SECOND, T0 + SECOND + round(duration * SECOND))
     # driving backwards does not cancel the noise floor
-    sigma_w = n.c * abs(w) + n.d
+    sigma_w = n.turn_noise * abs(w) + n.turn_noise_floor
     assert m.cov[2, 2] == pytest.approx((sigma_w * duration) ** 2, rel=1e-9)
-    sigma_v, lateral = n.a * abs(v) + n.b, n.lateral * abs(v)
+    sigma_v, lateral = n.speed_noise * abs(v) + n.speed_noise_floor, n.lateral_noise * abs(v)
     # the turn and the heading's noise mix a little of one into the other
     swing = abs(v) * duration * (sigma_w * duration)
     assert m.cov[0, 0] == pytest.approx((sigma_v * duration) ** 2, rel=0.01)
@@ -282,15 +282,15 @@ def test_turn_rate_is_the_imus_where_there_is_one():
     buffer = filled(line(1.0, 0.5), imu=lambda t: 0.7)
     m = buffer.motion(T0 + SECOND, T0 + 2 * SECOND)
     np.testing.assert_allclose(m.delta, line(1.0, 0.7)(1.0), atol=1e-4)
-    sigma = NOISE.imu_c * 0.7 + NOISE.imu_d
-    assert m.cov[2, 2] == pytest.approx(sigma**2 * NOISE.interval * 1.0, rel=1e-6)
+    sigma = NOISE.imu_turn_noise * 0.7 + NOISE.imu_turn_noise_floor
+    assert m.cov[2, 2] == pytest.approx(sigma**2 * NOISE.noise_interval * 1.0, rel=1e-6)
     assert m.bias_gain[2] == pytest.approx(-1.0)
     np.testing.assert_array_equal(m.turn_gain, 0.0)
     # what wheels and IMU differ by is the bias, as well as both tell
     assert m.bias == pytest.approx(0.2, rel=1e-6)
     assert m.bias_turn == pytest.approx(0.7, rel=1e-6)
-    wheels = NOISE.c * 0.5 + NOISE.d
-    assert m.bias_var == pytest.approx((sigma**2 + wheels**2) * NOISE.interval, rel=1e-6)
+    wheels = NOISE.turn_noise * 0.5 + NOISE.turn_noise_floor
+    assert m.bias_var == pytest.approx((sigma**2 + wheels**2) * NOISE.noise_interval, rel=1e-6)
 
 
 def test_without_an_imu_nothing_is_said_of_its_bias():
@@ -346,7 +346,7 @@ def test_motion_across_a_long_gap_is_unknown_and_wide():
     # a speed that lasts, and a turn rate that is unknown anew in each interval: after so long, no
     # heading is left to be known either way
     expected = (np.array([NOISE.max_speed, NOISE.max_speed, NOISE.max_turn_rate]) / 5.0) ** 2
-    lasted = np.array([gap, gap, NOISE.interval])
+    lasted = np.array([gap, gap, NOISE.noise_interval])
     np.testing.assert_allclose(np.diag(m.cov), expected * gap * lasted, rtol=1e-9)
     longer = with_gap(gap).motion(T0 + SECOND, T0 + round((2.5 + gap) * SECOND))
     assert not longer.known
@@ -412,11 +412,11 @@ def test_end_of_odometry_is_extrapolated_for_a_moment_only():
 
 @pytest.mark.parametrize('speed', [0.0, 1.0])
 def test_first_speed_holds_a_moment_before_the_odometry_begins(speed):
-    moment = round(0.5 * NOISE.interval * SECOND)
+    moment = round(0.5 * NOISE.noise_interval * SECOND)
     buffer = filled(line(speed, 0.5 * speed), duration=2.0)
     m = buffer.motion(T0 - moment, T0 + moment)
     assert m.known
-    np.testing.assert_allclose(m.delta, line(speed, 0.5 * speed)(NOISE.interval), atol=1e-4)
+    np.testing.assert_allclose(m.delta, line(speed, 0.5 * speed)(NOISE.noise_interval), atol=1e-4)
     later = buffer.motion(T0, T0 + 2 * moment)
     np.testing.assert_allclose(m.cov, later.cov, rtol=1e-2, atol=1e-7)
     # how it went long before nobody knows: it counts as standing, within a wide covariance

@@ -121,7 +121,7 @@ def run_node(
     environment = {'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
     simulated = {
         'seed': seed, 'rate': rate, 'duration': duration, 'wait_for_subscribers': 2,
-        'carrier.kind': kind, 'carrier.ids': ids, 'carrier.ghosts': 0.0 if ids else 0.05,
+        'carrier.kind': kind, 'carrier.ids': ids, 'carrier.false_detections': 0.0 if ids else 0.05,
     }  # fmt: skip
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -167,10 +167,13 @@ def run_node(
 
 def noise_parameters() -> dict[str, float]:
     """The simulated odometry's noise in the node's terms: per sqrt(s), but of an interval."""
-    along, across, turn = np.array(Carrier().odometry_sigma) / math.sqrt(MotionNoise().interval)
+    along, across, turn = np.array(Carrier().odometry_sigma) / math.sqrt(
+        MotionNoise().noise_interval
+    )
     return {
-        'motion.a': 0.0, 'motion.b': float(along), 'motion.c': 0.0, 'motion.d': float(turn),
-        'motion.lateral': float(across),
+        'motion.speed_noise': 0.0, 'motion.speed_noise_floor': float(along),
+        'motion.turn_noise': 0.0, 'motion.turn_noise_floor': float(turn),
+        'motion.lateral_noise': float(across),
     }  # fmt: skip
 
 

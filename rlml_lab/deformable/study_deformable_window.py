@@ -52,7 +52,7 @@ class WindowRun:
 
 def run_window(kind: str, minutes: float, seed: int, ids: bool) -> WindowRun:
     """Drive one system beside one carrier; anonymous detections come with ghosts."""
-    settings = Carrier(kind=kind, ids=ids, ghosts=0.0 if ids else 0.05)
+    settings = Carrier(kind=kind, ids=ids, false_detections=0.0 if ids else 0.05)
     count = round(minutes * MINUTE * settings.rate)
     slam, owner = DeformableSlam(DeformableParameters()), dict[int, int]()
     rows = np.full((count, 8), np.nan)  # filled, so that its memory is there from the start

@@ -151,9 +151,9 @@ def simulator(case: Case) -> SimulatorParameters:
             'duration': DURATION,
             'laser.beams': 8,
             'gyro.rate': 1.0,
-            'wheels.d': case.turn_noise,
+            'wheels.turn_noise_floor': case.turn_noise,
             'markers.ids': True,
-            'markers.ghosts': 0.0,
+            'markers.false_detections': 0.0,
             'markers.max_range': case.max_range,
             'markers.sigma_bearing': case.bearing_noise,
         },
@@ -189,7 +189,7 @@ def judge_case(name: str, seed: int) -> dict[str, Judged]:
     for system in SYSTEMS:
         slam: Slam | EkfSlam = Slam(params)
         if system != 'rlml':
-            slam = EkfSlam(replace(params, ekf=replace(params.ekf, error=system)))
+            slam = EkfSlam(replace(params, ekf=replace(params.ekf, error_model=system)))
         log = FrameLog()
         for frames in process(slam, observations):
             log.add(frames)

@@ -62,7 +62,7 @@ def ranges_of(data: Lego, scanner: Array, params: Spikes) -> Ranges:
     T_arena_laser = se2.compose(se2.compose(T, scanner), np.array([0.0, 0.0, T_BASE_LASER[2]]))
     rows = []
     for k, scan in enumerate(data.scans):
-        found = spikes.extract(scan, replace(params, offset=0.0, round=False))
+        found = spikes.extract(scan, replace(params, range_offset=0.0, cylindrical=False))
         where = se2.transform(T_arena_laser[k], found.points)
         gap = np.linalg.norm(where[:, None] - data.landmarks[None], axis=-1)
         for i in np.flatnonzero(gap.min(axis=1) < NEAR):

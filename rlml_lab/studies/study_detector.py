@@ -181,7 +181,7 @@ def judge_hall(p: Detector, duration: float, seed: int) -> dict[str, Any]:
     p = replace(p, flat_width=p.flat_width or HALL_FLAT)
     exact = {
         'world': 'hall', 'duration': duration, 'markers.sigma_range': 0.0,
-        'markers.sigma_bearing': 0.0, 'markers.missing': 0.0, 'markers.ghosts': 0.0,
+        'markers.sigma_bearing': 0.0, 'markers.missed_share': 0.0, 'markers.false_detections': 0.0,
     }  # fmt: skip
     parameters: SimulatorParameters = from_mapping(exact, SimulatorParameters)
     T_base_laser = np.array(parameters.node.laser_pose)

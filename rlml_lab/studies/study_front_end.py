@@ -117,8 +117,8 @@ def parameters_of(world: str, fault: str) -> SimulatorParameters:
     faults: dict[str, dict[str, float]] = {
         'slip': {'wheels.slip_rate': 0.1},  # bursts of 0.5 s: 5 % of the time
         'worn': {'wheels.speed_scale': 0.96, 'wheels.turn_scale': 1.05},  # all the way
-        'ghosts': {'markers.ghosts': VISIBLE[world]},
-        'missed': {'markers.missing': 0.4},
+        'ghosts': {'markers.false_detections': VISIBLE[world]},
+        'missed': {'markers.missed_share': 0.4},
         'jitter': {'transport.jitter': 0.02},
     }
     p: SimulatorParameters = from_mapping(

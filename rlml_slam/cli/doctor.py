@@ -157,8 +157,8 @@ def examine(e: Evidence, p: Detector) -> dict[str, Any]:
         a, k, floor, margin = propose(e, p)
         figures['margin'] = margin
         figures['proposed'] = {
-            'detector.threshold': 'curve', 'detector.a': a, 'detector.k': k,
-            'detector.floor': floor,
+            'detector.threshold': 'curve', 'detector.curve_gain': a, 'detector.curve_decay': k,
+            'detector.intensity_floor': floor,
         }  # fmt: skip
     return figures
 

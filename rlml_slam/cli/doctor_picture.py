@@ -28,8 +28,10 @@ def picture(e: Evidence, figures: dict[str, Any]) -> bytes:
     proposed = figures.get('proposed', {})
     if proposed.get('detector.threshold') == 'curve':
         r = np.linspace(0.0, float(e.beams[:, 0].max()), 200)
-        curve = proposed['detector.a'] * np.exp(-proposed['detector.k'] * r)
-        over.plot(r, curve + proposed['detector.floor'], color=INK, label='proposed threshold')
+        curve = proposed['detector.curve_gain'] * np.exp(-proposed['detector.curve_decay'] * r)
+        over.plot(
+            r, curve + proposed['detector.intensity_floor'], color=INK, label='proposed threshold'
+        )
     over.set_xlabel('range [m]', color=INK)
     over.set_ylabel('intensity', color=INK)
     over.set_yscale('log')

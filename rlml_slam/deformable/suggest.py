@@ -56,11 +56,11 @@ def drivable(displacement: Array) -> Array:
 def _noise(params: DeformableParameters, velocity: CarrierVelocity) -> Noise:
     """Noise of one step of the plan at the carrier's speed."""
     m, p = params.motion, params.deformable
-    scale = math.sqrt(m.interval * p.plan_step)
+    scale = math.sqrt(m.noise_interval * p.plan_step)
     speed = float(np.hypot(*velocity.linear))
     return Noise(
-        heading=(m.c * abs(velocity.angular) + m.d) * scale,
-        position=(m.a * speed + m.b) * scale,
+        heading=(m.turn_noise * abs(velocity.angular) + m.turn_noise_floor) * scale,
+        position=(m.speed_noise * speed + m.speed_noise_floor) * scale,
         drift2=(p.drift**2 + p.common_drift**2) * p.plan_step,
     )
 

@@ -55,7 +55,7 @@ class Estimator:
     def reset(self, pose: Array, cov: Array) -> None:
         """Forget everything and start at a pose (3,) of the map with covariance (3, 3)."""
         # a line is no point that turns with the rest
-        invariant = self._p.ekf.error == 'invariant' and self.model is POINT
+        invariant = self._p.ekf.error_model == 'invariant' and self.model is POINT
         m = self._p.motion
         filter_ = Filter(pose, cov, m.imu_bias_sigma, self.model, invariant, m.scale_error_sigma)
         self._start = Start(filter_.x.copy(), filter_.P.copy())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The declared parameters (params.py) become ROS parameters with descriptors, and their values.
+"""Declare the parameters of rlml_slam.params as ROS parameters, and read their values.
 
 rclpy ignores names in a YAML file that nobody declares, and refuses a whole number where a
 fraction is expected. Here an unknown name is warned about and numbers are numbers.

@@ -121,9 +121,9 @@ def _detect(
     body = (points - pose[:2]) @ np.array([[c, -s], [s, c]])
     noisy = body + settings.sigma * generator.standard_normal(body.shape)
     kept = (np.linalg.norm(body, axis=-1) <= settings.max_range) & (
-        generator.random(len(body)) >= settings.missing
+        generator.random(len(body)) >= settings.missed_share
     )
-    num = generator.poisson(settings.ghosts)
+    num = generator.poisson(settings.false_detections)
     ghosts = generator.uniform(-settings.max_range, settings.max_range, (num, 2))
     found = np.concatenate([noisy[kept], ghosts])
     seen = np.concatenate([ids[kept], np.full(num, ANONYMOUS, dtype=np.int64)])

@@ -69,9 +69,13 @@ class WheelSensor:
             self._slip_until = stamp + int(n.slip_duration * SECOND)
             self._slip_v, self._slip_w = n.slip_speed * share, n.slip_turn * rate
         v, w = travel / dt, turn / dt
-        spread = math.sqrt(n.interval * dt)
-        measured_travel = n.speed_scale * travel + (n.a * abs(v) + n.b) * spread * e_v
-        measured_turn = n.turn_scale * turn + (n.c * abs(w) + n.d) * spread * e_w
+        spread = math.sqrt(n.noise_interval * dt)
+        measured_travel = (
+            n.speed_scale * travel + (n.speed_noise * abs(v) + n.speed_noise_floor) * spread * e_v
+        )
+        measured_turn = (
+            n.turn_scale * turn + (n.turn_noise * abs(w) + n.turn_noise_floor) * spread * e_w
+        )
         if stamp < self._slip_until:
             measured_travel += self._slip_v * travel
             measured_turn += self._slip_w * dt
@@ -81,7 +85,7 @@ class WheelSensor:
 class GyroSensor:
     """Yaw rate with white noise of eq. 6 and a bias that walks.
 
-    A sample stands for 1 / rate seconds: its variance is (c |omega| + d)^2 interval rate.
+    A sample stands for 1 / rate seconds: its variance is (c |omega| + d)^2 noise_interval rate.
     """
 
     def __init__(self, gyro: Gyro, generators: Generators) -> None:
@@ -94,7 +98,9 @@ class GyroSensor:
         """The IMU at a stamp."""
         n = self._n
         rate = track.turn_rate(stamp)
-        sigma = (n.c * abs(rate) + n.d) * math.sqrt(n.interval * n.rate)
+        sigma = (n.turn_noise * abs(rate) + n.turn_noise_floor) * math.sqrt(
+            n.noise_interval * n.rate
+        )
         measured = rate + self.bias + sigma * self._noise.standard_normal()
         self.bias += n.bias_walk / math.sqrt(n.rate) * self._walk.standard_normal()
         return Imu(stamp, measured)
@@ -185,7 +191,7 @@ class LaserSensor:
         none = (power < n.min_intensity) | (ranges > n.range_max)
         power[none], ranges[none] = 0.0, np.inf
         ranges[ranges < n.range_min] = -np.inf
-        lost = self._dropped.random(n.beams) < n.dropped
+        lost = self._dropped.random(n.beams) < n.dropout_share
         power[lost], ranges[lost] = 0.0, np.nan
         return Scan(
             stamp,
@@ -220,7 +226,7 @@ class MarkerSensor:
         """The detections of the sweep that began at ``stamp``."""
         n, m = self._n, len(self.reflectors)
         noise = self._noise.standard_normal((m, 2))
-        missing = self._missing.random(m) < n.missing
+        missing = self._missing.random(m) < n.missed_share
         seen = np.flatnonzero(self._visible(track, laser, stamp, geometry, moment) & ~missing)
         T_world_laser = laser.poses(track, np.array([stamp]))[0]
         p = se2.transform(se2.inverse(T_world_laser), self.reflectors.points[seen])
@@ -245,7 +251,7 @@ class MarkerSensor:
     def _false(self, laser: LaserSensor) -> tuple[Array, Array]:
         """Ranges and bearings of ghosts, uniform in range and bearing."""
         n = self._n
-        g = int(self._ghosts.poisson(n.ghosts))
+        g = int(self._ghosts.poisson(n.false_detections))
         u = self._ghosts.random((g, 2))
         return 0.5 + u[:, 0] * (n.max_range - 0.5), laser.angle_min * (1.0 - 2.0 * u[:, 1])
 

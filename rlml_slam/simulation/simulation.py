@@ -206,7 +206,7 @@ class Simulation:
         w = approach(now_w, w, n.turn_acceleration * dt)
         # sideways motion of variance (lateral |v|)^2 interval dt per step, unseen by the wheels
         wheels = self.parameters.wheels
-        sigma = wheels.lateral * abs(v) * (wheels.interval / dt) ** 0.5
+        sigma = wheels.lateral_noise * abs(v) * (wheels.noise_interval / dt) ** 0.5
         self._track.set_twist(v, sigma * self._slide.standard_normal(), w)
 
     def _due(self, kind: type[Message], rate: float, delay: int = 0) -> Iterator[int]:
@@ -255,7 +255,7 @@ class Simulation:
         jitter, (late, delay, drop) = rng.standard_normal(), rng.random(3)
         if not keep_stamp and n.jitter > 0.0:
             message = replace(message, stamp=message.stamp + round(n.jitter * jitter * SECOND))
-        arrival = ready + (round(n.late_delay * delay * SECOND) if late < n.late else 0)
-        if drop >= n.dropped:
+        arrival = ready + (round(n.late_delay * delay * SECOND) if late < n.late_share else 0)
+        if drop >= n.lost_share:
             self._push(arrival, message)
         return message.stamp, arrival

@@ -214,7 +214,8 @@ def test_unsolvable_window_begins_anew_where_the_robot_is(monkeypatch):
 def with_gap(kind, seed, gap, ids=True):
     """A drive of 10 s and a ``gap`` of the data at 4 s, as a node hears it; NEES per update."""
     noise = MotionNoise(
-        a=0.0, b=0.01 / np.sqrt(0.1), c=0.0, d=0.004 / np.sqrt(0.1), lateral=0.01 / np.sqrt(0.1)
+        speed_noise=0.0, speed_noise_floor=0.01 / np.sqrt(0.1),
+        turn_noise=0.0, turn_noise_floor=0.004 / np.sqrt(0.1), lateral_noise=0.01 / np.sqrt(0.1),
     )  # fmt: skip
     params = DeformableParameters(motion=noise)
     synchronizer = Synchronizer(Parameters(motion=noise, node=params.node))

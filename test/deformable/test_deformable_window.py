@@ -93,7 +93,7 @@ def test_information_of_a_step_is_the_inverse_of_its_covariance():
 @pytest.mark.parametrize('kind', ['train', 'conveyor'])
 def test_noiseless_run_has_no_error(kind):
     # a turn is about the features that are tracked, so all must be seen from the first step
-    run = steps(150, kind=kind, missing=0.0, **EXACT)
+    run = steps(150, kind=kind, missed_share=0.0, **EXACT)
     run = [
         dataclasses.replace(
             s,
@@ -140,7 +140,7 @@ def test_covariances_account_for_the_errors(kind):
 
 def test_cost_and_memory_stay_constant():
     """Nothing grows over 40 s of a conveyor whose features come and go."""
-    run = steps(400, kind='conveyor', ids=False, ghosts=0.05)
+    run = steps(400, kind='conveyor', ids=False, false_detections=0.05)
     window = DeformableWindow(Deformable(), Reflector())
     sizes, seconds = [], []
     for s in run:
@@ -155,7 +155,7 @@ def test_cost_and_memory_stay_constant():
 
 
 def test_anonymous_features_are_followed_among_ghosts():
-    run = steps(200, ids=False, ghosts=0.1)
+    run = steps(200, ids=False, false_detections=0.1)
     estimates, owner, _ = follow(run)
     last, step = estimates[-1], run[-1]
     found = last.features.points[:, None] - step.points[None]
@@ -167,7 +167,7 @@ def test_anonymous_features_are_followed_among_ghosts():
 
 
 def test_lone_ghost_is_never_a_feature_and_keys_are_never_reused():
-    run = steps(100, ghosts=0.0)
+    run = steps(100, false_detections=0.0)
     ghost = run[50].detections
     odd = dataclasses.replace(
         ghost,
@@ -185,7 +185,7 @@ def test_lone_ghost_is_never_a_feature_and_keys_are_never_reused():
 
 
 def test_feature_out_of_sight_is_kept_a_while_and_then_forgotten():
-    run = steps(120, missing=0.0)
+    run = steps(120, missed_share=0.0)
     blind = []
     for k, s in enumerate(run):
         keep = (s.seen != 2) | (k < 40)
@@ -217,7 +217,7 @@ def test_moving_the_start_moves_everything_and_changes_nothing_else():
 
 
 def test_replay_is_identical_bit_for_bit():
-    run = steps(60, ids=False, ghosts=0.2)
+    run = steps(60, ids=False, false_detections=0.2)
     a, b = follow(run)[0], follow(run)[0]
     for x, y in zip(a, b, strict=True):
         np.testing.assert_array_equal(x.joint_cov, y.joint_cov)

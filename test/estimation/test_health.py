@@ -101,7 +101,7 @@ def test_nothing_seen_in_doubt_is_mapped():
 
 
 def test_place_that_is_not_in_the_map_stays_lost_and_is_new_after_a_while():
-    limits = HealthLimits(new_place_time=2.0)
+    limits = HealthLimits(new_session_time=2.0)
     path = drive((0.0, 0.1, 6.0))
     observed, _ = kidnapping(after=path, elsewhere=OTHER_ROOM, reflectors=False)
     frames, slam = run(observed, Slam(Parameters(health=limits)))
@@ -126,7 +126,7 @@ def test_place_that_looks_like_another_stays_lost():
     path = drive((0.5, 0.0, 4.0), (0.0, 0.8, 4.0), start=(-3.0, -0.4, 0.0))
     after = drive((0.0, 0.1, 3.0), start=(3.0, 0.9, 1.0))
     observed, _ = kidnapping(path, after, hall, hall)
-    limits = HealthLimits(new_place_time=60.0)
+    limits = HealthLimits(new_session_time=60.0)
     frames, slam = run(observed, Slam(Parameters(health=limits)))
     assert not any(f.jumped for f in frames)
     assert frames[-1].health.level is Level.LOST

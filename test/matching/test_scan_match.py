@@ -152,7 +152,7 @@ def test_turning_the_world_turns_the_match(room, turn):
 def test_search_finds_what_refinement_alone_does_not(room):
     points = scan(ROOM, START, 360, sigma=0.01)
     prior = se2.compose(START, [0.45, -0.35, 0.3])
-    p = dataclasses.replace(P, search_window=0.5, wide_search_score=0.0)
+    p = dataclasses.replace(P, search_window=0.5, wide_search_threshold=0.0)
     odometry = np.linalg.inv(ODOMETRY)
     alone = match(room, points, prior, odometry, p, searched=False)
     searched = match(room, points, prior, odometry, p)
@@ -166,7 +166,7 @@ def test_poor_fit_is_searched_wider(room):
     prior = se2.compose(START, [0.45, -0.35, 0.3])
     found = match(room, points, prior, np.linalg.inv(ODOMETRY))
     assert np.abs(se2.between(START, found.pose)).max() < 0.01
-    narrow = dataclasses.replace(P, wide_search_score=0.0)
+    narrow = dataclasses.replace(P, wide_search_threshold=0.0)
     lost = match(room, points, prior, np.linalg.inv(ODOMETRY), narrow)
     assert np.abs(se2.between(START, lost.pose)).max() > 0.1
 
@@ -204,7 +204,7 @@ def test_corridor_has_no_information_along_itself(beams):
     submap = built(world, poses, sigma=0.01, beams=beams)
     true = se2.compose(turn, [1.53, 0.1, 0.03])
     p = params.ScanMatch()
-    points = thin(scan(world, true, beams, sigma=0.01, seed=99), p.voxel, p.max_points)
+    points = thin(scan(world, true, beams, sigma=0.01, seed=99), p.voxel_size, p.max_points)
     prior = se2.compose(true, [0.08, 0.0, 0.0])
     found = match(submap, points, prior, np.linalg.inv(np.diag([0.05, 0.05, 0.02]) ** 2))
     # the odometry's 8 cm along the corridor are left alone, across it is held to millimetres

@@ -75,8 +75,10 @@ def test_given_values_are_taken_and_whole_numbers_serve_as_fractions(make_node):
     assert parameters.node.map_start_pose == (1.0, 2.0, 3.0)
 
 
-def test_wrong_value_is_told_with_its_name_and_meaning(make_node):
-    with pytest.raises(ParameterError, match=r"^mode = 'mopping' is none of .*\(mapping, or"):
+def test_wrong_value_is_reported_with_its_name_and_meaning(make_node):
+    with pytest.raises(
+        ParameterError, match=r"^mode = 'mopping' is not one of .*\(build a map, or"
+    ):
         declare(make_node(mode='mopping'))
 
 

@@ -206,12 +206,12 @@ def test_an_empty_scan_is_no_error():
 
 
 def test_the_curve_is_what_it_says():
-    p = replace(THIN, threshold='curve', a=3000.0, k=0.2, floor=100.0)
+    p = replace(THIN, threshold='curve', curve_gain=3000.0, curve_decay=0.2, intensity_floor=100.0)
     scan = made_scan([(2.0, 0.0, 0.08)])
     bound = threshold(scan, p)
     assert_allclose(bound, 3000.0 * np.exp(-0.2 * scan.ranges) + 100.0, rtol=1e-6)
     assert len(detect(scan, p)) == 1
-    assert len(detect(scan, replace(p, floor=5000.0))) == 0
+    assert len(detect(scan, replace(p, intensity_floor=5000.0))) == 0
 
 
 def test_the_vendors_mark_is_taken_alone():
@@ -252,7 +252,7 @@ def test_a_vest_is_too_wide(width):
     scene.add_room(np.full(2, 6.0), [surface(0.6)] * 4)
     scene.add_disc(np.array([3.0, 0.5]), width, np.zeros(2), surface(0.6, retro=True))
     scan = still(scene.geometry())
-    found = detect(scan, Detector(threshold='curve', a=0.0, floor=3000.0))
+    found = detect(scan, Detector(threshold='curve', curve_gain=0.0, intensity_floor=3000.0))
     assert len(found) == 0
     assert found.rejected[Fate.WIDE] == 1
     assert len(detect(scan, Detector())) == 0

@@ -16,7 +16,7 @@ def scan(ranges, increment=0.01, first=-0.5):
 def test_jump_finds_what_is_nearer_than_both_neighbours():
     r = np.full(100, 5.0)
     r[40:43] = 3.0
-    found = extract(scan(r), Spikes(offset=0.1, round=False))
+    found = extract(scan(r), Spikes(range_offset=0.1, cylindrical=False))
     assert found.beams.tolist() == [41.0]
     angle = -0.5 + 0.41
     assert found.points[0] == pytest.approx([3.1 * np.cos(angle), 3.1 * np.sin(angle)], abs=1e-6)
@@ -44,7 +44,7 @@ def test_centre_of_a_cylinder_is_found_whatever_its_size(diameter):
 def test_sum_finds_one_near_beam_and_its_covariance_is_polar():
     r = np.full(100, 5.0)
     r[60] = 2.0
-    p = Spikes(test='sum', sigma_range=0.05, sigma_bearing=0.01, round=False)
+    p = Spikes(test='sum', sigma_range=0.05, sigma_bearing=0.01, cylindrical=False)
     found = extract(scan(r), p)
     assert found.beams.tolist() == [60.0]
     u = found.points[0] / 2.0
@@ -57,7 +57,7 @@ def test_sum_with_reach_finds_several_near_beams_once():
     r = np.full(100, 5.0)
     r[60:63] = 2.0
     assert extract(scan(r), Spikes(test='sum')).beams.tolist() == []
-    assert extract(scan(r), Spikes(test='sum', reach=3)).beams.tolist() == [61.0]
+    assert extract(scan(r), Spikes(test='sum', neighbour_offset=3)).beams.tolist() == [61.0]
 
 
 @pytest.mark.parametrize('test', ['jump', 'sum'])
@@ -83,7 +83,7 @@ def test_spike_across_the_seam_of_a_full_turn_is_found(test, at):
     r = np.full(360, 5.0)
     r[[(at - 1) % 360, at]] = 3.0
     s = scan(r, 2.0 * np.pi / 360, -np.pi)
-    found = extract(s, Spikes(test=test, reach=2, max_width=0.2))
+    found = extract(s, Spikes(test=test, neighbour_offset=2, max_width=0.2))
     assert found.beams.tolist() == [(at - 0.5) % 360]
 
 

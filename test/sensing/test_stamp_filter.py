@@ -124,7 +124,7 @@ def test_the_same_stamp_is_told_the_same_again():
 def observed(steady):
     """Errors [m] of what is seen of REFLECTORS on a drive where all stamps jitter by 20 ms."""
     rng = np.random.default_rng(4)
-    synchronizer = Synchronizer(replace(Parameters(), node=Node(steady_stamps=steady)))
+    synchronizer = Synchronizer(replace(Parameters(), node=Node(filter_stamps=steady)))
     stamps, out = set(), []
     for k in range(1500):
         pose = se2.exp(TWIST * k * 0.02)

@@ -57,7 +57,7 @@ def test_train_stays_in_range_and_a_conveyor_brings_new_features():
 
 
 def test_ghosts_and_missing_come_in_the_stated_share():
-    run = steps(1000, ghosts=0.5, missing=0.3, ids=False)
+    run = steps(1000, false_detections=0.5, missed_share=0.3, ids=False)
     seen = np.concatenate([s.seen for s in run])
     assert (seen == -1).mean() * len(seen) / 1000 == pytest.approx(0.5, abs=0.07)
     assert (seen >= 0).sum() / 6000 == pytest.approx(0.7, abs=0.02)

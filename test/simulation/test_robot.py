@@ -12,7 +12,7 @@ from rlml_slam.simulation.robot import SECOND, RouteFollower, Track
 from rlml_slam.simulation.simulation import START, STEP, GroundTruth, Simulation
 from rlml_slam.simulation.world_file import load_world, parse_world, world_names
 
-QUIET = SimulatorParameters(wheels=Wheels(lateral=0.0))
+QUIET = SimulatorParameters(wheels=Wheels(lateral_noise=0.0))
 
 
 def truths(simulation):
@@ -94,7 +94,7 @@ def test_speeds_and_accelerations_stay_in_their_bounds():
 
 
 def test_sideways_motion_is_that_of_the_parameter():
-    parameters = SimulatorParameters(wheels=Wheels(lateral=0.05, interval=0.2))
+    parameters = SimulatorParameters(wheels=Wheels(lateral_noise=0.05, noise_interval=0.2))
     simulation = Simulation(load_world('corridor'), parameters)
     sides = []
     while not simulation.done:

@@ -26,7 +26,12 @@ route: [[0, 0]]
 walls: [{points: [[-4, -3], [6, -3], [6, 3], [-4, 3]], closed: true}]
 """
 EXACT = Laser(
-    range_sigma=0.0, divergence=0.0, dropped=0.0, intensity_noise=0.0, min_intensity=0.0, beams=720
+    range_sigma=0.0,
+    divergence=0.0,
+    dropout_share=0.0,
+    intensity_noise=0.0,
+    min_intensity=0.0,
+    beams=720,
 )
 
 
@@ -63,7 +68,14 @@ def scan_in(text, laser=EXACT, pose=(0.0, 0.0, 0.0), twist=(0.0, 0.0), seed=0, m
 
 @pytest.mark.parametrize('rate', [20.0, 50.0])
 def test_odometry_noise_is_that_of_the_motion_model_at_any_rate(rate):
-    wheels = Wheels(rate=rate, a=0.08, b=0.02, c=0.1, d=0.03, interval=0.2)
+    wheels = Wheels(
+        rate=rate,
+        speed_noise=0.08,
+        speed_noise_floor=0.02,
+        turn_noise=0.1,
+        turn_noise_floor=0.03,
+        noise_interval=0.2,
+    )
     track = straight(200.0, v=0.8, omega=0.5)
     samples = odometry(wheels, track)
     steps = np.array([se2.log(se2.between(a.pose, b.pose)) for a, b in pairwise(samples)])
@@ -86,7 +98,14 @@ def test_the_errors_of_wheels_and_gyro_are_consistent_with_the_motion_models_cov
     )
     w, g = parameters.wheels, parameters.gyro
     noise = MotionNoise(
-        a=w.a, b=w.b, c=w.c, d=w.d, lateral=w.lateral, interval=w.interval, imu_c=g.c, imu_d=g.d
+        speed_noise=w.speed_noise,
+        speed_noise_floor=w.speed_noise_floor,
+        turn_noise=w.turn_noise,
+        turn_noise_floor=w.turn_noise_floor,
+        lateral_noise=w.lateral_noise,
+        noise_interval=w.noise_interval,
+        imu_turn_noise=g.turn_noise,
+        imu_turn_noise_floor=g.turn_noise_floor,
     )
     values = {False: [], True: []}
     for use_imu in (False, True):
@@ -118,7 +137,12 @@ def test_wheels_that_stand_report_nothing():
 
 
 def test_scale_errors_are_what_they_say():
-    quiet = {'a': 0.0, 'b': 0.0, 'c': 0.0, 'd': 0.0}
+    quiet = {
+        'speed_noise': 0.0,
+        'speed_noise_floor': 0.0,
+        'turn_noise': 0.0,
+        'turn_noise_floor': 0.0,
+    }
     track = straight(2.0, v=0.5, omega=0.3)
     last = odometry(Wheels(speed_scale=1.1, turn_scale=0.9, **quiet), track)[-1].pose
     want = se2.exp(np.array([0.5 * 1.1, 0.0, 0.3 * 0.9]) * 2.0)
@@ -126,7 +150,7 @@ def test_scale_errors_are_what_they_say():
 
 
 def test_without_noise_odometry_is_the_truth():
-    wheels = Wheels(a=0.0, b=0.0, c=0.0, d=0.0)
+    wheels = Wheels(speed_noise=0.0, speed_noise_floor=0.0, turn_noise=0.0, turn_noise_floor=0.0)
     track = straight(5.0, v=0.7, omega=-0.8, pose=(1.0, 2.0, 3.0))
     last = odometry(wheels, track)[-1]
     want = se2.between(track.pose_at(START), track.pose_at(last.stamp))
@@ -134,7 +158,12 @@ def test_without_noise_odometry_is_the_truth():
 
 
 def test_a_slip_burst_overstates_speed_for_its_duration():
-    quiet = {'a': 0.0, 'b': 0.0, 'c': 0.0, 'd': 0.0}
+    quiet = {
+        'speed_noise': 0.0,
+        'speed_noise_floor': 0.0,
+        'turn_noise': 0.0,
+        'turn_noise_floor': 0.0,
+    }
     wheels = Wheels(slip_rate=0.5, slip_duration=0.4, slip_speed=0.5, slip_turn=0.2, **quiet)
     samples = odometry(wheels, straight(60.0))
     steps = np.array([se2.log(se2.between(a.pose, b.pose)) for a, b in pairwise(samples)]) * 50
@@ -150,7 +179,9 @@ def test_a_slip_burst_overstates_speed_for_its_duration():
 
 
 def test_gyro_noise_and_bias_are_what_they_say():
-    gyro = Gyro(c=0.02, d=0.004, interval=0.1, bias=0.01, bias_walk=0.0)
+    gyro = Gyro(
+        turn_noise=0.02, turn_noise_floor=0.004, noise_interval=0.1, bias=0.01, bias_walk=0.0
+    )
     sensor = GyroSensor(gyro, generators(0))
     track = straight(60.0, omega=0.5)
     stamps = range(START, track.stamp, STEP)
@@ -174,7 +205,8 @@ def test_gyro_bias_walks_as_it_says():
 
 def test_the_trapezoids_through_a_noiseless_gyro_add_up_to_the_heading():
     parameters = SimulatorParameters(
-        gyro=Gyro(c=0.0, d=0.0, bias=0.0, bias_walk=0.0), laser=Laser(rate=0.5, beams=2)
+        gyro=Gyro(turn_noise=0.0, turn_noise_floor=0.0, bias=0.0, bias_walk=0.0),
+        laser=Laser(rate=0.5, beams=2),
     )
     simulation = Simulation(load_world('symmetric'), parameters)
     samples = [e.message for e in simulation if isinstance(e.message, Imu)]
@@ -253,7 +285,7 @@ def test_what_moves_is_met_where_it_is_at_the_time_of_the_ray():
 
 
 def test_range_noise_and_dropped_beams_are_what_they_say():
-    noisy = Laser(**{**EXACT.__dict__, 'range_sigma': 0.03, 'dropped': 0.1, 'beams': 20000})
+    noisy = Laser(**{**EXACT.__dict__, 'range_sigma': 0.03, 'dropout_share': 0.1, 'beams': 20000})
     scan, *_ = scan_in(ROOM, noisy)
     exact, *_ = scan_in(ROOM, Laser(**{**EXACT.__dict__, 'beams': 20000}))
     lost = np.isnan(scan.ranges)
@@ -330,7 +362,7 @@ def detections(text, markers, twist=(0.0, 0.0), laser=EXACT, seeds=1, mount=(0.2
     return found
 
 
-CLEAN = Markers(sigma_range=0.0, sigma_bearing=0.0, missing=0.0, ghosts=0.0)
+CLEAN = Markers(sigma_range=0.0, sigma_bearing=0.0, missed_share=0.0, false_detections=0.0)
 POSTS = 'reflectors: [{at: [3, 1], diameter: 0.1, id: 7}, {at: [-2, -2], diameter: 0.3, id: 9}]'
 
 
@@ -350,7 +382,7 @@ def test_ids_are_told_only_when_asked():
 
 
 def test_noise_has_no_bias_and_the_covariance_that_is_stated():
-    markers = Markers(sigma_range=0.05, sigma_bearing=0.01, missing=0.0, ghosts=0.0)
+    markers = Markers(sigma_range=0.05, sigma_bearing=0.01, missed_share=0.0, false_detections=0.0)
     found = detections(ROOM + POSTS, markers, seeds=800)
     for k, true in enumerate([[2.8, 1.0], [-2.2, -2.0]]):
         error = np.array([d.points[k] for d in found]) - true
@@ -394,10 +426,10 @@ def test_a_flat_reflector_is_detected_from_its_front_only():
 
 
 def test_missing_and_ghosts_come_as_often_as_they_say():
-    markers = Markers(**{**CLEAN.__dict__, 'missing': 0.3, 'ghosts': 0.0})
+    markers = Markers(**{**CLEAN.__dict__, 'missed_share': 0.3, 'false_detections': 0.0})
     count = sum(len(d) for d in detections(ROOM + POSTS, markers, seeds=800))
     assert abs(count - 0.7 * 1600) < 4 * math.sqrt(1600 * 0.21)
-    markers = Markers(**{**CLEAN.__dict__, 'missing': 1.0, 'ghosts': 2.0})
+    markers = Markers(**{**CLEAN.__dict__, 'missed_share': 1.0, 'false_detections': 2.0})
     found = detections(ROOM + POSTS, markers, seeds=800)
     assert abs(sum(map(len, found)) - 1600) < 4 * math.sqrt(1600)
     points = np.concatenate([d.points for d in found])

@@ -125,7 +125,7 @@ def test_the_map_begins_at_the_robots_start():
 
 def test_detections_seen_from_the_truth_are_the_reflectors():
     parameters = dataclasses.replace(
-        SHORT, markers=Markers(sigma_range=0.0, sigma_bearing=0.0, ids=True, ghosts=0.0)
+        SHORT, markers=Markers(sigma_range=0.0, sigma_bearing=0.0, ids=True, false_detections=0.0)
     )
     simulation = Simulation(load_world('hall'), parameters)
     seen = of(list(simulation), Detections)
@@ -145,9 +145,9 @@ def test_detections_seen_from_the_truth_are_the_reflectors():
         ({'gyro': Gyro(bias=0.05)}, Imu),
         ({'gyro': Gyro(bias_walk=0.01)}, Imu),
         ({'laser': Laser(beams=180, range_sigma=0.05)}, Scan),
-        ({'laser': Laser(beams=180, dropped=0.1)}, Scan),
-        ({'markers': Markers(ghosts=1.0)}, Detections),
-        ({'markers': Markers(missing=0.5)}, Detections),
+        ({'laser': Laser(beams=180, dropout_share=0.1)}, Scan),
+        ({'markers': Markers(false_detections=1.0)}, Detections),
+        ({'markers': Markers(missed_share=0.5)}, Detections),
         ({'markers': Markers(sigma_range=0.1)}, Detections),
     ],
 )
@@ -158,9 +158,9 @@ def test_a_fault_of_one_sensor_leaves_all_others_as_they_were(change, changed):
 
 
 def test_missing_reflectors_leave_the_noise_of_the_others():
-    markers = Markers(ids=True, ghosts=0.0, missing=0.0)
+    markers = Markers(ids=True, false_detections=0.0, missed_share=0.0)
     full = of(run(dataclasses.replace(SHORT, markers=markers)), Detections)
-    markers = dataclasses.replace(markers, missing=0.4)
+    markers = dataclasses.replace(markers, missed_share=0.4)
     some = of(run(dataclasses.replace(SHORT, markers=markers)), Detections)
     assert sum(map(len, some)) < 0.75 * sum(map(len, full))
     for a, b in zip(full, some, strict=True):
@@ -169,7 +169,7 @@ def test_missing_reflectors_leave_the_noise_of_the_others():
 
 def test_dropped_messages_are_missing_and_nothing_else_changes():
     before = run()
-    after = run(dataclasses.replace(SHORT, transport=Transport(dropped=0.2)))
+    after = run(dataclasses.replace(SHORT, transport=Transport(lost_share=0.2)))
     for kind in (Odometry, Imu, Scan, Detections):
         a, b = of(before, kind), of(after, kind)
         n = len(a)
@@ -181,7 +181,7 @@ def test_dropped_messages_are_missing_and_nothing_else_changes():
 
 def test_late_messages_arrive_later_and_complete():
     before = run()
-    after = run(dataclasses.replace(SHORT, transport=Transport(late=0.3, late_delay=0.5)))
+    after = run(dataclasses.replace(SHORT, transport=Transport(late_share=0.3, late_delay=0.5)))
     times = [e.time for e in after]
     assert times == sorted(times)
     for kind in (Odometry, Imu, Scan, Detections):
@@ -223,7 +223,7 @@ def test_nothing_that_moves_comes_near_the_robot():
 
 def test_the_robot_keeps_clear_of_walls_in_every_world():
     for name in world_names():
-        laser = Laser(beams=90, rate=2.0, dropped=0.0, range_sigma=0.0)
+        laser = Laser(beams=90, rate=2.0, dropout_share=0.0, range_sigma=0.0)
         scans = of(run(dataclasses.replace(CALM, laser=laser), name), Scan)
         assert min(float(s.ranges.min()) for s in scans) > 0.4
 

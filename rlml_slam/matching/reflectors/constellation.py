@@ -145,7 +145,7 @@ class _Search:
         self._noise = float(self._z_var.max() + self._p_var.max())
         self._floor2 = self._gate2 * self._noise
         # expected ghosts per m^2
-        self._ghosts = max(1.0, params.ghosts * len(z)) / _area(z, self._floor2)
+        self._ghosts = max(1.0, params.false_share * len(z)) / _area(z, self._floor2)
 
     def run(self, prior: Prior | None) -> Constellation:
         """Verdict and candidates."""
@@ -206,11 +206,11 @@ class _Search:
         hit = np.flatnonzero(match >= 0)
         S = self._p_cov[match[hit]] + _turned(self._z_cov[hit], T[2])
         area = np.pi * self._gate2 * np.sqrt(np.linalg.det(S))
-        score = float(np.log((1.0 - p.missing) / (self._ghosts * area)).sum())
+        score = float(np.log((1.0 - p.missed_share) / (self._ghosts * area)).sum())
         near = np.hypot(*(self._p - T[:2]).T) < p.max_range
         num_near = int(near[match[hit]].sum())
         num_unseen = int(near.sum()) - num_near
-        score += num_unseen * float(np.log(p.missing))
+        score += num_unseen * float(np.log(p.missed_share))
         return Candidate(T, cov, match, score, chi2, num_near, num_unseen)
 
     def _judged(self, found: list[Candidate], proposals: int) -> Constellation:
@@ -220,9 +220,9 @@ class _Search:
         chance = self._chance([c.num_matches for c in found], proposals)
         seen = f'{n} of {k} detections match'
         # more ghosts or more missing than there are where the robot stands in this map
-        strange = bdtr(n, k, 1.0 - p.ghosts) < p.false_positive_probability
+        strange = bdtr(n, k, 1.0 - p.false_share) < p.false_positive_probability
         missed = (
-            bdtr(best.num_near, best.num_near + best.num_unseen, 1.0 - p.missing)
+            bdtr(best.num_near, best.num_near + best.num_unseen, 1.0 - p.missed_share)
             < p.false_positive_probability
         )
         if chance > p.false_positive_probability:

@@ -21,7 +21,7 @@ def window(
     half_width: float,
     half_angle: float,
     whitening: Array | None = None,
-    prior_scale: float = 3.0,
+    prior_robust_scale: float = 3.0,
     share: float = 0.05,
     stride: int = 1,
 ) -> Candidate:
@@ -42,7 +42,7 @@ def window(
     j, i = submap.corner
     x, y, theta, total = search_window(
         submap.values, float(j), float(i), 1.0 / submap.resolution, points, pose, n, stride, m,
-        step, np.zeros((3, 3)) if whitening is None else whitening, prior_scale,
+        step, np.zeros((3, 3)) if whitening is None else whitening, prior_robust_scale,
         share * len(points) * LEVELS / (P_MAX - P_MIN),
     )  # fmt: skip
     score = P_MIN + (P_MAX - P_MIN) * total / (LEVELS * max(len(points), 1))
@@ -50,11 +50,15 @@ def window(
 
 
 @brief
-def prior_loss(x: float, y: float, turn: float, whitening: Array, prior_scale: float) -> float:
-    """Sum over u = whitening @ (x, y, turn) of v^2 / (1 + v^2), v = u_k / prior_scale."""
+def prior_loss(
+    x: float, y: float, turn: float, whitening: Array, prior_robust_scale: float
+) -> float:
+    """Sum over u = whitening @ (x, y, turn) of v^2 / (1 + v^2), v = u_k / prior_robust_scale."""
     loss = 0.0
     for h in range(3):
-        u = (whitening[h, 0] * x + whitening[h, 1] * y + whitening[h, 2] * turn) / prior_scale
+        u = (
+            whitening[h, 0] * x + whitening[h, 1] * y + whitening[h, 2] * turn
+        ) / prior_robust_scale
         loss += u * u / (1.0 + u * u)
     return loss
 
@@ -72,7 +76,7 @@ def search_window(
     m: int,
     step: float,
     whitening: Array,
-    prior_scale: float,
+    prior_robust_scale: float,
     unit: float,
 ) -> tuple[float, float, float, int]:
     """Exhaustive sum of cell values over (2 n + 1)^2 shifts and 2 m + 1 angles.
@@ -111,7 +115,7 @@ def search_window(
             for q in range(width):
                 di, dj = (r - n) * stride, (q - n) * stride
                 distance = di * di + dj * dj + a * a
-                loss = prior_loss(dj / scale, di / scale, a * step, whitening, prior_scale)
+                loss = prior_loss(dj / scale, di / scale, a * step, whitening, prior_robust_scale)
                 value = sums[r, q] - unit * loss
                 if value > best or (value == best and distance < best_distance):
                     best, best_distance, best_sum = value, distance, sums[r, q]

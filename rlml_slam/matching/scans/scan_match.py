@@ -243,7 +243,7 @@ def refine(
     start: Array,
     prior: Array,
     whitening: Array,
-    prior_scale: float,
+    prior_robust_scale: float,
     sigma: float,
     max_iterations: int,
     out: Array,
@@ -259,14 +259,14 @@ def refine(
     A = np.empty((3, 3))
     b = np.empty(3)
     accumulate(values, corner_j, corner_i, scale, points, constraints, pose, out)
-    cost, weight = prior_term(pose, prior, whitening, prior_scale, A, b)
+    cost, weight = prior_term(pose, prior, whitening, prior_robust_scale, A, b)
     cost += w * out[0]
     damping = 1e-4
     iterations = 0
     converged = False
     while iterations < max_iterations and not converged:
         iterations += 1
-        _, weight = prior_term(pose, prior, whitening, prior_scale, A, b)
+        _, weight = prior_term(pose, prior, whitening, prior_robust_scale, A, b)
         n = 4
         for r in range(3):
             b[r] += w * out[1 + r]
@@ -279,7 +279,7 @@ def refine(
         for r in range(3):
             trial[r] = pose[r] - step[r]
         accumulate(values, corner_j, corner_i, scale, points, constraints, trial, term)
-        trial_cost, _ = prior_term(trial, prior, whitening, prior_scale, A, b)
+        trial_cost, _ = prior_term(trial, prior, whitening, prior_robust_scale, A, b)
         trial_cost += w * term[0]
         converged = abs(step[0]) < 1e-4 and abs(step[1]) < 1e-4 and abs(step[2]) < 1e-5
         if trial_cost <= cost:
@@ -294,7 +294,7 @@ def refine(
 
 @kernel
 def prior_term(
-    pose: Array, prior: Array, whitening: Array, prior_scale: float, A: Array, b: Array
+    pose: Array, prior: Array, whitening: Array, prior_robust_scale: float, A: Array, b: Array
 ) -> tuple[float, float]:
     """Cost and smallest weight of the prior; its Hessian into A (3, 3), its gradient into b (3,).
 
@@ -309,7 +309,7 @@ def prior_term(
     cost, weight = 0.0, 1.0
     for h in range(3):
         u = whitening[h, 0] * d0 + whitening[h, 1] * d1 + whitening[h, 2] * d2
-        k = 1.0 / (1.0 + u * u / (prior_scale * prior_scale))
+        k = 1.0 / (1.0 + u * u / (prior_robust_scale * prior_robust_scale))
         cost += 0.5 * u * u * k
         weight = min(weight, k * k)
         for r in range(3):
@@ -383,7 +383,7 @@ def match(
     if window is not None:
         other = solve.refined(prior_pose)
         result = other if solve.merit(other) >= solve.merit(result) else result
-    if result.score < max(p.wide_search_score, usual):
+    if result.score < max(p.wide_search_threshold, usual):
         other = solve.refined(solve.found(p.wide_window, p.wide_angle, WIDE_STRIDE))
         if solve.merit(other) > solve.merit(result):
             return other
@@ -406,7 +406,7 @@ class _Solve:
         p = self.p
         return correlative_search.window(
             self.submap, self.points, self.prior, half_width, half_angle, self.whitening,
-            p.prior_scale, p.search_prior_weight, stride,
+            p.prior_robust_scale, p.search_prior_weight, stride,
         ).pose  # fmt: skip
 
     def refined(self, start: Array) -> ScanMatchResult:
@@ -414,11 +414,13 @@ class _Solve:
         p, (j, i), out = self.p, self.submap.corner, np.empty(12)
         x, y, theta, weight, iterations, converged = refine(
             self.submap.values, float(j), float(i), 1.0 / self.submap.resolution, self.points,
-            self.constraints, start, self.prior, self.whitening, p.prior_scale, p.sigma,
+            self.constraints, start, self.prior, self.whitening, p.prior_robust_scale, p.sigma,
             p.max_iterations, out,
         )  # fmt: skip
         A, pull = np.empty((3, 3)), np.empty(3)
-        prior_term(np.array([x, y, theta]), self.prior, self.whitening, p.prior_scale, A, pull)
+        prior_term(
+            np.array([x, y, theta]), self.prior, self.whitening, p.prior_robust_scale, A, pull
+        )
         return ScanMatchResult(
             np.array([x, y, wrapped(theta)]), symmetric(out[4:10]) / p.sigma**2,
             float(out[10]) / len(self.points), iterations, converged, weight, pull,
@@ -428,7 +430,7 @@ class _Solve:
         """Score less what the prior has against the pose, as in the search."""
         x, y, turn = result.pose - self.prior
         p, turn = self.p, wrapped(turn)
-        loss = correlative_search.prior_loss(x, y, turn, self.whitening, p.prior_scale)
+        loss = correlative_search.prior_loss(x, y, turn, self.whitening, p.prior_robust_scale)
         return result.score - p.search_prior_weight * loss
 
 
@@ -438,4 +440,4 @@ def warm_up() -> None:
     points = np.array([[1.0, 0.5], [-0.5, 1.0], [0.3, -0.8]])
     submap.insert(points, np.zeros(2))
     linearize(submap, points, np.zeros(3))
-    match(submap, points, np.zeros(3), np.eye(3), params.ScanMatch(wide_search_score=1.0))
+    match(submap, points, np.zeros(3), np.eye(3), params.ScanMatch(wide_search_threshold=1.0))

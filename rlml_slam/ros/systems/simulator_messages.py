@@ -49,7 +49,11 @@ class SimulatedMessages:
         if isinstance(message, Imu):
             gyro = self._p.gyro
             rate = abs(message.yaw_rate)
-            variance = (gyro.c * rate + gyro.d) ** 2 * gyro.interval * gyro.rate
+            variance = (
+                (gyro.turn_noise * rate + gyro.turn_noise_floor) ** 2
+                * gyro.noise_interval
+                * gyro.rate
+            )
             return 'imu', encode.imu(make, message, n.base_frame, variance)
         if isinstance(message, Scan):
             return 'scan', encode.laser_scan(make, message, 1.0 / self._p.laser.rate)
@@ -85,9 +89,15 @@ class SimulatedMessages:
 
     def _twist_cov(self, twist: Array) -> Array:
         w = self._p.wheels
-        scale = w.interval * w.rate
+        scale = w.noise_interval * w.rate
         v, omega = abs(twist[0]), abs(twist[2])
-        sigmas = np.array([w.a * v + w.b, w.lateral * v, w.c * omega + w.d])
+        sigmas = np.array(
+            [
+                w.speed_noise * v + w.speed_noise_floor,
+                w.lateral_noise * v,
+                w.turn_noise * omega + w.turn_noise_floor,
+            ]
+        )
         cov: Array = np.diag(sigmas**2 * scale)
         return cov
 

@@ -43,7 +43,7 @@ def extract(scan: Scan, params: Spikes) -> Extracted:
     if params.test == 'jump':
         spans = jump_spans(ranges, params.threshold, circular)
     else:
-        spans = sum_spans(ranges, params.threshold, params.reach, circular)
+        spans = sum_spans(ranges, params.threshold, params.neighbour_offset, circular)
     rows = []
     for first, last in spans:
         k = np.arange(first, last + 1)
@@ -125,8 +125,8 @@ def _spike(
         return None
     # A cylinder at r + depth is as wide as the beams that hit it, in the mean of many; averaged
     # over its width, its surface lies pi/8 of the diameter before its centre.
-    share = math.pi / 8.0 * step * (steps + 1.0) if params.round else 0.0
-    return r / (1.0 - min(share, 0.5)) + params.offset, float(beams.mean())
+    share = math.pi / 8.0 * step * (steps + 1.0) if params.cylindrical else 0.0
+    return r / (1.0 - min(share, 0.5)) + params.range_offset, float(beams.mean())
 
 
 def _extracted(scan: Scan, params: Spikes, rows: Array) -> Extracted:

@@ -40,11 +40,11 @@ def levels(scan: Scan, p: Detector) -> tuple[Array, Array, Array]:
     if p.threshold == 'bit':
         limit = np.full(len(ranges), np.nextafter(VENDOR_BIT, 0.0))
     elif p.threshold == 'curve':
-        limit = p.a * np.exp(-p.k * ranges) + p.floor
+        limit = p.curve_gain * np.exp(-p.curve_decay * ranges) + p.intensity_floor
     else:
         step, circular = abs(float(scan.angle_increment)), is_circular(scan)
         level = _other_surfaces(ranges, bright, step, circular, _widest(p))
-        limit = np.maximum(p.contrast * level, p.floor)
+        limit = np.maximum(p.contrast * level, p.intensity_floor)
     return ranges, bright, np.where(is_valid, limit, 0.0)
 
 

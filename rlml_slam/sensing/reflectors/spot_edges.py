@@ -73,7 +73,7 @@ def edges_of(
     reach = (
         max(math.ceil(settings.divergence / step), 1) + int(EDGE_SHARE * (last - first + 1)) + 1
     )
-    far = max(reach, min(int(settings.separation / (r * step)), n // 2))
+    far = max(reach, min(int(settings.min_separation / (r * step)), n // 2))
     hidden, fading = 0, False
     for side in (-1, 1):
         outer = first if side < 0 else last
@@ -102,6 +102,6 @@ def edges_of(
             continue
         if outside == np.inf:
             outside = 0.0  # nothing returns from beside it
-        if outside > DARK * inside or inside - outside < settings.edge * (peak - outside):
+        if outside > DARK * inside or inside - outside < settings.edge_contrast * (peak - outside):
             fading = True
     return hidden, fading

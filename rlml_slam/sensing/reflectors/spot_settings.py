@@ -17,14 +17,14 @@ class Settings(NamedTuple):
     flat_width: float
     size_tolerance: float
     divergence: float
-    edge: float
+    edge_contrast: float
     min_beams: float
     min_range: float
     max_range: float
     sigma_range: float
     sigma_bearing: float
     sigma_floor: float
-    separation: float
+    min_separation: float
     extent: float
 
 

@@ -57,7 +57,7 @@ def is_flat(
     x, y = np.empty(4), np.empty(4)
     m = 0
     spacing = r * abs(increment)
-    clear = max(int(settings.separation / spacing - 0.5 * (last - first)) + 1, 2)
+    clear = max(int(settings.min_separation / spacing - 0.5 * (last - first)) + 1, 2)
     for side in (-1, 1):
         outer = first if side < 0 else last
         met = 0

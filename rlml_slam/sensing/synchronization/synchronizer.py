@@ -185,7 +185,7 @@ class Synchronizer:
 
     def _steady(self, stream: str, source: str, stamp: int) -> int:
         """The stamp less its jitter, where the stream is one of a steady sensor."""
-        if not self._node.steady_stamps or stamp <= 0:
+        if not self._node.filter_stamps or stamp <= 0:
             return stamp
         clock = self._clocks.get((stream, source))
         if clock is None:

@@ -77,7 +77,9 @@ class ScanGraph:
         if len(key.points) < self._p.scan_match.min_points:
             return ()
         whole = key.points.astype(np.float64)
-        points = voxel_filter.thin(whole, self._p.scan_match.voxel, self._p.scan_match.max_points)
+        points = voxel_filter.thin(
+            whole, self._p.scan_match.voxel_size, self._p.scan_match.max_points
+        )
         p = self._p.submap
         for m in self._active:
             self._tie(m, key, points)
@@ -96,7 +98,7 @@ class ScanGraph:
             return ()
         p, whole = self._p.scan_match, key.points.astype(np.float64)
         among = [m for m in self._finished if m.anchor.index < before]
-        return self._close(key, voxel_filter.thin(whole, p.voxel, p.max_points), among)
+        return self._close(key, voxel_filter.thin(whole, p.voxel_size, p.max_points), among)
 
     def begin_piece(self) -> None:
         """Complete the submaps that are being built: the robot goes on from elsewhere."""
@@ -314,7 +316,7 @@ class ScanGraph:
             assert key.points is not None
             m = old[int(np.argmin(gaps))]
             points = voxel_filter.thin(
-                key.points.astype(np.float64), p.scan_match.voxel, p.scan_match.max_points
+                key.points.astype(np.float64), p.scan_match.voxel_size, p.scan_match.max_points
             )
             candidate = Candidate(m, se2.between(self._grid(m), here), *CONFIRMED)
             found = self._matcher.match(candidate, key, points).result

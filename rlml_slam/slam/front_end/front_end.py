@@ -281,7 +281,7 @@ class FrontEnd:
             bool(self.tracks.surveyed.any()),
         )
         p = self._p.health
-        if self._map is None and self.doubt.lasts(observation.stamp, p.new_place_time):
+        if self._map is None and self.doubt.lasts(observation.stamp, p.new_session_time):
             self._scans.begin_anew()
             return False
         return contradicted

@@ -62,15 +62,17 @@ class GridLocalizer:
     def fix(self, state: JointState, points: Array) -> Fix:
         """Match end points (n, 2), base frame, and update the state if they fit there."""
         p = self._p.scan_match
-        points = voxel_filter.thin(points, p.voxel, p.max_points)
+        points = voxel_filter.thin(points, p.voxel_size, p.max_points)
         prior, cov = state.pose, state.pose_cov
         strength = np.asarray(np.linalg.inv(cov + self._floor), dtype=np.float64)
         found = match(self._submap, points, prior, strength, p, searched=False)
-        if found.score < p.search_score:
+        if found.score < p.search_threshold:
             searched = match(self._submap, points, prior, strength, p)
             found = searched if searched.score > found.score else found
         if found.score < p.min_score:
-            may_be = possible(self._submap, points[::FEW], found.pose, found.score, p.search_score)
+            may_be = possible(
+                self._submap, points[::FEW], found.pose, found.score, p.search_threshold
+            )
             return Fix(found.score, contradicts=may_be < p.min_score)
         information = scan_information.information(self._submap, points, found.pose, p)
         # the error of the map at this place, which more beams do not lower
@@ -88,5 +90,5 @@ class GridLocalizer:
             return Fix(found.score)
         state.apply(POSE, root, np.eye(len(v)), v)
         self._last = state.pose
-        weakest = self._p.health.degenerate_sigma**-2
+        weakest = self._p.health.degeneracy_sigma**-2
         return Fix(found.score, True, len(v) == 3 and float(values[0]) >= weakest)

@@ -54,11 +54,11 @@ class MapConfirmation:
         if self._since is None or not (self.is_pending or fix.contradicts):
             self._since = stamp
         self._gone += distance
-        if not self.is_pending and self._gone > self._limits.confirm_distance:
+        if not self.is_pending and self._gone > self._limits.confirmation_distance:
             self.reason = f'the saved map has not confirmed the pose for {self._gone:.0f} m'
             if fix.contradicts:
                 self.reason += ', and the scan contradicts it'
-        lasts = stamp - self._since > self._limits.confirm_time * 1e9
+        lasts = stamp - self._since > self._limits.confirmation_time * 1e9
         self.is_lost = bool(self.reason) and lasts
 
     def _starts(self, detections: int, used: int, fix: Fix) -> bool:

@@ -33,7 +33,7 @@ def went_on(velocity: Array, dt: float, noise: MotionNoise) -> Array:
         return np.zeros(2)
     return np.array(
         [
-            dt * math.copysign(max(abs(v) - noise.b, 0.0), v),
-            dt * math.copysign(max(abs(w) - noise.d, 0.0), w),
+            dt * math.copysign(max(abs(v) - noise.speed_noise_floor, 0.0), v),
+            dt * math.copysign(max(abs(w) - noise.turn_noise_floor, 0.0), w),
         ]
     )

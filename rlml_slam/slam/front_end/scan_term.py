@@ -57,11 +57,11 @@ class ScanTerm:
             return first, sweep
         if len(first.points) < p.min_points:
             return first, sweep
-        points = voxel_filter.thin(first.points, p.voxel, p.max_points)
+        points = voxel_filter.thin(first.points, p.voxel_size, p.max_points)
         state = copy.deepcopy(self._state)
         prior, strength = self._prior(sweep)
         found = match(submap, points, prior, strength, p, searched=False)
-        if found.score < max(p.search_score, AS_USUAL * self.doubt.usual):
+        if found.score < max(p.search_threshold, AS_USUAL * self.doubt.usual):
             return first, sweep
         self._fuse(state, found, self._information(submap, points, found), sweep)
         return deskewed(observation, state.velocity, reach)
@@ -86,7 +86,7 @@ class ScanTerm:
         A speed is less sure than odometry: what it leads wrong by must not make a new one, and
         what it holds the match back by is made up for.
         """
-        gate, pull = self._p.scan_match.prior_scale, np.zeros(3)
+        gate, pull = self._p.scan_match.prior_robust_scale, np.zeros(3)
         if not self.has_odometry:
             gate, pull = gate / math.sqrt(3.0), found.pull
         fuse(
@@ -126,7 +126,7 @@ class ScanTerm:
             return Evidence(scan=False)
         if submap is None or len(observation.points) < p.min_points:
             return Evidence(scan=submap is None, beams=len(observation.points))
-        points = voxel_filter.thin(observation.points, p.voxel, p.max_points)
+        points = voxel_filter.thin(observation.points, p.voxel_size, p.max_points)
         prior, strength = self._prior(sweep)
         if self.has_odometry:
             found = match(submap, points, prior, strength, p, searched=False)
@@ -134,7 +134,7 @@ class ScanTerm:
             found = self._matched_freely(submap, points, prior, strength, p.search_window)
         usual = AS_USUAL * self.doubt.usual
         # where nothing but the speed leads to the start, a fit that is worse is of another place
-        least = p.search_score if self.has_odometry else max(p.search_score, usual)
+        least = p.search_threshold if self.has_odometry else max(p.search_threshold, usual)
         if found.score < least or found.prior_weight < 0.5:
             searched = match(submap, points, prior, strength, p)
             found = searched if searched.score > found.score else found
@@ -161,7 +161,7 @@ class ScanTerm:
             misfit=misfit,
             beams=len(points),
             score=found.score,
-            weak=weak_direction(information, heading, self._p.health.degenerate_sigma),
+            weak=weak_direction(information, heading, self._p.health.degeneracy_sigma),
             prior_weight=found.prior_weight,
             iterations=found.iterations,
         )

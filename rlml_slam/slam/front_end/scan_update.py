@@ -90,7 +90,7 @@ def fuse(
     P: Array,
     pose: Array,
     information: Array,
-    prior_scale: float,
+    prior_robust_scale: float,
     pull: Array,
     curvature: Array,
     half: Array,
@@ -98,8 +98,8 @@ def fuse(
 ) -> None:
     """Update ``x`` and ``P`` with a match at ``pose`` (3,) of the submap with ``information``.
 
-    Where the scan disagrees with the prior by more than ``prior_scale`` sigmas, the scan wins:
-    the odometry was wrong by what shows, and the covariance is widened by as much before.
+    Where the scan disagrees with the prior by more than ``prior_robust_scale`` sigmas, the
+    prior covariance is first widened by the disagreement: the odometry was wrong by that much.
 
     The match is the optimum of scan and prior, while the update wants what the scan says alone:
     that is farther by what the prior held back, ``pull`` (3,) of it over the ``curvature`` (3, 3)
@@ -123,7 +123,7 @@ def fuse(
     offset[2] = np.pi - (np.pi - offset[2]) % (2.0 * np.pi)
     v = np.dot(root, offset)
     spread = np.dot(np.dot(root, cov), root.T.copy()) + np.eye(rows)
-    if np.dot(v, np.linalg.solve(spread, v)) > prior_scale**2 * rows:
+    if np.dot(v, np.linalg.solve(spread, v)) > prior_robust_scale**2 * rows:
         seen = np.dot(J[:, :3].T.copy(), np.dot(inverse, v))
         P[:3, :3] += np.outer(seen, seen)
     else:

@@ -56,7 +56,7 @@ class LandmarkPersistence:
     def __init__(self, params: Parameters, graph: Graph, reflectors: ReflectorGraph) -> None:
         p = params.reflector
         self._p = p
-        self._missing = params.relocalization.missing
+        self._missing = params.relocalization.missed_share
         self._empty = min(p.unmapped_density * math.pi * p.min_separation**2, 0.5)
         self._graph = graph
         self._reflectors = reflectors

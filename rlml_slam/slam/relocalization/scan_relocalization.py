@@ -61,8 +61,8 @@ def relocalize(
     if points is None or len(points) < p.scan_match.min_points:
         return Relocation(Verdict.IMPOSSIBLE, 'the newest frame has no usable scan')
     submap = submap_of(grid, p.submap)
-    points = voxel_filter.thin(points, p.scan_match.voxel, p.scan_match.max_points)
-    few = voxel_filter.thin(points, p.scan_match.voxel, SEARCHED)
+    points = voxel_filter.thin(points, p.scan_match.voxel_size, p.scan_match.max_points)
+    few = voxel_filter.thin(points, p.scan_match.voxel_size, SEARCHED)
     middle = 0.5 * (submap.bounds[:2] + submap.bounds[2:])
     # a robot stands inside of what it has seen
     reach = 0.5 * float(np.max(submap.bounds[2:] - submap.bounds[:2]))
@@ -104,7 +104,7 @@ def scan_fits(grid: OccupancyGrid, points: Array, poses: Array, p: Parameters) -
     The second of each is what the score may be where parts of the place are not mapped.
     """
     submap = submap_of(grid, p.submap)
-    points = voxel_filter.thin(points, p.scan_match.voxel, p.scan_match.max_points)
+    points = voxel_filter.thin(points, p.scan_match.voxel_size, p.scan_match.max_points)
     places = [_refined(submap, points, pose, p) for pose in poses]
     best = max(score for _, score in places)
     return np.array([[s, possible(submap, points, pose, s, best)] for pose, s in places])

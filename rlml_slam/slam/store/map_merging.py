@@ -64,7 +64,7 @@ def merge_maps(first: Content, second: Content, params: Parameters) -> Merged:
         raise MapError('the maps have the frames of two different surveys')
     if surveys[0] is None and surveys[1] is not None:
         raise MapError('only the second map has the frame of a survey: name it first')
-    alike = replace(Relocalization(), ghosts=APART)
+    alike = replace(Relocalization(), false_share=APART)
     stars = locate(b.points, b.cov, a.points, a.cov, alike, max_tests=PATIENCE * MAX_TESTS)
     if stars.verdict is not Verdict.UNIQUE:
         raise MapError(f'the reflectors do not tell how the maps lie: {stars.why}')

@@ -164,7 +164,7 @@ def test_maps_that_overlap_by_a_few_reflectors_are_placed_by_these(shared, told)
     seen = se2.transform(se2.inverse(START), second) + 0.01 * rng.standard_normal(second.shape)
     first = np.vstack([west, both])
     cov = [np.tile(1e-4 * np.eye(2), (len(p), 1, 1)) for p in (seen, first)]
-    stars = locate(seen, cov[0], first, cov[1], replace(Relocalization(), ghosts=APART))
+    stars = locate(seen, cov[0], first, cov[1], replace(Relocalization(), false_share=APART))
     assert (stars.verdict is Verdict.UNIQUE) == told, stars.why
     if told:
         np.testing.assert_allclose(stars.candidates[0].pose, START, atol=0.03)

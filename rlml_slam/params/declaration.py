@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a parameter is declared: default, unit, bounds and meaning, checked at construction.
+
+A group is a frozen dataclass of :func:`param` fields. A value outside of its declaration raises
+ParameterError, which names the parameter, the value and the meaning.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from rlml_slam.errors import ParameterError
+
+INF = math.inf
+
+
+def param(
+    default: Any,
+    meaning: str,
+    unit: str = '',
+    low: float = -INF,
+    high: float = INF,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """A dataclass field with its meaning, unit, inclusive bounds and choices."""
+    return field(
+        default=default,
+        metadata={'meaning': meaning, 'unit': unit, 'low': low, 'high': high, 'choices': choices},
+    )
+
+
+@dataclass(frozen=True)
+class Group:
+    """A set of parameters; construction checks every value.
+
+    ``prefix`` starts their ROS names; by default it is the class name in snake case.
+    """
+
+    _prefix: ClassVar[str]
+
+    def __init_subclass__(cls, prefix: str | None = None) -> None:
+        """Store the prefix, so that errors give the ROS name of a parameter."""
+        of_class = re.sub('(?<=[a-z])(?=[A-Z])', '_', cls.__name__).lower() + '.'
+        cls._prefix = of_class if prefix is None else prefix
+
+    def __post_init__(self) -> None:
+        """Check each field against its declared type, bounds and choices."""
+        for f in dataclasses.fields(self):
+            object.__setattr__(self, f.name, _checked(self._prefix, f, getattr(self, f.name)))
+
+
+def _checked(prefix: str, f: dataclasses.Field[Any], value: Any) -> Any:
+    """The value converted to the type of the default; ParameterError if it is not allowed."""
+    m = f.metadata
+
+    def refuse(why: str) -> ParameterError:
+        return ParameterError(f'{prefix}{f.name} = {value!r} {why} ({m["meaning"]})')
+
+    if isinstance(f.default, bool):
+        if not isinstance(value, bool):
+            raise refuse('is not true or false')
+        return value
+    if isinstance(f.default, str):
+        if not isinstance(value, str):
+            raise refuse('is not a string')
+        if m['choices'] and value not in m['choices']:
+            raise refuse(f'is not one of {", ".join(m["choices"])}')
+        return value
+    if isinstance(f.default, tuple):
+        if isinstance(value, str) or not isinstance(value, list | tuple):
+            raise refuse('is not a list')
+        if f.default and isinstance(f.default[0], str):
+            if not all(isinstance(v, str) for v in value):
+                raise refuse('is not a list of strings')
+            return tuple(value)
+        if not all(_is_number(v) and math.isfinite(v) for v in value):
+            raise refuse('is not a list of finite numbers')
+        if len(value) != len(f.default):
+            raise refuse(f'is not a list of {len(f.default)} numbers')
+        if not all(m['low'] <= v <= m['high'] for v in value):
+            raise refuse(f'has a number outside [{m["low"]:g}, {m["high"]:g}]')
+        return tuple(float(v) for v in value)
+    if not _is_number(value) or not math.isfinite(value):
+        raise refuse('is not a finite number')
+    if isinstance(f.default, int):
+        if int(value) != value:
+            raise refuse('is not a whole number')
+        value = int(value)
+    else:
+        value = float(value)
+    if not m['low'] <= value <= m['high']:
+        raise refuse(f'is outside [{m["low"]:g}, {m["high"]:g}]')
+    return value
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """One parameter under its ROS name."""
+
+    name: str
+    group: str
+    field: str
+    default: Any
+    unit: str
+    low: float
+    high: float
+    choices: tuple[str, ...]
+    meaning: str
+
+
+def declarations(of: type[Any]) -> Iterator[Declaration]:
+    """All parameters of the groups of the set ``of``, in order of declaration."""
+    for g in dataclasses.fields(of):
+        prefix = '' if g.name == 'node' else f'{g.name}.'
+        group: Any = type(g.default)
+        for f in dataclasses.fields(group):
+            yield Declaration(
+                prefix + f.name,
+                g.name,
+                f.name,
+                f.default,
+                *(f.metadata[k] for k in ('unit', 'low', 'high', 'choices', 'meaning')),
+            )

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames, topics, files and timing of the nodes; the bag that bag_player plays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from rlml_slam.params.declaration import Group, param
+
+
+@dataclass(frozen=True)
+class Node(Group, prefix=''):
+    """Frames, topics, files and timing of a node; names follow slam_toolbox."""
+
+    map_frame: str = param('map', 'frame of the map')
+    odom_frame: str = param('odom', 'frame of the raw odometry')
+    base_frame: str = param(
+        'base_link', 'frame of the robot; all estimates are poses of this frame'
+    )
+    local_frame: str = param(
+        'rlml_local', 'frame in which the front end estimates: no jumps when the map is corrected'
+    )
+    scan_topic: str = param('scan', 'LaserScan topic')
+    scan_topics: tuple[str, ...] = param(
+        ('',), 'LaserScan topics of several lidars; replaces scan_topic'
+    )
+    odom_topic: str = param('odom', 'Odometry topic')
+    imu_topic: str = param('imu', 'Imu topic')
+    reflectors_topic: str = param('reflectors', 'PointCloud2 topic of reflector detections')
+    reflector_poses_topic: str = param(
+        'reflector_poses', 'PoseArray topic of reflector detections'
+    )
+    use_odom: bool = param(True, 'use odometry; false: constant-velocity model')
+    use_imu: bool = param(True, 'use the yaw rate of the IMU, if there is one')
+    filter_stamps: bool = param(
+        True, 'remove the jitter of the stamps of sensors with a constant rate'
+    )
+    use_scan: bool = param(True, 'match scans against the submap')
+    use_reflectors: bool = param(True, 'use reflector detections')
+    mode: str = param(
+        'mapping', 'build a map, or localize in a saved one', choices=('mapping', 'localization')
+    )
+    map_directory: str = param('maps', 'the only folder that maps are saved to and loaded from')
+    map_file_name: str = param('map', 'name of the saved map in map_directory, without suffix')
+    continue_map: bool = param(
+        False,
+        'mapping: load map_file_name.rlml at start, if it exists, and extend it',
+    )
+    map_start_pose: tuple[float, ...] = param(
+        (0.0, 0.0, 0.0), 'start pose in the saved map', 'm, m, rad'
+    )
+    restore_pose: bool = param(
+        True,
+        'start in a saved map at the last pose of the robot, if scan and reflectors match there',
+    )
+    laser_pose: tuple[float, ...] = param(
+        (0.0, 0.0, 0.0),
+        'pose of the laser in base_frame, if /tf_static does not have it',
+        'm, m, rad',
+    )
+    laser_upside_down: bool = param(
+        False, 'the laser is mounted upside down at laser_pose, if /tf_static does not have it'
+    )
+    transform_publish_period: float = param(
+        0.02,
+        'shortest time between two transforms map to odom on /tf',
+        's',
+        0.001,
+        10.0,
+    )
+    transform_timeout: float = param(
+        0.2, 'longest time that a scan waits for the odometry at its stamp', 's', 0.0, 10.0
+    )
+    map_update_interval: float = param(
+        2.0, 'period at which map, graph and trajectory are published', 's', 0.05, 600.0
+    )
+    tf_buffer_duration: float = param(
+        30.0, 'length of the buffers of odometry and of waiting inputs', 's', 1.0, 600.0
+    )
+
+
+@dataclass(frozen=True)
+class Player(Group, prefix=''):
+    """The bag that bag_player publishes, and at which rate."""
+
+    bag: str = param('', 'rosbag2 folder (sqlite3 or mcap), .mcap, .db3 or ROS 1 .bag')
+    rate: float = param(1.0, 'playback rate: recorded seconds per second', '', 0.01, 1000.0)
+    clock_rate: float = param(100.0, 'rate of /clock in recorded time', 'Hz', 1.0, 1e4)
+    wait_for_subscribers: int = param(
+        0, 'playback starts when a topic has this many subscribers', '', 0, 100
+    )
+    start_delay: float = param(1.0, 'delay before playback starts, for discovery', 's', 0.0, 600.0)
+
+
+@dataclass(frozen=True)
+class PlayerParameters:
+    """Parameters of bag_player."""
+
+    node: Player = Player()
