@@ -162,7 +162,7 @@ import sys
 from numba.core.dispatcher import Dispatcher
 from rlml_slam import warm_up
 from rlml_slam.params import Parameters
-from rlml_slam.slam.system import Slam
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.ros.bags.bag import BagReader, choose_topics
 from rlml_slam.ros.sensor_input import SensorInput
 

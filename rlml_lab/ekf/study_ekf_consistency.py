@@ -26,7 +26,7 @@ from rlml_slam.evaluation.metrics import nees
 from rlml_slam.evaluation.run_record import FrameLog
 from rlml_slam.params import EkfParameters, SimulatorParameters, from_mapping
 from rlml_slam.se2 import Array
-from rlml_slam.slam.system import Slam
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.types import Detections, Odometry
 
 SYSTEMS = ('additive', 'invariant', 'rlml')  # the two errors of the EKF, and RLML

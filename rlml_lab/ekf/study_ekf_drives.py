@@ -21,7 +21,7 @@ from rlml_slam.evaluation.metrics import metrics
 from rlml_slam.evaluation.run_record import FrameLog
 from rlml_slam.params import EkfParameters, SimulatorParameters, from_mapping
 from rlml_slam.simulation.simulation import Message
-from rlml_slam.slam.system import Slam
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.types import Odometry
 
 SYSTEMS = ('rlml', 'reflectors', 'spikes', 'lines', 'dead_reckoning')

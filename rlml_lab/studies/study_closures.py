@@ -30,7 +30,7 @@ from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.loop_closure import State
-from rlml_slam.slam.system import Slam
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.types import EdgeKind, Frame, Odometry
 
 SIGMA = np.array([0.03, 0.03, 0.01])  # of a relation: about what the benchmark's authors state

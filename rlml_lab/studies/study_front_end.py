@@ -39,7 +39,7 @@ from rlml_slam.evaluation.run_record import Truth
 from rlml_slam.params import Parameters, SimulatorParameters, from_mapping, read_yaml
 from rlml_slam.simulation.robot import SECOND
 from rlml_slam.simulation.simulation import START, Message
-from rlml_slam.slam.system import Slam
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.types import Detections, Frame, Level, Scan
 
 WORLDS = ('hall', 'corridor', 'symmetric', 'yard')

@@ -30,7 +30,7 @@ from rlml_slam.simulation.ray_cast import cast
 from rlml_slam.simulation.simulation import GroundTruth, Simulation
 from rlml_slam.simulation.world import Geometry, ReflectorSet, World
 from rlml_slam.simulation.world_file import load_world
-from rlml_slam.slam.system import Slam
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.types import Imu, Odometry, Scan
 
 HOUR = 3600.0

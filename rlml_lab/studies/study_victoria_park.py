@@ -31,7 +31,7 @@ from rlml_slam.evaluation.run_record import FrameLog
 from rlml_slam.maps.atomic_file import write_atomically
 from rlml_slam.params import EkfParameters, from_mapping, read_yaml
 from rlml_slam.se2 import Array
-from rlml_slam.slam.system import Slam
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.types import Detections, Odometry, Reflectors
 
 SYSTEMS = ('dead_reckoning', 'ekf', 'rlml')

@@ -26,7 +26,7 @@ from rlml_slam.params import Parameters, SimulatorParameters, from_mapping, read
 from rlml_slam.report.outputs import write_outputs
 from rlml_slam.simulation.simulation import GroundTruth, Simulation
 from rlml_slam.simulation.world_file import load_world
-from rlml_slam.slam.system import Slam
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.types import Imu, Level, Odometry, Scan
 
 WORLDS = ('hall', 'corridor', 'symmetric', 'yard')

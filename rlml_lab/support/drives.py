@@ -16,7 +16,7 @@ from rlml_slam.ros.sensor_input import Out, Target
 from rlml_slam.sensing.synchronization.synchronizer import Synchronizer
 from rlml_slam.simulation.simulation import GroundTruth, Message, Simulation
 from rlml_slam.simulation.world_file import load_world
-from rlml_slam.slam.system import Slam
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.types import Frame, Imu, Observation, Odometry, Scan
 
 

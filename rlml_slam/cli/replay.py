@@ -32,8 +32,8 @@ from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.closures.closure_table import closure_table
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.store import map_file
-from rlml_slam.slam.system import Slam
 
 # name -> the type of its parameters and its constructor
 SYSTEMS: Mapping[str, tuple[type[Any], Callable[[Any], Slam | EkfSlam]]] = {

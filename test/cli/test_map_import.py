@@ -12,8 +12,8 @@ from rlml_slam.cli.map import map_export
 from rlml_slam.cli.map.map_import import import_map
 from rlml_slam.errors import FileFormatError, MapError
 from rlml_slam.params import Parameters
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.store import map_file
-from rlml_slam.slam.system import Slam
 from rlml_slam.types import Detections, Odometry, Scan
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'rlml'))

@@ -27,8 +27,8 @@ from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import HealthLimits, Node, Parameters
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.front_end.front_end import FrontEnd
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.relocalization.recovery import Recovery
-from rlml_slam.slam.system import Slam
 from rlml_slam.types import Level, Motion, Reflectors
 
 LOOP = drive((0.6, 0.0, 4.0), (0.5, 0.7, 5.0), (0.6, 0.0, 3.0), (0.5, 0.7, 4.0))

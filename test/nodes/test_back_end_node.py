@@ -24,7 +24,7 @@ from rlml_slam.ros.codecs.message_types import rclpy_class
 from rlml_slam.ros.codecs.reflector_clouds import read_reflector_map
 from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.slam.closures.loop_closure import Closure
-from rlml_slam.slam.system import Slam
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.types import EdgeKind
 
 SECOND = 1_000_000_000

@@ -19,8 +19,8 @@ from rlml_slam.ros.codecs.belief_message import read_belief
 from rlml_slam.ros.codecs.decode import pose_estimate
 from rlml_slam.ros.codecs.frame_messages import Record
 from rlml_slam.slam.front_end.front_end import FrontEnd
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.store import map_file
-from rlml_slam.slam.system import Slam
 from rlml_slam.types import Detections, Odometry, Scan
 
 PARAMS = Parameters()

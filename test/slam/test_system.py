@@ -20,8 +20,8 @@ from made_worlds import (
 from rlml_slam import se2
 from rlml_slam.errors import SolverError
 from rlml_slam.params import BackEnd, LoopClosure, Node, Parameters
-from rlml_slam.slam import system as slam_module
-from rlml_slam.slam.system import Slam
+from rlml_slam.slam.offline import slam as slam_module
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.types import Detections, Imu, Level, Odometry, Scan
 
 HALL = TinyWorld(

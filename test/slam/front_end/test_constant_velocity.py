@@ -9,7 +9,7 @@ from rlml_slam import se2
 from rlml_slam.params import Node, Parameters, SimulatorParameters, from_mapping
 from rlml_slam.slam.front_end.constant_velocity import coast, way_cov
 from rlml_slam.slam.front_end.joint_state import BIAS, VELOCITY, JointState
-from rlml_slam.slam.system import Slam
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.types import Level, Motion
 
 SIGMA = np.array([0.8, 0.3, 1.2])

@@ -19,8 +19,8 @@ from rlml_slam.slam.landmarks.landmark import Landmark
 from rlml_slam.slam.landmarks.landmark_persistence import HIDDEN, WHILE, LandmarkPersistence
 from rlml_slam.slam.landmarks.reflector_graph import ReflectorGraph
 from rlml_slam.slam.landmarks.reflector_states import reflector_states, state_table
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.store import map_file
-from rlml_slam.slam.system import Slam
 from rlml_slam.types import Detections, Odometry, Scan
 
 PARAMS = Parameters()

@@ -13,8 +13,8 @@ from rlml_slam.maps.survey import Survey
 from rlml_slam.matching.reflectors.survey_alignment import place
 from rlml_slam.params import Parameters
 from rlml_slam.slam.back_end.back_end import BackEnd
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.store import map_file
-from rlml_slam.slam.system import Slam
 from rlml_slam.types import ANONYMOUS, Detections, Odometry, Reflectors, Scan
 
 PARAMS = Parameters()

@@ -10,8 +10,8 @@ from made_worlds import ROOM, TinyWorld, detections_of, drive, errors, observati
 from rlml_slam import se2
 from rlml_slam.params import Parameters
 from rlml_slam.slam.offline import batch_reassociation
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.store import map_file
-from rlml_slam.slam.system import Slam
 
 ROUND = drive(*[(0.5, 0.4, 15.7)] * 3)  # three times round a circle of 1.25 m
 SINGLE = np.array([[4.0, 0.0], [0.0, 4.5], [-3.5, 1.0], [1.0, -2.5]])

@@ -19,8 +19,8 @@ from rlml_slam.params import Parameters
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.closures.loop_closure import Closure
 from rlml_slam.slam.front_end.front_end import FrontEnd
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.store import map_file
-from rlml_slam.slam.system import Slam
 from rlml_slam.types import EdgeKind, Odometry, Scan
 
 PARAMS = Parameters()

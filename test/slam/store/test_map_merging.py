@@ -15,9 +15,9 @@ from rlml_slam.matching.reflectors.constellation import locate
 from rlml_slam.params import Parameters, Relocalization
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.back_end.trajectory import poses_of
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.store import map_file
 from rlml_slam.slam.store.map_merging import APART, merge_maps
-from rlml_slam.slam.system import Slam
 from rlml_slam.types import Detections, Odometry, Scan, Verdict
 
 PARAMS = Parameters(back_end=replace(Parameters().back_end, submap_size=10))
