@@ -21,7 +21,8 @@ ALLOWED = {
     'nodes': {'core', 'ros', 'nodes'},
     'cli': {'core', 'ros', 'cli'},
 }
-CLI = ('cli', 'datasets', 'evaluation', 'report')
+# readers of data sets, figures and reports stand beside the commands; api is a façade over both
+CLI = ('cli', 'datasets', 'evaluation', 'report', 'api', '__init__')
 # third-party modules of the core: numbers, and YAML for parameters, worlds and maps; llvmlite is
 # what numba itself is made with
 CORE_NEEDS = {'llvmlite', 'numba', 'numpy', 'scipy', 'yaml'}

@@ -6,6 +6,7 @@ The one place that knows of tf2_msgs, which every installed ROS 2 has and the wh
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable
 from typing import Any
 
@@ -47,6 +48,16 @@ class Extrinsics:
         if R[2, 2] < 0.0:
             R = R @ HALF_TURN
         return np.array([t[0], t[1], decode.yaw(R, f'{base} to {frame}')])
+
+    def planar_poses(self, base: str) -> dict[str, Array]:
+        """T_base_frame (3,) of every untilted frame that the tree connects to ``base``."""
+        out: dict[str, Array] = {}
+        for frame in self._parent:
+            with contextlib.suppress(InputError):
+                pose = self.pose(base, frame)
+                if pose is not None:
+                    out[frame] = pose
+        return out
 
     def hangs(self, base: str, frame: str) -> bool:
         """Whether a sensor is known to hang upside down."""

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The Python API, as a notebook uses it."""
+
+from __future__ import annotations
+
+import runpy
+import subprocess
+import sys
+import typing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rlml_slam
+from rlml_slam.datasets.tum import Trajectory, write_tum
+
+ROOT = Path(__file__).resolve().parents[1]
+ROOM = ROOT / 'bags' / 'room'
+
+
+@pytest.fixture(scope='module')
+def bag():
+    return rlml_slam.read_bag(ROOM)
+
+
+@pytest.fixture(scope='module')
+def result(bag):
+    return rlml_slam.replay(bag)
+
+
+def test_import_is_cheap():
+    code = 'import sys, rlml_slam; print(*sys.modules)'
+    done = subprocess.run(
+        [sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert not {'numpy', 'numba', 'rosbags', 'rlml_slam.api'} & set(done.stdout.split())
+
+
+def test_names_are_listed_and_typed():
+    assert len(rlml_slam.__all__) <= 10
+    for name in rlml_slam.__all__:
+        assert name in dir(rlml_slam)
+        value = getattr(rlml_slam, name)
+        assert value.__doc__
+        if not isinstance(value, type):
+            hints = typing.get_type_hints(value)
+            assert 'return' in hints
+            assert len(hints) == value.__code__.co_argcount + value.__code__.co_kwonlyargcount + 1
+    with pytest.raises(AttributeError, match='no attribute'):
+        _ = rlml_slam.optimise
+
+
+def test_notebook_runs(monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    names = runpy.run_path('docs/examples/notebook.py')
+    out = capsys.readouterr().out
+    assert 'bags/kitchen: no such bag' in out
+    assert len(names['result'].poses) == len(names['localized'].poses)
+    assert names['walls'].shape[1] == 2
+
+
+def test_result_has_arrays(bag, result):
+    n = len(result.stamps)
+    assert bag.start <= result.stamps[0] < result.stamps[-1] <= bag.end
+    assert result.poses.shape == (n, 3)
+    assert result.live.poses.shape == (n, 3)
+    assert result.covariances.shape == (n, 3, 3)
+    assert result.map.reflectors.points.shape == (7, 2)
+    assert result.map.grid.cells.dtype == np.int8
+    assert result.problem == ''
+    assert result.metrics['reflectors_spurious'] == 0
+
+
+def test_measurement_by_measurement_gives_the_result_of_a_replay(bag, result):
+    slam = rlml_slam.Slam(bag.parameters, bag.sensor_poses)
+    frames = [frame for measurement in bag for frame in slam.add(measurement)]
+    ended = slam.finish()
+    # the frames of finish() come without an add
+    np.testing.assert_array_equal([f.T_map_base for f in frames], ended.live.poses[: len(frames)])
+    np.testing.assert_array_equal(ended.poses, result.poses)
+    np.testing.assert_array_equal(ended.map.reflectors.points, result.map.reflectors.points)
+    assert slam.map().grid.cells.tobytes() == result.map.grid.cells.tobytes()
+    assert bag.skipped == {}
+
+
+def test_map_is_saved_loaded_and_localized_in(bag, result, tmp_path):
+    whole = rlml_slam.load_map(rlml_slam.save_map(result.map, tmp_path / 'room.rlml'))
+    plain = rlml_slam.load_map(rlml_slam.save_map(result.map, tmp_path / 'folder'))
+    assert plain.graph is None
+    assert len(rlml_slam.load_map(result.save(tmp_path / 'out')).graph.arrays) > 0
+    for map_ in (whole, plain):
+        np.testing.assert_allclose(map_.reflectors.points, result.map.reflectors.points, atol=1e-6)
+        found = rlml_slam.replay(bag, localize_in=map_)
+        assert rlml_slam.evaluate(found)['rmse_m'] < 0.02
+    with pytest.raises(rlml_slam.RlmlError, match='no graph'):
+        rlml_slam.replay(bag, continue_from=plain)
+    with pytest.raises(rlml_slam.RlmlError, match='save it to a folder'):
+        rlml_slam.save_map(plain, tmp_path / 'plain.rlml')
+    with pytest.raises(rlml_slam.RlmlError, match='exclude each other'):
+        rlml_slam.replay(bag, localize_in=whole, continue_from=whole)
+
+
+def test_map_is_continued(bag, result):
+    slam = rlml_slam.Slam(sensor_poses=bag.sensor_poses, continue_from=result.map)
+    for measurement in bag:
+        slam.add(measurement)
+    after, before = slam.finish().map.reflectors, result.map.reflectors
+    assert len(after) == len(before)
+    assert (after.sightings > before.sightings).all()
+
+
+def test_errors_are_those_of_the_files(result, tmp_path):
+    own = rlml_slam.evaluate(result)
+    assert own['rmse_m'] < 0.02
+    truth = Trajectory(result.stamps, result.poses + np.array([1.0, 2.0, 0.0]))
+    write_tum(tmp_path / 'truth.tum', truth)
+    assert rlml_slam.evaluate(result, truth=tmp_path / 'truth.tum')['rmse_m'] < 1e-6
+    shifted = rlml_slam.evaluate(result, truth=truth, align=False)
+    assert shifted['rmse_m'] == pytest.approx(np.hypot(1.0, 2.0))
+    t = result.stamps[[0, -1]] * 1e-9
+    delta = rlml_slam.evaluate(result.trajectory, truth=truth)['matched']
+    assert delta == len(result.poses)
+    (tmp_path / 'relations').write_text(f'{t[0]:.9f} {t[1]:.9f} 0 0 0 0 0 0\n')
+    relative = rlml_slam.evaluate(result, relations=tmp_path / 'relations')
+    assert relative['relations'] == 1
+    with pytest.raises(rlml_slam.RlmlError, match='give truth or relations'):
+        rlml_slam.evaluate(result.trajectory)
+
+
+def test_parameters_are_read_and_checked(tmp_path):
+    path = tmp_path / 'robot.yaml'
+    path.write_text('/**:\n  ros__parameters:\n    laser_pose: [0.2, 0.0, 0.0]\n')
+    found = rlml_slam.read_parameters(path, {'use_odom': False})
+    assert found.node.laser_pose == (0.2, 0.0, 0.0)
+    assert not found.node.use_odom
+    with pytest.raises(rlml_slam.RlmlError, match="unknown parameter 'use_odm'"):
+        rlml_slam.read_parameters(changes={'use_odm': False})
+
+
+def test_other_things_are_no_measurements():
+    with pytest.raises(rlml_slam.RlmlError, match='int is no measurement'):
+        rlml_slam.Slam().add(3)
+    with pytest.raises(rlml_slam.RlmlError, match='no measurement could be used'):
+        rlml_slam.Slam().finish()
