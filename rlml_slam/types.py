@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frozen values between modules. SI units, radians; stamps are integer nanoseconds; no ROS."""
+"""Value types that modules exchange. SI units, radians; stamps are integer nanoseconds; no ROS."""
 
 from __future__ import annotations
 
@@ -52,10 +52,10 @@ class Scan:
 
 @dataclass(frozen=True)
 class Detections:
-    """Reflectors seen at one instant; an empty one means "looked and saw none".
+    """Reflector detections of one instant; n = 0 means that there was no reflector in view.
 
     ``points`` (n, 2) [m] and ``cov`` (n, 2, 2) [m^2] in ``frame_id``; ``ids`` (n,) int64,
-    ANONYMOUS where the reflector does not tell who it is; ``diameters`` (n,) [m], NaN = unknown.
+    ANONYMOUS for a reflector without an id; ``diameters`` (n,) [m], NaN if unknown.
     """
 
     stamp: int
@@ -71,17 +71,17 @@ class Detections:
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion ``delta`` (3,) of base and its covariance ``cov`` (3, 3), both in the start frame.
+    """Relative motion ``delta`` (3,) of base with covariance ``cov`` (3, 3), in the start frame.
 
-    ``known`` is False where no odometry covered the interval: delta is then an extrapolation and
-    cov is wide. Where the turn rate is the IMU's, ``bias_gain`` (3,) is d delta / d bias, delta
-    being that of a bias of zero; ``bias`` [rad/s] is what IMU and wheels together say of it, with
-    variance ``bias_var``, infinite without an IMU.
+    ``known``: odometry covered the whole interval; else ``delta`` is extrapolated and ``cov``
+    wide. If the turn rate is that of the IMU, ``bias_gain`` (3,) is d delta / d bias, and
+    ``delta`` that of a bias of zero; ``bias`` [rad/s] is the bias measured by comparing IMU and
+    wheels, with variance ``bias_var``, infinite without an IMU.
 
-    Wheels tell speed and turn but for a scale: the true ones are larger by a share of them, which
-    ``delta`` is without. Where the turn is the wheels', ``turn_gain`` (3,) is d delta / d share of
-    turn; where it is the IMU's, ``bias`` is that and ``bias_turn`` [rad/s] times that share. The
-    share of speed needs no gain: the way (x, y) is its own derivative.
+    Wheel odometry has slowly varying scale errors of speed and turn, which ``delta`` does not
+    include. If the turn is that of the wheels, ``turn_gain`` (3,) is d delta / d (scale error of
+    turn); if it is that of the IMU, the bias is ``bias`` plus ``bias_turn`` [rad/s] times that
+    error. The scale error of speed needs no gain: its derivative is (x, y) of ``delta``.
     """
 
     delta: Array
@@ -96,14 +96,14 @@ class Motion:
 
 @dataclass(frozen=True)
 class Observation:
-    """All that was measured at one stamp, in the base frame at that stamp.
+    """All measurements of one stamp, in the base frame at that stamp.
 
     ``motion`` is the odometry/IMU motion since the previous observation. ``points`` (n, 2) are
-    the de-skewed end points of the valid beams, ``origin`` (2,) the laser's position; None where
-    there was no scan. ``scan`` is the raw sweep. ``odom_pose`` (3,) is the raw odometry at the
-    stamp, None without odometry. ``T_base_laser`` (3,) and ``sweep`` (3,), the motion of base
-    during the sweep, are those that ``points`` were made with. ``stamp_sigma`` [s] is the error
-    of the stamps, where they jitter.
+    the deskewed end points of the valid beams, ``origin`` (2,) the position of the laser; both
+    None without a scan. ``scan`` is the raw sweep. ``odom_pose`` (3,) is the raw odometry at the
+    stamp, None without odometry. ``points`` were computed with ``T_base_laser`` (3,) and
+    ``sweep`` (3,), the motion of base during the sweep. ``stamp_sigma`` [s] is the error of the
+    stamp, if the stamps have jitter.
     """
 
     stamp: int
@@ -119,12 +119,12 @@ class Observation:
 
 
 class Status(IntEnum):
-    """What became of one reflector detection.
+    """Result of the association of one detection.
 
-    GATED fits no reflector and is too near to one to be another; NEW begins a candidate; GHOST is
-    of no reflector of a map that does not change; AMBIGUOUS fits more than one. DOUBTFUL may be a
-    known one, but the pose is too uncertain to tell: it is kept apart like a new one, until the
-    back end can say which it is.
+    USED: matched, and updated the estimate. GATED: outside the gate of all reflectors, but too
+    close to one to be another. NEW: starts a candidate. GHOST: no reflector of a fixed map.
+    AMBIGUOUS: inside the gate of several. DEFERRED: matches, but the pose is too uncertain to
+    use it; it starts a candidate, which the back end merges later (delayed association).
     """
 
     USED = 0
@@ -132,11 +132,11 @@ class Status(IntEnum):
     NEW = 2
     GHOST = 3
     AMBIGUOUS = 4
-    DOUBTFUL = 5
+    DEFERRED = 5
 
 
 class Level(IntEnum):
-    """Health of the estimate; the values are those of diagnostic_msgs/DiagnosticStatus."""
+    """Level of health; values as in diagnostic_msgs/DiagnosticStatus."""
 
     OK = 0
     DEGRADED = 1
@@ -145,7 +145,7 @@ class Level(IntEnum):
 
 @dataclass(frozen=True)
 class Health:
-    """Level with the reasons that a person can act on."""
+    """Health of the estimate: its level, and the reasons in words."""
 
     level: Level = Level.OK
     reasons: tuple[str, ...] = ()
@@ -153,16 +153,16 @@ class Health:
 
 @dataclass(frozen=True)
 class Frame:
-    """The front end's answer to one observation.
+    """Estimate of the front end for one observation.
 
-    ``T_local_base`` (3,) and ``cov_local`` (3, 3) live in the front end's continuous local frame
-    (never corrected backwards), ``T_map_base`` and ``cov_map`` in the map frame with the newest
-    correction of the back end. Covariances are of (x, y, theta) in the axes of their frame.
-    ``landmarks`` (n,) int64: the front end's key of each detection's reflector, -1 where it has
-    none; ``statuses`` (n,) of Status. ``scan_used``: the scan fitted and moved the estimate.
-    ``doubtful``: what was seen contradicts the map, or nothing has confirmed the start in it yet;
-    nothing of it belongs into the map. ``jumped``: the place was found anew, and no motion leads
-    to it from the frame before.
+    ``T_local_base`` (3,) and ``cov_local`` (3, 3) are in the continuous local frame of the front
+    end, ``T_map_base`` and ``cov_map`` in the map frame with the newest correction of the back
+    end. Covariances are of (x, y, theta) in the axes of their frame. ``landmarks`` (n,) int64 are
+    the keys of the reflectors of the detections, -1 if none; ``statuses`` (n,) of Status.
+    ``scan_used``: the scan was matched and updated the estimate.
+    ``unconfirmed``: scan or reflectors contradict the map, or the start pose in a saved map has
+    not been confirmed yet; such a frame is not mapped. ``jumped``: the robot was relocalized, and
+    no motion connects the frame with the one before.
     """
 
     stamp: int
@@ -176,7 +176,7 @@ class Frame:
     health: Health = field(default_factory=Health)
     scan_score: float = float('nan')
     scan_used: bool = False
-    doubtful: bool = False
+    unconfirmed: bool = False
     jumped: bool = False
     chi2: float = 0.0
     iterations: int = 0
@@ -185,11 +185,12 @@ class Frame:
 
 @dataclass(frozen=True)
 class Belief:
-    """What the back end believes at its newest keyframe, map frame.
+    """Estimate of the back end at its newest keyframe, in the map frame.
 
     ``T_map_base`` (3,) and ``points`` (m, 2) with their joint covariance ``cov``
-    (3 + 2m, 3 + 2m); ``keys`` (m,) are the front end's, ``aliases`` maps keys of reflectors that
-    were merged to the key that goes on, ``gone`` are keys of those that are no longer there.
+    (3 + 2m, 3 + 2m). ``keys`` (m,) are those of the front end, ``aliases`` maps the key of a
+    merged reflector to the key that it has now, ``removed`` are keys of reflectors that no longer
+    exist.
     """
 
     T_map_base: Array
@@ -197,11 +198,11 @@ class Belief:
     points: Array
     cov: Array
     aliases: dict[int, int]
-    gone: tuple[int, ...] = ()
+    removed: tuple[int, ...] = ()
 
 
 class Verdict(Enum):
-    """What a search of the whole map says; NOT_SEARCHED where there is too much to be searched."""
+    """Result of a global search; NOT_SEARCHED if the search would take too long."""
 
     UNIQUE = 'unique'
     AMBIGUOUS = 'ambiguous'
@@ -210,7 +211,7 @@ class Verdict(Enum):
 
 
 class EdgeKind(Enum):
-    """Where a relative-pose edge of the graph comes from."""
+    """Source of a relative-pose edge of the graph."""
 
     ODOMETRY = 'odometry'
     SCAN = 'scan'
@@ -219,10 +220,10 @@ class EdgeKind(Enum):
 
 @dataclass(frozen=True)
 class Reflectors:
-    """A map: ``keys`` (n,) int64, ``points`` (n, 2) and ``cov`` (n, 2, 2) in the map frame.
+    """Reflector map: ``keys`` (n,) int64, ``points`` (n, 2), ``cov`` (n, 2, 2) in the map frame.
 
-    ``ids`` (n,) are the reflectors' own ids (ANONYMOUS where none), ``sightings`` (n,) how often
-    each was seen, ``diameters`` (n,) [m] or NaN.
+    ``ids`` (n,) are the ids of the reflectors (ANONYMOUS without one), ``sightings`` (n,) their
+    numbers of detections, ``diameters`` (n,) [m], NaN if unknown.
     """
 
     keys: NDArray[np.int64]

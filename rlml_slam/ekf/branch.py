@@ -233,7 +233,7 @@ class Branch:
         for i, (slot, status) in enumerate(zip(slots, self.looked.statuses, strict=True)):
             if seen.detections.ids[i] != ANONYMOUS:
                 continue
-            if slot < 0 and status in (Status.NEW, Status.DOUBTFUL):
+            if slot < 0 and status in (Status.NEW, Status.DEFERRED):
                 total += self._log_new
             else:
                 fits = density[i, slot] if slot >= 0 else density[i].max(initial=OUTLIER)
@@ -245,7 +245,7 @@ class Branch:
     def _grow(self, look: Look) -> list[Branch]:
         """Count what is new as candidates; those seen N times enter the state."""
         seen, ids, out = look.seen, look.seen.detections.ids, [self]
-        new = np.flatnonzero(np.isin(self.looked.statuses, (Status.NEW, Status.DOUBTFUL)))
+        new = np.flatnonzero(np.isin(self.looked.statuses, (Status.NEW, Status.DEFERRED)))
         if len(new) and look.mapping:
             times = self.candidates.see(
                 look.stamp, seen.z[new], seen.R[new], ids[new], self._matcher.gate

@@ -181,7 +181,7 @@ class Estimator:
             landmarks=keys,
             statuses=statuses,
             health=health,
-            doubtful=in_map.is_pending,
+            unconfirmed=in_map.is_pending,
             chi2=looked.chi2,
             wall_ms=(time.perf_counter() - began) * 1e3,
         )

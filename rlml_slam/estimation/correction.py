@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The back end's correction of the local frame, and how well a pose is known in the map by it.
+"""Correction of the local frame by the back end, and the covariance of a pose in the map.
 
-A corrected pose is the graph's newest keyframe and the way that the front end went since. So is
-its error: the covariance in the map is that of the keyframe in the graph, carried along, and what
-the front end's has grown by since. That of the front end alone is not: it is of another estimate.
+A corrected pose is the newest keyframe of the graph plus the motion of the front end since then.
+Its covariance in the map is therefore that of the keyframe in the graph, transported along this
+motion, plus the growth of the covariance of the front end since the keyframe. The covariance of
+the front end alone is that of another estimate.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from rlml_slam.se2 import Array
 
 
 @dataclass(frozen=True)
-class Known:
-    """A pose of the local frame: ``pose`` (3,) and ``cov_local`` (3, 3) as the front end had it.
+class ReferencePose:
+    """A keyframe with both covariances: ``pose`` (3,) and ``cov_local`` (3, 3) in the local frame.
 
-    ``cov_map`` (3, 3) is its covariance in the map, by the graph.
+    ``cov_map`` (3, 3) is its marginal covariance in the graph, in the map frame.
     """
 
     pose: Array
@@ -32,25 +33,25 @@ class Known:
 
 @dataclass(frozen=True)
 class Correction:
-    """``T_map_local`` (3,) and, once the graph says so, how well a pose is ``known`` with it."""
+    """Pose ``T_map_local`` (3,), and the ``reference`` keyframe once the graph has one."""
 
     T_map_local: Array
-    known: Known | None = None
+    reference: ReferencePose | None = None
 
     def apply(self, pose: Array, cov: Array) -> tuple[Array, Array]:
         """A pose (3,) of the local frame and its covariance (3, 3) there, both in the map."""
-        k = self.known
-        if k is None:
+        r = self.reference
+        if r is None:
             return se2.compose_belief(self.T_map_local, pose, cov)
-        return _since(self.T_map_local, pose, cov, k.pose, k.cov_local, k.cov_map)
+        return _since(self.T_map_local, pose, cov, r.pose, r.cov_local, r.cov_map)
 
 
 @brief
 def carried(cov: Array, way: Array) -> Array:
-    """Covariance (3, 3) of a pose that lies ``way`` (2,) from one of covariance ``cov`` (3, 3).
+    """Covariance (3, 3) of a pose at offset ``way`` (2,) from one with covariance ``cov`` (3, 3).
 
-    The two are tied rigidly, and all is in the axes of one frame: a heading error moves the far
-    end sideways.
+    J cov J^T with J = [[1, 0, -y], [0, 1, x], [0, 0, 1]]: the two poses are rigidly connected,
+    and all axes are those of one frame.
     """
     J = np.array([[1.0, 0.0, -way[1]], [0.0, 1.0, way[0]], [0.0, 0.0, 1.0]])
     out: Array = np.dot(np.dot(J, cov), J.T.copy())
@@ -69,7 +70,7 @@ def positive(A: Array) -> Array:
 def _since(
     T_map_local: Array, pose: Array, cov: Array, then: Array, cov_then: Array, cov_map: Array
 ) -> tuple[Array, Array]:
-    """The pose and its covariance in the map, where those of the pose ``then`` are known."""
+    """Pose (3,) and covariance (3, 3) in the map, from those of the reference ``then``."""
     way = pose[:2] - then[:2]
     grown = positive(cov - carried(cov_then, way))
     T_map_base, turned = se2.compose_belief(T_map_local, pose, grown)
@@ -79,9 +80,9 @@ def _since(
 
 
 def turned(cov: Array, angle: float) -> Array:
-    """Covariance (3, 3) of a pose, from the axes of a frame that lies at ``angle`` to the others.
+    """Covariance (3, 3) of a pose in the axes of the parent frame: R cov R^T.
 
-    From those of the pose itself, that is its heading, and back by the heading's negative.
+    ``cov`` is in axes that are rotated by ``angle`` [rad] in the parent frame.
     """
     R = np.eye(3)
     R[:2, :2] = se2.rotation(angle)
@@ -90,7 +91,7 @@ def turned(cov: Array, angle: float) -> Array:
 
 
 def either(P: Array, Q: Array) -> Array:
-    """The least covariance (3, 3) that is, along common axes, no smaller than P or than Q."""
+    """Smallest covariance (3, 3) that is, along common axes, not smaller than P or Q."""
     # Q may be singular, that of the pose where all began
     L = np.linalg.cholesky(Q + 1e-14 * np.eye(len(Q)))
     inverse = np.linalg.inv(L)
@@ -101,7 +102,7 @@ def either(P: Array, Q: Array) -> Array:
 
 def warm_up() -> None:
     """Compile the kernels with the signatures that are used at run time."""
-    known = Known(np.zeros(3), np.eye(3), np.eye(3))
+    known = ReferencePose(np.zeros(3), np.eye(3), np.eye(3))
     Correction(np.zeros(3), known).apply(np.zeros(3), np.eye(3))
     positive(np.eye(3))
     measured = np.zeros(2)

@@ -198,7 +198,7 @@ def test_assumed_start_in_a_map_is_as_good_as_a_persons_guess():
     for k in range(1, 20):
         frame = look(estimator, k, pose)
     assert np.abs(se2.between(pose, frame.T_map_base)).max() < 0.02
-    assert (frame.health.level, frame.doubtful) == (Level.OK, False)
+    assert (frame.health.level, frame.unconfirmed) == (Level.OK, False)
     assert len(estimator.reflectors()) == len(LANDMARKS)
 
 
@@ -209,7 +209,7 @@ def test_start_that_nothing_confirms_is_degraded_and_then_lost():
         frame = look(estimator, k, np.zeros(3), seen=False)
         levels.append(frame.health.level)
         assert frame.health.reasons[0] == 'nothing has matched the saved map yet'
-        assert frame.doubtful
+        assert frame.unconfirmed
     assert levels == [Level.DEGRADED] * 51 + [Level.LOST] * 28
 
 

@@ -6,7 +6,7 @@ from differences import central_differences
 from made_worlds import ROOM, drive, observations
 
 from rlml_slam import se2
-from rlml_slam.estimation.correction import Correction, Known, carried, either, positive
+from rlml_slam.estimation.correction import Correction, ReferencePose, carried, either, positive
 from rlml_slam.params import Parameters
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.front_end.front_end import FrontEnd
@@ -33,13 +33,13 @@ def test_without_a_graph_the_covariance_is_the_front_ends_turned():
 
 
 def test_pose_that_the_graph_knows_has_the_graphs_covariance():
-    known = Known(np.array([3.0, 1.0, 0.4]), random_cov(), random_cov())
+    known = ReferencePose(np.array([3.0, 1.0, 0.4]), random_cov(), random_cov())
     _, cov = Correction(np.array([1.0, -2.0, 0.7]), known).apply(known.pose, known.cov_local)
     np.testing.assert_allclose(cov, known.cov_map, atol=1e-12)
 
 
 def test_what_the_front_ends_covariance_has_grown_by_is_added():
-    known = Known(np.zeros(3), random_cov(), random_cov())
+    known = ReferencePose(np.zeros(3), random_cov(), random_cov())
     T = np.array([0.0, 0.0, 0.5 * np.pi])
     grown = np.diag([0.1, 0.2, 0.0])
     _, cov = Correction(T, known).apply(known.pose, known.cov_local + grown)
@@ -47,7 +47,7 @@ def test_what_the_front_ends_covariance_has_grown_by_is_added():
 
 
 def test_what_was_learnt_since_is_not_taken_off():
-    known = Known(np.zeros(3), random_cov(), random_cov())
+    known = ReferencePose(np.zeros(3), random_cov(), random_cov())
     _, cov = Correction(np.zeros(3), known).apply(known.pose, 0.5 * known.cov_local)
     np.testing.assert_allclose(cov, known.cov_map, atol=1e-12)
 

@@ -93,7 +93,7 @@ def test_nothing_seen_in_doubt_is_mapped():
     tracks = front_end.tracks.keys.copy()
     for o in observed[len(LOOP) :]:
         frame = front_end.process(o)
-        assert frame.doubtful
+        assert frame.unconfirmed
         assert back_end.add(frame) is None
     assert len(back_end.keyframes) == keys
     np.testing.assert_array_equal(front_end.submaps.target.values, grid)
@@ -253,7 +253,7 @@ def test_without_the_map_to_localize_in_nothing_is_sure():
     assert {f.health.reasons[0] for f in frames} == {'no map to localize in has come'}
     levels, t = np.array([f.health.level for f in frames]), seconds(frames, ())
     assert (levels == np.where(t > 5.0, Level.LOST, Level.DEGRADED)).all()
-    assert all(f.doubtful for f in frames)
+    assert all(f.unconfirmed for f in frames)
     assert len(slam.reflectors()) == len(slam.front_end.reflectors()) == 0
 
 
@@ -303,7 +303,7 @@ def test_recovery_leaves_a_robot_alone_that_is_not_lost():
     # and does not look before the doubt has lasted
     looks = []
     for f in frames:
-        recovery.look(replace(f, doubtful=True), lambda: looks.append(1) or slam.map(), False)
+        recovery.look(replace(f, unconfirmed=True), lambda: looks.append(1) or slam.map(), False)
         assert bool(looks) == (f.stamp - FIRST >= 6 * STEP)
 
 
@@ -313,8 +313,8 @@ def test_reflectors_that_tell_who_they_are_are_left_to_the_back_end():
     kw = {'scan': False, 'rng': np.random.default_rng(0)}
     front_end = FrontEnd(Parameters())
     for o in observations(ROOM, LOOP[:40], ids=True, **kw):
-        assert not front_end.process(o).doubtful
+        assert not front_end.process(o).unconfirmed
     for ids in (True, False):
         (o,) = observations(moved, [np.array([0.7, 0.9, 2.0])], ids=ids, **kw)
         later = replace(o, stamp=FIRST + (41 - ids) * STEP)
-        assert front_end.process(later).doubtful is not ids
+        assert front_end.process(later).unconfirmed is not ids

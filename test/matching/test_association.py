@@ -281,7 +281,7 @@ def test_match_of_a_lost_pose_is_doubtful_and_of_a_sure_one_used():
     np.testing.assert_array_equal(Associator(Reflector()).associate(seen(sure), sure).status, 0)
     lost = wary(believed(pose_sigma=1.0))
     result = Associator(Reflector()).associate(seen(lost, [1]), lost)
-    assert (result.match[0], result.status[0]) == (-1, Status.DOUBTFUL)
+    assert (result.match[0], result.status[0]) == (-1, Status.DEFERRED)
 
 
 def test_reflector_seen_a_moment_ago_and_one_with_an_id_need_no_proof():

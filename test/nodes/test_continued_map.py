@@ -84,7 +84,7 @@ class Front:
         for msg in self.ear.sent['belief']:
             said = read_belief(msg)
             self.front_end.correct(said.T_map_local)
-            self.front_end.forget(said.belief.gone)
+            self.front_end.forget(said.belief.removed)
             if said.stamp == self.front_end.newest and self.front_end.contradicts(said.belief):
                 self.front_end.adopt(said.belief)
         self.ear.sent['belief'].clear()

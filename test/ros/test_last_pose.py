@@ -13,11 +13,20 @@ HERE = np.array([3.0, -1.0, 0.5])
 COV = 1e-4 * np.eye(3)
 
 
-def frame(pose=HERE, stamp=PERIOD, level=Level.OK, doubtful=False):
+def frame(pose=HERE, stamp=PERIOD, level=Level.OK, unconfirmed=False):
     none = np.zeros(0, dtype=np.int64)
     observation = Observation(stamp, Motion(np.zeros(3), COV))
     return Frame(
-        stamp, observation, pose, COV, pose, COV, none, none, Health(level, ()), doubtful=doubtful
+        stamp,
+        observation,
+        pose,
+        COV,
+        pose,
+        COV,
+        none,
+        none,
+        Health(level, ()),
+        unconfirmed=unconfirmed,
     )
 
 
@@ -33,7 +42,7 @@ def test_pose_that_is_sure_is_written(last):
 
 
 @pytest.mark.parametrize(
-    'unsure', [{'level': Level.DEGRADED}, {'level': Level.LOST}, {'doubtful': True}]
+    'unsure', [{'level': Level.DEGRADED}, {'level': Level.LOST}, {'unconfirmed': True}]
 )
 def test_pose_that_is_not_sure_is_not_written(last, unsure):
     last.remember(frame(**unsure))

@@ -72,7 +72,7 @@ TOPICS = (
           'detections with the reflector that each was taken for'),
     Topic('front_end', OUT, 'reflectors/statuses', MARKERS, RELIABLE,
           'the same in colours: used green, gated red, new blue, ghost grey, ambiguous yellow, '
-          'doubtful violet'),
+          'deferred violet'),
     Topic('front_end', OUT, '/diagnostics', 'diagnostic_msgs/DiagnosticArray', RELIABLE,
           '1 Hz: OK, DEGRADED or LOST with reasons; what became of the inputs'),
     Topic('back_end', IN, 'frames', CLOUD, RELIABLE, 'of the front end'),

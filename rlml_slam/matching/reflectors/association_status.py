@@ -15,7 +15,7 @@ from rlml_slam.types import ANONYMOUS, Status
 
 WIDE = math.log(16.0)  # of the area of an ellipse, squared: each axis twice the detection's
 USED, GATED, NEW = Status.USED.value, Status.GATED.value, Status.NEW.value
-AMBIGUOUS, DOUBTFUL = Status.AMBIGUOUS.value, Status.DOUBTFUL.value
+AMBIGUOUS, DEFERRED = Status.AMBIGUOUS.value, Status.DEFERRED.value
 Indices = NDArray[np.int64]
 
 
@@ -133,7 +133,7 @@ def judge(
                 # the likeliest reflector's place is less certain than the detection itself
                 is_wide = log_det[i, likeliest] > own + WIDE
                 if is_careful and is_wide and not is_recent:
-                    status[i] = DOUBTFUL
+                    status[i] = DEFERRED
         elif is_known:
             status[i] = AMBIGUOUS if fits else GATED
     if is_careful:
@@ -161,10 +161,10 @@ def odds(d2: Array, log_det: Array, j: int, density: float) -> float:
 def keep_apart(seen: Array, ids: Indices, limit: Array, status: Indices) -> None:
     """Of unknown detections that cannot be told apart, only the first begins a reflector."""
     for i in range(len(ids)):
-        if ids[i] != ANONYMOUS or (status[i] != NEW and status[i] != DOUBTFUL):
+        if ids[i] != ANONYMOUS or (status[i] != NEW and status[i] != DEFERRED):
             continue
         for h in range(i):
-            begins = status[h] == NEW or status[h] == DOUBTFUL
+            begins = status[h] == NEW or status[h] == DEFERRED
             gap = math.hypot(seen[h, 0] - seen[i, 0], seen[h, 1] - seen[i, 1])
             if begins and gap < limit[i]:
                 status[i] = AMBIGUOUS

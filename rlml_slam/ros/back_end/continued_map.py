@@ -107,5 +107,5 @@ class Continued:
             belief,
             keys=np.array([name(key) for key in belief.keys.tolist()], dtype=np.int64),
             aliases={key: other for key, other in aliases.items() if key != other},
-            gone=tuple(key - self._first for key in belief.gone if key >= self._first),
+            removed=tuple(key - self._first for key in belief.removed if key >= self._first),
         )

@@ -81,7 +81,7 @@ class LastPose:
 
     def remember(self, frame: Frame) -> None:
         """Write the pose of a frame that is sure of it, if it is another one. Raises MapError."""
-        if frame.health.level is not Level.OK or frame.doubtful:
+        if frame.health.level is not Level.OK or frame.unconfirmed:
             return
         pose = frame.T_map_base
         if self._written is not None:

@@ -38,7 +38,7 @@ def build_belief(make: Make, stamped: StampedBelief, map_frame: str) -> Any:
     b = stamped.belief
     n = 3 + 2 * len(b.keys)
     rows = np.zeros(
-        n + 3 + len(b.aliases) + len(b.gone),
+        n + 3 + len(b.aliases) + len(b.removed),
         dtype=[
             ('session', '<u4'), ('kind', 'u1'), ('key', '<i4'), ('value', '<f8'),
             ('cov', '<f8', (n,)),
@@ -47,11 +47,11 @@ def build_belief(make: Make, stamped: StampedBelief, map_frame: str) -> Any:
     rows['session'] = stamped.session
     rows['kind'] = (
         [POSE] * 3 + [LANDMARK] * (n - 3) + [CORRECTION] * 3
-        + [ALIAS] * len(b.aliases) + [GONE] * len(b.gone)
+        + [ALIAS] * len(b.aliases) + [GONE] * len(b.removed)
     )  # fmt: skip
     rows['key'] = -1
     rows['key'][3:n] = np.repeat(b.keys, 2)
-    rows['key'][n + 3 :] = [*b.aliases, *b.gone]
+    rows['key'][n + 3 :] = [*b.aliases, *b.removed]
     values = [*b.T_map_base, *b.points.ravel(), *stamped.T_map_local, *b.aliases.values()]
     rows['value'][: len(values)] = values
     rows['cov'][:n] = b.cov

@@ -37,13 +37,13 @@ RECORD = np.dtype(
         ('delta', '<f8', (3,)), ('cov', '<f8', (9,)), ('known', 'u1'),
         ('bias_gain', '<f8', (3,)), ('bias', '<f8'), ('bias_var', '<f8'),
         ('level', 'u1'), ('scan_score', '<f8'), ('scan_used', 'u1'), ('chi2', '<f8'),
-        ('doubtful', 'u1'), ('jumped', 'u1'),
+        ('unconfirmed', 'u1'), ('jumped', 'u1'),
         ('iterations', '<i4'), ('wall_ms', '<f8'),
     ]
 )  # fmt: skip
 POINT = np.dtype([('x', '<f4'), ('y', '<f4'), ('z', '<f4')])
 _FRAME = ('T_local_base', 'cov_local', 'T_map_base', 'cov_map')
-_FIGURES = ('scan_score', 'scan_used', 'doubtful', 'jumped', 'chi2', 'iterations', 'wall_ms')
+_FIGURES = ('scan_score', 'scan_used', 'unconfirmed', 'jumped', 'chi2', 'iterations', 'wall_ms')
 _MOTION = ('delta', 'cov', 'known', 'bias_gain', 'bias', 'bias_var')
 
 
@@ -114,7 +114,7 @@ def read_record(msg: Any, topic: str = 'frames') -> Record:
         health=Health(Level(int(r['level']))),
         scan_score=float(r['scan_score']),
         scan_used=bool(r['scan_used']),
-        doubtful=bool(r['doubtful']),
+        unconfirmed=bool(r['unconfirmed']),
         jumped=bool(r['jumped']),
         chi2=float(r['chi2']),
         iterations=int(r['iterations']),

@@ -30,7 +30,7 @@ STATUS_COLORS = {
     Status.NEW: (0.2, 0.5, 1.0, 1.0),
     Status.GHOST: (0.6, 0.6, 0.6, 1.0),
     Status.AMBIGUOUS: (1.0, 0.9, 0.2, 1.0),
-    Status.DOUBTFUL: (0.7, 0.4, 1.0, 1.0),
+    Status.DEFERRED: (0.7, 0.4, 1.0, 1.0),
 }
 EDGE_COLORS = {
     FactorKind.ODOMETRY: (0.6, 0.6, 0.6, 1.0),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rlml_slam import se2
-from rlml_slam.estimation.correction import Known
+from rlml_slam.estimation.correction import ReferencePose
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Parameters
 from rlml_slam.ros.codecs import decode
@@ -83,10 +83,10 @@ class FrontEndControl:
         """
         found = decode.pose_estimate(msg, 'relocation')
         front_end = self.front_end
-        if not front_end.doubt.since:
+        if not front_end.kidnapping.since:
             return
         for stamp, T_local_base, _ in self._recent:
-            if stamp == found.stamp and stamp >= front_end.doubt.since:
+            if stamp == found.stamp and stamp >= front_end.kidnapping.since:
                 moved = se2.between(T_local_base, front_end.state.pose)
                 front_end.relocate(se2.compose(found.pose, moved), found.cov)
                 self._recent.clear()
@@ -124,7 +124,7 @@ class FrontEndControl:
         said = read_belief(msg)
         if said.session == self._answers.session:
             self.front_end.correct(said.T_map_local)
-            self.front_end.forget(said.belief.gone)
+            self.front_end.forget(said.belief.removed)
             fresh = said.stamp == self.front_end.newest
             if fresh and self.front_end.contradicts(said.belief):
                 self.front_end.adopt(said.belief)
@@ -140,6 +140,6 @@ class FrontEndControl:
             if stamp == correction.stamp:
                 # zeros are those of a graph that says nothing, and of no pose
                 told = correction.cov.any()
-                known = Known(T_local_base, cov_local, correction.cov) if told else None
+                known = ReferencePose(T_local_base, cov_local, correction.cov) if told else None
                 self.front_end.correct(correction.pose, known)
                 return

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rlml_slam import se2
 from rlml_slam.errors import MapError
-from rlml_slam.estimation.correction import Correction, Known, either, turned
+from rlml_slam.estimation.correction import Correction, ReferencePose, either, turned
 from rlml_slam.graph.batch.marginals import Marginals
 from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.factors import relative_information
@@ -57,7 +57,7 @@ class Update:
     optimized: bool
     closures: tuple[Closure, ...]
     wall_ms: float
-    known: Known | None = None
+    known: ReferencePose | None = None
     changed: tuple[Closure, ...] = ()
     gone: tuple[int, ...] = ()
     cpu_ms: float = 0.0
@@ -103,7 +103,7 @@ class BackEnd:
         self.survey_frame = self._plant_frame(self._survey)
         self._changed: tuple[Closure, ...] = ()  # since the newest keyframe began
         self.T_map_local = np.zeros(3)
-        self.known: Known | None = None
+        self.known: ReferencePose | None = None
         self._optimized = False
         self._interval: Interval | None = None
         self._since_optimized = 0
@@ -128,7 +128,7 @@ class BackEnd:
         if self._is_key(frame):
             update = self._add_keyframe(frame, began)
         assert self._interval is not None
-        if not frame.doubtful:
+        if not frame.unconfirmed:
             self._interval.add_detections(frame)
         newest = self.keyframes[-1]
         self.path.add(frame.stamp, se2.between(newest.T_local, frame.T_local_base))
@@ -137,7 +137,7 @@ class BackEnd:
     def _is_key(self, frame: Frame) -> bool:
         if not self.keyframes:
             return True
-        if frame.doubtful or frame.jumped:
+        if frame.unconfirmed or frame.jumped:
             return frame.jumped  # of a robot that does not know where it is, nothing is mapped
         p, last = self._p.back_end, self.keyframes[-1]
         step = se2.between(last.T_local, frame.T_local_base)
@@ -304,7 +304,7 @@ class BackEnd:
         self.T_map_local = se2.compose(self.graph.poses[last.index], se2.inverse(last.T_local))
         self.known = self._known()
 
-    def _known(self) -> Known:
+    def _known(self) -> ReferencePose:
         """How well the newest keyframe is known in the map.
 
         Nothing that was seen near it is in the graph yet: that is of the keyframe before, from
@@ -319,9 +319,9 @@ class BackEnd:
             if not self._is_held(before):
                 heading = float(self.T_map_local[2] + before.T_local[2])
                 cov = either(cov, turned(self.path_covariance.cov(before), heading))
-        since = Correction(self.T_map_local, Known(before.T_local, before.cov_local, cov))
+        since = Correction(self.T_map_local, ReferencePose(before.T_local, before.cov_local, cov))
         _, cov_map = since.apply(last.T_local, last.cov_local)
-        return Known(last.T_local, last.cov_local, cov_map)
+        return ReferencePose(last.T_local, last.cov_local, cov_map)
 
     def _is_held(self, key: Keyframe) -> bool:
         """Whether reflectors that were in the map when it was last tied together hold a pose."""

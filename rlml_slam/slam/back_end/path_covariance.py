@@ -20,7 +20,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rlml_slam.estimation.correction import Correction, Known, carried, positive, turned
+from rlml_slam.estimation.correction import Correction, ReferencePose, carried, positive, turned
 from rlml_slam.graph.model.factor_table import FactorTable
 from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.closure_records import ClosureRecords
@@ -38,7 +38,7 @@ class PathCovariance:
 
     def __init__(self) -> None:
         self._stamps: list[int] = []
-        self._known: list[Known] = []  # at these, as if the local frame were the map
+        self._known: list[ReferencePose] = []  # at these, as if the local frame were the map
         self._begun: list[int] = []
         self._num = 0  # closures below this number are in it
 
@@ -95,7 +95,7 @@ class PathCovariance:
         self._known = [self._known[k] for k in kept]
 
     def _enter(self, key: Keyframe, cov: Array) -> None:
-        known = Known(key.T_local, key.cov_local, turned(cov, key.T_local[2]))
+        known = ReferencePose(key.T_local, key.cov_local, turned(cov, key.T_local[2]))
         k = bisect_right(self._stamps, key.stamp)
         self._stamps.insert(k, key.stamp)
         self._known.insert(k, known)

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from rlml_slam import se2
-from rlml_slam.estimation.correction import Correction, Known
+from rlml_slam.estimation.correction import Correction, ReferencePose
 from rlml_slam.estimation.health import Evidence, HealthMonitor
 from rlml_slam.estimation.kidnapping_detection import KidnappingDetection
 from rlml_slam.estimation.landmark_tracks import LandmarkTracks
@@ -126,13 +126,13 @@ class FrontEnd:
         self._correction = Correction(T_map_local)
         self._jumped = True
 
-    def correct(self, T_map_local: Array, known: Known | None = None) -> None:
-        """Take over the back end's newest correction of the local frame.
+    def correct(self, T_map_local: Array, reference: ReferencePose | None = None) -> None:
+        """Apply the newest correction of the local frame by the back end.
 
-        Without what is ``known`` of a pose by the graph, what was known before goes on.
+        Without a ``reference``, that of the last correction stays in use.
         """
-        known = self._correction.known if known is None else known
-        self._correction = Correction(np.array(T_map_local, dtype=np.float64), known)
+        reference = self._correction.reference if reference is None else reference
+        self._correction = Correction(np.array(T_map_local, dtype=np.float64), reference)
 
     def in_map(self, pose: Array, cov: Array) -> tuple[Array, Array]:
         """A pose (3,) of the local frame and its covariance (3, 3), both in the map frame."""
@@ -154,9 +154,9 @@ class FrontEnd:
         return self._scans.submaps
 
     @property
-    def doubt(self) -> KidnappingDetection:
+    def kidnapping(self) -> KidnappingDetection:
         """Whether what is seen contradicts the map."""
-        return self._scans.doubt
+        return self._scans.kidnapping
 
     @property
     def newest(self) -> int | None:
@@ -272,7 +272,7 @@ class FrontEnd:
         d = observation.detections
         # one that tells who it is tells the back end more than that it does not fit here
         told = 0 if d is None else int(((d.ids != ANONYMOUS) & matched.open).sum())
-        contradicted = self.doubt.judge(
+        contradicted = self.kidnapping.judge(
             observation.stamp,
             evidence.misfit,
             evidence.used and evidence.weak is None,
@@ -281,7 +281,7 @@ class FrontEnd:
             bool(self.tracks.surveyed.any()),
         )
         p = self._p.health
-        if self._map is None and self.doubt.lasts(observation.stamp, p.new_session_time):
+        if self._map is None and self.kidnapping.lasts(observation.stamp, p.new_session_time):
             self._scans.begin_anew()
             return False
         return contradicted
@@ -330,7 +330,7 @@ class FrontEnd:
             chi2=float(matched.distance2[used].sum()),
             iterations=evidence.iterations,
             wall_ms=(time.perf_counter() - began) * 1e3,
-            doubtful=doubtful or self.confirmation.is_pending,
+            unconfirmed=doubtful or self.confirmation.is_pending,
             jumped=self._jumped,
         )
 

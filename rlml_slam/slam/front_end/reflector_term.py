@@ -25,7 +25,7 @@ from rlml_slam.types import ANONYMOUS, Belief, Detections, Observation, Reflecto
 NONE = np.zeros(0, dtype=np.int64)
 # as plain numbers: a member of an enumeration takes longer to be looked up than to be compared
 USED, GHOST = int(Status.USED), int(Status.GHOST)
-NEW, DOUBTFUL, AMBIGUOUS = int(Status.NEW), int(Status.DOUBTFUL), int(Status.AMBIGUOUS)
+NEW, DEFERRED, AMBIGUOUS = int(Status.NEW), int(Status.DEFERRED), int(Status.AMBIGUOUS)
 
 
 class Matched:
@@ -155,7 +155,7 @@ class ReflectorTerm:
             # a map that never changes has all reflectors that there are
             matched.status[matched.status == NEW] = GHOST
         elif detections is not None and not doubtful:
-            fresh = (matched.status == NEW) | (matched.status == DOUBTFUL)
+            fresh = (matched.status == NEW) | (matched.status == DEFERRED)
             for k in np.flatnonzero(fresh):
                 matched.index[k] = self._state.add_landmark(
                     detections.points[k], detections.cov[k]

@@ -44,7 +44,7 @@ class ScanTerm:
     def begin_anew(self) -> None:
         """Forget the submaps: the robot is somewhere else."""
         self.submaps = Submaps(self._p.submap)
-        self.doubt = KidnappingDetection(self._p.health)
+        self.kidnapping = KidnappingDetection(self._p.health)
         self._open = Degeneracy()
         self._last_fit = 0
 
@@ -61,7 +61,7 @@ class ScanTerm:
         state = copy.deepcopy(self._state)
         prior, strength = self._prior(sweep)
         found = match(submap, points, prior, strength, p, searched=False)
-        if found.score < max(p.search_threshold, AS_USUAL * self.doubt.usual):
+        if found.score < max(p.search_threshold, AS_USUAL * self.kidnapping.usual):
             return first, sweep
         self._fuse(state, found, self._information(submap, points, found), sweep)
         return deskewed(observation, state.velocity, reach)
@@ -104,7 +104,7 @@ class ScanTerm:
         turn = min(FAR * math.sqrt(spread[2, 2]), p.wide_angle)
         window = (min(max(reach, least), p.wide_window), turn)
         # all that odometry may be wrong by is in this window
-        usual = 0.0 if self.has_odometry else self.doubt.usual
+        usual = 0.0 if self.has_odometry else self.kidnapping.usual
         return match(submap, points, prior, strength, p, window=window, usual=usual)
 
     def _misfits(self, submap: Submap, points: Array, found: ScanMatchResult) -> bool:
@@ -112,10 +112,10 @@ class ScanTerm:
 
         What ends where nothing is known yet contradicts nothing; the rest has to fit as usual.
         """
-        if not self.doubt.misfits(found.score, submap.insertions):
+        if not self.kidnapping.misfits(found.score, submap.insertions):
             return False
         known = submap.knows(se2.transform(found.pose, points))
-        least = AS_USUAL * self.doubt.usual
+        least = AS_USUAL * self.kidnapping.usual
         return known < KNOWN or found.score - (1.0 - known) * UNKNOWN < known * least
 
     def use(self, observation: Observation, sweep: Sweep, agrees: bool) -> Evidence:
@@ -132,7 +132,7 @@ class ScanTerm:
             found = match(submap, points, prior, strength, p, searched=False)
         else:
             found = self._matched_freely(submap, points, prior, strength, p.search_window)
-        usual = AS_USUAL * self.doubt.usual
+        usual = AS_USUAL * self.kidnapping.usual
         # where nothing but the speed leads to the start, a fit that is worse is of another place
         least = p.search_threshold if self.has_odometry else max(p.search_threshold, usual)
         if found.score < least or found.prior_weight < 0.5:
@@ -146,12 +146,13 @@ class ScanTerm:
         if misfit and not agrees and not self.lasts(observation.stamp):
             turn = TURN if self.has_odometry else math.pi
             found = (
-                recover_locally(submap, points, prior, self.doubt.usual, self._p, turn) or found
+                recover_locally(submap, points, prior, self.kidnapping.usual, self._p, turn)
+                or found
             )
             misfit = self._misfits(submap, points, found)
         if found.score < p.min_score or (misfit and not agrees):
             return Evidence(scan=True, misfit=misfit, beams=len(points), score=found.score)
-        self.doubt.learn(found.score)
+        self.kidnapping.learn(found.score)
         information = self._information(submap, points, found)
         self._fuse(self._state, found, information, sweep)
         heading = float(self._state.anchor(0)[2])
@@ -197,4 +198,4 @@ class ScanTerm:
 
     def lasts(self, stamp: int) -> bool:
         """Whether the contradiction lasts for so long that the robot is lost."""
-        return self.doubt.lasts(stamp, self._p.health.lost_time)
+        return self.kidnapping.lasts(stamp, self._p.health.lost_time)

@@ -19,7 +19,7 @@ from rlml_slam.types import Detections, Frame, Motion, Observation
 
 # What the back end reads of a frame, besides the end points and the detections.
 VALUES = attrgetter(
-    'stamp', 'scan_score', 'scan_used', 'doubtful', 'jumped',
+    'stamp', 'scan_score', 'scan_used', 'unconfirmed', 'jumped',
     'observation.motion.known', 'observation.motion.bias', 'observation.motion.bias_var',
 )  # fmt: skip
 ARRAYS = tuple(
@@ -74,7 +74,7 @@ def unpacked(batch: Batch) -> list[Frame]:
     for k, (values, pose, cov, delta, motion_cov, gain) in enumerate(
         zip(batch.values, *batch.arrays, strict=True)
     ):
-        stamp, score, scan_used, doubtful, jumped, known, bias, bias_var = values
+        stamp, score, scan_used, unconfirmed, jumped, known, bias, bias_var = values
         motion = Motion(delta, motion_cov, known, gain, bias, bias_var)
         points = origin = None
         if (length := batch.lengths[k]) >= 0:
@@ -85,7 +85,7 @@ def unpacked(batch: Batch) -> list[Frame]:
             Frame(
                 stamp, Observation(stamp, motion, points, origin, detections), pose, cov,
                 UNSENT[0], UNSENT, landmarks, NONE,
-                scan_score=score, scan_used=scan_used, doubtful=doubtful, jumped=jumped,
+                scan_score=score, scan_used=scan_used, unconfirmed=unconfirmed, jumped=jumped,
             )
         )  # fmt: skip
     return frames

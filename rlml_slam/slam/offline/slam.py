@@ -137,7 +137,7 @@ class Slam(SynchronizedSystem):
                 self._apart.add(frame)
                 late = self.front_end.late(observation.stamp_sigma)
                 self._pending.append((frame, spent, frame.cov_local + late))
-                is_lost = frame.health.level is Level.LOST or frame.doubtful
+                is_lost = frame.health.level is Level.LOST or frame.unconfirmed
                 frames += self._settle(0 if is_lost else AHEAD)
             else:
                 if self._take_over(_add(self.back_end, frame)):

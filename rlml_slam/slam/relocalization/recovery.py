@@ -31,7 +31,7 @@ class Recovery:
     ) -> Relocation | None:
         """The only place of a lost frame in the map, which is ``complete`` or in the making."""
         lost = frame.health.level is Level.LOST
-        if not (lost or frame.doubtful):
+        if not (lost or frame.unconfirmed):
             self._pace, self._map, self.why = None, None, ''
             return None
         if self._pace is None or frame.stamp < self._pace.since:

@@ -43,7 +43,7 @@ def run(observed):
 def test_reflectors_seen_again_after_a_blind_stretch_are_told_in_the_end(seed):
     frames, back_end = run(blinded(np.random.default_rng(seed)))
     again = frames[BLIND.stop]
-    assert (again.statuses == Status.DOUBTFUL).any()
+    assert (again.statuses == Status.DEFERRED).any()
     assert not (again.statuses == Status.USED).any()
     assert not back_end.delayed_association.pending
     mapped = back_end.reflectors().points
@@ -65,14 +65,14 @@ def test_front_end_alone_would_have_carried_the_slip_on():
 def test_nothing_is_open_where_the_pose_stays_known():
     observed = observations(ROOM, LOOP, scan=False, rng=np.random.default_rng(1))
     frames, back_end = run(observed)
-    assert not any((f.statuses == Status.DOUBTFUL).any() for f in frames)
+    assert not any((f.statuses == Status.DEFERRED).any() for f in frames)
     assert len(back_end.reflectors()) == len(ROOM.reflectors)
 
 
 def test_with_ids_nothing_is_ever_asked():
     observed = observations(ROOM, LOOP, scan=False, rng=np.random.default_rng(2), ids=True)
     frames, back_end = run(observed)
-    assert not any((f.statuses == Status.DOUBTFUL).any() for f in frames)
+    assert not any((f.statuses == Status.DEFERRED).any() for f in frames)
     assert back_end.delayed_association.pending == frozenset()
 
 

@@ -19,7 +19,7 @@ def frame(rng, points=None, detections=None):
     return Frame(
         seen.stamp, seen, rng.random(3), rng.random((3, 3)), rng.random(3), rng.random((3, 3)),
         landmarks, NONE, scan_score=rng.random(), scan_used=points is not None,
-        doubtful=bool(rng.random() < 0.5), jumped=bool(rng.random() < 0.5),
+        unconfirmed=bool(rng.random() < 0.5), jumped=bool(rng.random() < 0.5),
     )  # fmt: skip
 
 

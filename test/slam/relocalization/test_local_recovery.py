@@ -31,7 +31,7 @@ def mapped(world):
 @pytest.mark.parametrize('slip', [(0.9, 0.0, 0.0), (-0.6, 0.7, 0.3), (0.0, 0.0, -0.9)])
 def test_scan_is_found_where_it_was_taken(slip):
     front_end, place, points = mapped(ROOM)
-    submap, usual = front_end.submaps.target, front_end.doubt.usual
+    submap, usual = front_end.submaps.target, front_end.kidnapping.usual
     found = recover_locally(submap, points, place + slip, usual, Parameters())
     assert found is not None
     assert found.score >= AS_USUAL * usual
@@ -43,14 +43,14 @@ def test_scan_is_found_where_it_was_taken(slip):
 
 def test_nothing_is_found_beyond_its_reach_in_the_same_room():
     front_end, place, points = mapped(ROOM)
-    submap, usual = front_end.submaps.target, front_end.doubt.usual
+    submap, usual = front_end.submaps.target, front_end.kidnapping.usual
     for far in ([2.2, 0.0, 0.0], [0.0, 0.0, 2.5], [-1.5, -1.5, 1.5]):
         assert recover_locally(submap, points, place + far, usual, Parameters()) is None
 
 
 def test_place_along_a_corridor_is_not_guessed():
     front_end, place, points = mapped(CORRIDOR)
-    submap, usual = front_end.submaps.target, front_end.doubt.usual
+    submap, usual = front_end.submaps.target, front_end.kidnapping.usual
     turned = place + np.array([0.0, 0.0, 0.8])
     assert recover_locally(submap, points, turned, usual, Parameters()) is None
 
@@ -65,7 +65,7 @@ def test_scan_after_a_slip_is_used_and_mapped_without_a_doubt(slip):
     )
     front_end = FrontEnd(Parameters())
     frames = [front_end.process(o) for o in seen]
-    assert not any(f.doubtful for f in frames)
+    assert not any(f.unconfirmed for f in frames)
     assert all(f.scan_used for f in frames[1:])
     assert all(f.health.level is not Level.LOST for f in frames)
     distance, turn = errors(np.array([f.T_local_base for f in frames]), PATH)
@@ -109,7 +109,7 @@ def test_scan_of_what_is_new_by_half_contradicts_nothing(turn):
     seen = [replace(o, points=o.points[a]) for o, a in zip(seen, ahead, strict=True)]
     front_end = FrontEnd(Parameters())
     frames = [front_end.process(o) for o in seen]
-    assert all(f.scan_used and not f.doubtful for f in frames[1:])
+    assert all(f.scan_used and not f.unconfirmed for f in frames[1:])
     distance, off = errors(np.array([f.T_local_base for f in frames]), path)
     assert distance.max() < 0.06
     assert off.max() < 0.03

@@ -34,7 +34,7 @@ def searched(monkeypatch, lasts, pose, period=SECOND // 10):
     for stamp in range(0, lasts * SECOND, period):
         now[0] = stamp
         frame = SimpleNamespace(
-            stamp=SECOND + stamp, health=health, doubtful=False, observation=None,
+            stamp=SECOND + stamp, health=health, unconfirmed=False, observation=None,
             T_map_base=pose(stamp / SECOND),
         )  # fmt: skip
         assert looks.look(frame, lambda: saved, True) is None
