@@ -58,7 +58,7 @@ $(DOCS)/.made: $(wildcard requirements/docs-*.txt)
 config: env  ## write config/*.yaml from the declared parameters
 	@for name in default simulator deformable_slam carrier_simulator ekf_slam \
 	  reflector_detector; do \
-	  $(BIN)/python -m rlml_slam.cli.config_file $$name.yaml >config/.new && \
+	  $(BIN)/python -m rlml_lab.support.config_file $$name.yaml >config/.new && \
 	  mv config/.new config/$$name.yaml; done
 
 tf: env  ## build tf2_msgs, which the wheels lack, into .venv

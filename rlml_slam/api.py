@@ -35,8 +35,8 @@ from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.synchronization.synchronizer import Inputs
+from rlml_slam.slam.offline.slam import Slam as System
 from rlml_slam.slam.store import map_file
-from rlml_slam.slam.system import Slam as System
 from rlml_slam.types import Detections, Frame, Imu, Odometry, Reflectors, Scan
 
 Measurement: TypeAlias = Odometry | Imu | Scan | Detections

@@ -11,8 +11,8 @@ from xml.etree import ElementTree
 
 import pytest
 
+from rlml_lab.support.config_file import FILES, UNREAD, parameter_file
 from rlml_slam import __version__
-from rlml_slam.cli.config_file import FILES, UNREAD, parameter_file
 from rlml_slam.errors import FileFormatError, ParameterError
 from rlml_slam.params import (
     NODES,

@@ -11,22 +11,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_lab.deformable.scoring import chi2_bounds, mean_ci, pose_error2, run_nees, step_nees
-from rlml_lab.deformable.simulated_runs import simulate
-from rlml_slam.deformable.ekf import Estimate, dead_reckoning, run_ekf
-from rlml_slam.deformable.experiment import (
+from rlml_lab.deformable.ekf import Estimate, dead_reckoning, run_ekf
+from rlml_lab.deformable.experiment import (
     FEATURES,
     PATHS,
     ROWS,
     SENSINGS,
     STEPS,
     Measurements,
-    Noise,
     Row,
     draw,
 )
-from rlml_slam.deformable.nls import Smoothed, run_nls
-from rlml_slam.deformable.rts import run_rts
+from rlml_lab.deformable.nls import Smoothed, run_nls
+from rlml_lab.deformable.rts import run_rts
+from rlml_lab.deformable.scoring import chi2_bounds, mean_ci, pose_error2, run_nees, step_nees
+from rlml_lab.deformable.simulated_runs import simulate
+from rlml_slam.deformable.model import Noise
 from rlml_slam.se2 import Array
 
 ESTIMATORS = ('ekf', 'nls', 'rts', 'dead_reckoning')

@@ -15,9 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from rlml_lab.deformable.scoring import ss3
-from rlml_slam.deformable.ekf import dead_reckoning, run_ekf
-from rlml_slam.deformable.experiment import (
+from rlml_lab.deformable.ekf import dead_reckoning, run_ekf
+from rlml_lab.deformable.experiment import (
     FEATURES,
     PATHS,
     SENSORS,
@@ -26,12 +25,13 @@ from rlml_slam.deformable.experiment import (
     TRAVEL,
     TURN,
     Measurements,
-    Noise,
     edges,
     nominal,
 )
-from rlml_slam.deformable.nls import run_nls
-from rlml_slam.deformable.rts import run_rts
+from rlml_lab.deformable.nls import run_nls
+from rlml_lab.deformable.rts import run_rts
+from rlml_lab.deformable.scoring import ss3
+from rlml_slam.deformable.model import Noise
 from rlml_slam.errors import FileFormatError
 from rlml_slam.se2 import Array, rotation
 

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import chi2
 
-from rlml_slam.deformable.ekf import Estimate
-from rlml_slam.deformable.nls import Smoothed
+from rlml_lab.deformable.ekf import Estimate
+from rlml_lab.deformable.nls import Smoothed
 from rlml_slam.se2 import Array
 
 

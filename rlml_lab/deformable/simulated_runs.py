@@ -7,22 +7,19 @@ import math
 
 import numpy as np
 
-from rlml_slam.compiled import kernel
-from rlml_slam.deformable.active import HORIZON, choose_control, offsets
-from rlml_slam.deformable.ekf import initialize, predict, update
-from rlml_slam.deformable.experiment import (
+from rlml_lab.deformable.ekf import initialize, predict, update
+from rlml_lab.deformable.experiment import (
     SENSORS,
     START_FEATURES,
     Draws,
-    Indices,
     Measurements,
-    Noise,
     Row,
-    Sensor,
     edges,
     nominal,
 )
-from rlml_slam.deformable.model import motion, observe_feature, sigma_at
+from rlml_slam.compiled import kernel
+from rlml_slam.deformable.active import HORIZON, choose_control, offsets
+from rlml_slam.deformable.model import Indices, Noise, Sensor, motion, observe_feature, sigma_at
 from rlml_slam.se2 import Array
 
 

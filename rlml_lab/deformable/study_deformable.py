@@ -17,11 +17,11 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
 from rich.table import Table
 
+from rlml_lab.deformable.experiment import CONTROLS, ROWS, Row
 from rlml_lab.deformable.monte_carlo import RowResult, concatenate, run_row, summarize
 from rlml_lab.deformable.replay_note import replay
 from rlml_lab.deformable.study_deformable_tables import tables
 from rlml_lab.support.parallel_jobs import each
-from rlml_slam.deformable.experiment import CONTROLS, ROWS, Row
 from rlml_slam.errors import ParameterError, RlmlError
 
 CHUNK = 50  # seeds per task: small enough for a moving bar, large enough to be worth sending

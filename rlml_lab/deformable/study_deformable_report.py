@@ -17,10 +17,10 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from rlml_lab.deformable.ekf import Estimate
+from rlml_lab.deformable.experiment import FEATURES, ROWS, Row
 from rlml_lab.deformable.monte_carlo import ESTIMATORS, RowResult, Runs, run_estimators
 from rlml_lab.deformable.study_deformable_tables import tables
-from rlml_slam.deformable.ekf import Estimate
-from rlml_slam.deformable.experiment import FEATURES, ROWS, Row
 from rlml_slam.errors import RlmlError
 from rlml_slam.se2 import Array
 

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from rlml_lab.ekf import study_ekf_drives as drives
 from rlml_lab.ekf import study_ekf_speed as speed
 from rlml_lab.ekf.study_ekf_consistency import CASES, HEADER, SYSTEMS, Series, rows
+from rlml_lab.support import page
 from rlml_slam.maps.atomic_file import write_atomically
-from rlml_slam.report import page
 from rlml_slam.report.outputs import make_folder
 from rlml_slam.report.pictures import CLOSURE, LIVE, PATH, TRUTH, png
 

@@ -20,8 +20,8 @@ from rlml_lab.studies.front_end_tables import (
     fault_rows,
     kidnap_text,
 )
+from rlml_lab.support import page
 from rlml_slam.maps.atomic_file import write_atomically
-from rlml_slam.report import page
 from rlml_slam.report.outputs import make_folder
 from rlml_slam.report.pictures import CLOSURE, LIVE, PATH, REFLECTOR, TRUTH, png
 

@@ -15,9 +15,16 @@ import math
 import numpy as np
 
 from rlml_slam.compiled import kernel
-from rlml_slam.deformable.ekf import absorb, advance
-from rlml_slam.deformable.experiment import Indices, Noise, Sensor
-from rlml_slam.deformable.model import in_range_probability, motion, observe_feature, sigma_at
+from rlml_slam.deformable.covariance import absorb, advance
+from rlml_slam.deformable.model import (
+    Indices,
+    Noise,
+    Sensor,
+    in_range_probability,
+    motion,
+    observe_feature,
+    sigma_at,
+)
 from rlml_slam.se2 import Array
 
 HORIZON = 6

@@ -9,10 +9,33 @@ R(theta_i)^T (f - p) at the same step i; the smooth model is f_{i+1} - f_i.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rlml_slam.compiled import kernel
-from rlml_slam.deformable.experiment import Sensor
 from rlml_slam.se2 import Array
+
+Indices = NDArray[np.int64]
+
+
+class Noise(NamedTuple):
+    """Noise that every estimator knows."""
+
+    heading: float = 0.01  # sigma of one step's turn [rad]
+    position: float = 0.02  # sigma of one step's travel, per axis [m]
+    drift2: float = 0.3**2 + 0.2**2  # variance of a feature's own motion per step and axis [m^2]
+    edge: float = 0.2  # sigma of a construction measurement, per axis [m]
+
+
+class Sensor(NamedTuple):
+    """Range limits [m] and noise per axis [m], linear in the distance between them."""
+
+    near: float
+    far: float
+    sigma_near: float
+    sigma_far: float
 
 
 @kernel

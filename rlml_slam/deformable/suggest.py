@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from rlml_slam.deformable.active import HORIZON, choose_control, offsets
-from rlml_slam.deformable.experiment import Noise, Sensor
+from rlml_slam.deformable.model import Noise, Sensor
 from rlml_slam.deformable.window import CarrierVelocity, WindowEstimate
 from rlml_slam.params import DeformableParameters
 from rlml_slam.se2 import Array, log, rotation

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m rlml_slam.cli.config_file``: a parameter file with every default."""
+"""``python -m rlml_lab.support.config_file``: a parameter file with every default."""
 
 from __future__ import annotations
 

@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rlml_lab.deformable.ekf import dead_reckoning
+from rlml_lab.deformable.experiment import Measurements, edges
 from rlml_slam.compiled import kernel
 from rlml_slam.deformable.block_tridiagonal import factorize, marginals, solve
-from rlml_slam.deformable.ekf import dead_reckoning
-from rlml_slam.deformable.experiment import Indices, Measurements, Noise, edges
-from rlml_slam.deformable.model import motion, observe_feature
+from rlml_slam.deformable.model import Indices, Noise, motion, observe_feature
 from rlml_slam.se2 import Array
 
 MAX_ITERATIONS = 50

@@ -13,11 +13,9 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rlml_slam.deformable.model import Indices, Sensor
 from rlml_slam.se2 import Array
-
-Indices = NDArray[np.int64]
 
 STEPS = 20
 FEATURES = 3
@@ -28,24 +26,6 @@ START_FEATURES = np.array([[0.5, 0.5], [0.9, 0.8], [0.3, 0.4]])
 PATHS = ('straight', 'circle')
 SENSINGS = ('fixed', 'changing')
 CONTROLS = ('predetermined', 'active')
-
-
-class Noise(NamedTuple):
-    """Noise that every estimator knows."""
-
-    heading: float = 0.01  # sigma of one step's turn [rad]
-    position: float = 0.02  # sigma of one step's travel, per axis [m]
-    drift2: float = 0.3**2 + 0.2**2  # variance of a feature's own motion per step and axis [m^2]
-    edge: float = 0.2  # sigma of a construction measurement, per axis [m]
-
-
-class Sensor(NamedTuple):
-    """Range limits [m] and noise per axis [m], linear in the distance between them."""
-
-    near: float
-    far: float
-    sigma_near: float
-    sigma_far: float
 
 
 SENSORS = {

@@ -6,13 +6,15 @@ import pytest
 from scipy.optimize import least_squares
 from test_deformable_model import whitened_residuals
 
+from rlml_lab.deformable.ekf import dead_reckoning, run_ekf
+from rlml_lab.deformable.experiment import ROWS, Draws, Measurements, Row, draw, edges
+from rlml_lab.deformable.nls import run_nls
+from rlml_lab.deformable.rts import run_rts
 from rlml_lab.deformable.scoring import chi2_bounds, run_nees, ss3, step_nees
 from rlml_lab.deformable.simulated_runs import simulate
 from rlml_slam.deformable import block_tridiagonal
-from rlml_slam.deformable.ekf import advance, dead_reckoning, run_ekf
-from rlml_slam.deformable.experiment import ROWS, Draws, Measurements, Noise, Row, draw, edges
-from rlml_slam.deformable.nls import run_nls
-from rlml_slam.deformable.rts import run_rts
+from rlml_slam.deformable.covariance import advance
+from rlml_slam.deformable.model import Noise
 from rlml_slam.se2 import rotation
 
 NOISE = Noise()

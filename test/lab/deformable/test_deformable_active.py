@@ -2,11 +2,11 @@
 import numpy as np
 import pytest
 
+from rlml_lab.deformable.ekf import predict, run_ekf, update
+from rlml_lab.deformable.experiment import SENSORS, Draws, Row, draw, edges, nominal
 from rlml_lab.deformable.simulated_runs import simulate
 from rlml_slam.deformable.active import HORIZON, choose_control, offsets, rollout
-from rlml_slam.deformable.ekf import predict, run_ekf, update
-from rlml_slam.deformable.experiment import SENSORS, Draws, Noise, Row, draw, edges, nominal
-from rlml_slam.deformable.model import observe_feature
+from rlml_slam.deformable.model import Noise, observe_feature
 
 NOISE = Noise()
 PAIRS = edges(3)

@@ -5,18 +5,16 @@ import numpy as np
 import pytest
 from differences import central_differences
 
+from rlml_lab.deformable.experiment import SENSORS, Draws, Row, draw, edges, nominal
+from rlml_lab.deformable.nls import linearize
 from rlml_lab.deformable.simulated_runs import simulate
-from rlml_slam.deformable.experiment import (
-    SENSORS,
-    Draws,
+from rlml_slam.deformable.model import (
     Noise,
-    Row,
-    draw,
-    edges,
-    nominal,
+    in_range_probability,
+    motion,
+    observe_feature,
+    sigma_at,
 )
-from rlml_slam.deformable.model import in_range_probability, motion, observe_feature, sigma_at
-from rlml_slam.deformable.nls import linearize
 from rlml_slam.se2 import rotation
 
 HEADINGS = (0.0, 1e-9, 0.7, -2.0, math.pi - 1e-9, 6.5)

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from rlml_lab.deformable.experiment import ROWS
 from rlml_lab.deformable.replay_note import replay
 from rlml_lab.deformable.scoring import chi2_bounds
 from rlml_slam.cli.support.interface import TOPICS
-from rlml_slam.deformable.experiment import ROWS
 from rlml_slam.params import DeformableParameters, declarations
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 TEXT = (ROOT / 'docs' / 'deformable.md').read_text(encoding='utf-8')
 NOTE = ROOT.parent / 'shared' / 'data' / 'deformable-note'
 

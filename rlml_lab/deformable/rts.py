@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from rlml_lab.deformable.ekf import Estimate, predict
+from rlml_lab.deformable.experiment import Measurements
 from rlml_slam.compiled import kernel
 from rlml_slam.deformable.block_tridiagonal import cholesky, solve_lower, solve_upper
-from rlml_slam.deformable.ekf import Estimate, predict
-from rlml_slam.deformable.experiment import Measurements, Noise
-from rlml_slam.deformable.model import motion
+from rlml_slam.deformable.model import Noise, motion
 from rlml_slam.se2 import Array
 
 

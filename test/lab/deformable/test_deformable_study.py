@@ -7,14 +7,14 @@ import pytest
 
 from rlml_lab.deformable import study_deformable
 from rlml_lab.deformable import study_deformable_window as window_study
+from rlml_lab.deformable.experiment import ROWS, Row, draw
 from rlml_lab.deformable.monte_carlo import RowResult, concatenate, run_row, summarize
 from rlml_lab.deformable.replay_note import make_run, read_noise, replay
 from rlml_lab.deformable.simulated_runs import simulate
 from rlml_lab.support.parallel_jobs import each
-from rlml_slam.deformable.experiment import ROWS, Row, draw
 from rlml_slam.errors import FileFormatError, ParameterError
 
-NOTE = Path(__file__).parents[3] / 'shared' / 'data' / 'deformable-note'
+NOTE = Path(__file__).parents[4] / 'shared' / 'data' / 'deformable-note'
 ACTIVE = 60
 needs_note = pytest.mark.skipif(not NOTE.is_dir(), reason=f'{NOTE} is not there')
 
