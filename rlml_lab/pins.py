@@ -128,10 +128,10 @@ def _python(places: Places, *args: str | Path) -> subprocess.CompletedProcess[st
 
 def check_tree(places: Places) -> None:
     """Raises PinError if the interpreter would run other code than that of the tree."""
-    told = _python(places, '-c', f'import {PACKAGE}; print({PACKAGE}.__file__)')
+    printed = _python(places, '-c', f'import {PACKAGE}; print({PACKAGE}.__file__)')
     wanted = places.tree / PACKAGE / '__init__.py'
-    if told.returncode or Path(told.stdout.strip()).resolve() != wanted.resolve():
-        why = told.stdout.strip() or told.stderr.strip()
+    if printed.returncode or Path(printed.stdout.strip()).resolve() != wanted.resolve():
+        why = printed.stdout.strip() or printed.stderr.strip()
         raise PinError(f'{places.python} does not run {wanted}: {why}')
 
 
@@ -280,18 +280,18 @@ def _how(a: Any, b: Any) -> str:
         old, new = (f'{pin["rows"]} rows, {pin["numbers"]} numbers' for pin in (a, b))
         return f': {new}' if old == new else f': {new} instead of {old}'
     if isinstance(a, list):
-        gone, come = _without(a, b), _without(b, a)
-        kinds = ', '.join(' '.join(told.split()[:2]) for told in come)
-        return f': {len(gone)} of {len(a)} arrays changed or gone, {len(come)} others: {kinds}'
+        missing, come = _without(a, b), _without(b, a)
+        kinds = ', '.join(' '.join(line.split()[:2]) for line in come)
+        return f': {len(missing)} of {len(a)} arrays changed or missing, {len(come)} others: {kinds}'
     return ''
 
 
 def _without(a: Sequence[str], b: Iterable[str]) -> list[str]:
     """What is in a and not in b; what is there twice counts twice."""
     out = list(a)
-    for told in b:
-        if told in out:
-            out.remove(told)
+    for line in b:
+        if line in out:
+            out.remove(line)
     return out
 
 
@@ -299,14 +299,14 @@ def row(name: str, pin: Pin) -> str:
     """The figures of a case."""
     f = pin['figures']
 
-    def told(key: str, form: str) -> str:
+    def line(key: str, form: str) -> str:
         value = f.get(key)
         return '-' if value is None else format(value, form)
 
     cells = (
-        told('trans_mean_m', '.4f'), told('trans_std_m', '.4f'), told('rot_mean_deg', '.3f'),
-        told('rot_std_deg', '.3f'), told('ate_m', '.4f'), told('closures', 'd'),
-        told('reflectors', 'd'), told('wall_s', '.1f'), told('process_s', '.1f'),
+        line('trans_mean_m', '.4f'), line('trans_std_m', '.4f'), line('rot_mean_deg', '.3f'),
+        line('rot_std_deg', '.3f'), line('ate_m', '.4f'), line('closures', 'd'),
+        line('reflectors', 'd'), line('wall_s', '.1f'), line('process_s', '.1f'),
     )  # fmt: skip
     said = ''.join(f'  {f[key]}' for key in ('said', 'relations') if key in f)
     return _line(name, cells, f'{pin["exit"]}') + said
