@@ -282,7 +282,8 @@ def _how(a: Any, b: Any) -> str:
     if isinstance(a, list):
         missing, come = _without(a, b), _without(b, a)
         kinds = ', '.join(' '.join(line.split()[:2]) for line in come)
-        return f': {len(missing)} of {len(a)} arrays changed or missing, {len(come)} others: {kinds}'
+        counts = f'{len(missing)} of {len(a)} arrays changed or missing, {len(come)} others'
+        return f': {counts}: {kinds}'
     return ''
 
 
