@@ -37,7 +37,7 @@ COMMANDS: Table = {
             ),
             'relocalization': Command(
                 'rlml_lab.studies.study_relocalization',
-                'whether reflectors alone tell the place, and whether the verdict is right',
+                'whether reflectors alone give the pose, and whether the answer is right',
             ),
             'lego': Command(
                 'rlml_lab.studies.study_lego',

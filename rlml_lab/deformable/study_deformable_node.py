@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``rlml-lab study deformable --node``: two nodes as processes over DDS.
 
-What the node publishes is judged against the truth of the same stamps, one drive after another.
+What the node publishes is compared with the truth of the same stamps, one drive after another.
 Errors of one drive hang together over time, so the bounds of its mean NEES are those of a single
 sample; the mean over R drives has those of R.
 """
@@ -111,9 +111,9 @@ def _tell(progress: Progress, done: int, kind: str, share: float) -> None:
 
 
 def run_node(
-    kind: str, minutes: float, seed: int, ids: bool, rate: float, tell: Callable[[float], None]
+    kind: str, minutes: float, seed: int, ids: bool, rate: float, report: Callable[[float], None]
 ) -> Drive:
-    """One drive in a domain of its own; ``tell`` is told the share that is done.
+    """One drive in a domain of its own; ``report`` is given the share that is done.
 
     Anonymous detections come with ghosts. RlmlError with its last words where a process dies.
     """
@@ -140,7 +140,7 @@ def run_node(
                 executor.spin_once(timeout_sec=0.1)
                 processes.check('deformable_slam')
                 check()
-                tell(min(ear.time() / duration, 1.0))
+                report(min(ear.time() / duration, 1.0))
 
         try:
             processes.start('deformable_slam', node('deformable_slam', noise_parameters()))
@@ -162,7 +162,7 @@ def run_node(
         growth = after.rss_mb - before.rss_mb
         cpu = 1e3 * (after.cpu_s - before.cpu_s) / ((ear.time() - heard) * Carrier().rate)
     asked = math.floor(duration * Carrier().rate) + 1
-    return Drive(asked, *judge(ear), growth, cpu)
+    return Drive(asked, *evaluate(ear), growth, cpu)
 
 
 def noise_parameters() -> dict[str, float]:
@@ -177,7 +177,7 @@ def noise_parameters() -> dict[str, float]:
     }  # fmt: skip
 
 
-def judge(ear: Ear) -> tuple[int, Array, Array, dict[str, str]]:
+def evaluate(ear: Ear) -> tuple[int, Array, Array, dict[str, str]]:
     """Number of answers, normalised errors of those whose truth was heard, last diagnostics.
 
     An anonymous feature is compared with the nearest true one as long as it is in the sensor's

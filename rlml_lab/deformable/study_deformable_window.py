@@ -2,7 +2,7 @@
 """``rlml-lab study deformable --window``: the sliding window of deformable_slam over a long drive.
 
 Independent runs beside a simulated train and a simulated conveyor, through all that the node does
-but DDS. The normalised error (NEES) is judged over the runs, whose errors are independent: its
+but DDS. The normalised error (NEES) is averaged over the runs, whose errors are independent: its
 mean over time varies less than one sample does, so one sample's bounds hold for it.
 """
 
@@ -94,7 +94,7 @@ def _score(
 
 
 def resident() -> int:
-    """Memory of this process in RAM [bytes], 0 where the system does not tell."""
+    """Memory of this process in RAM [bytes], 0 where the system does not say."""
     try:
         status = Path('/proc/self/status').read_text(encoding='ascii')
     except OSError:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How right an association was, told by where each detection really was.
+"""Correctness of an association, by the true position of each detection.
 
 With the true pose, every detection has a true place in the map. The place of a landmark is the
 median of those of its detections; a detection that was used for a landmark elsewhere was used
-wrongly. This needs no identities, so it judges reflectors, spikes and lines alike.
+wrongly. This needs no identities, so it covers reflectors, spikes and lines alike.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def association_figures(
 
     Precision: share of the used detections that were of the landmark they were used for. Recall:
     share of the detections of landmarks known by then that were used, and rightly. A landmark's
-    error is its distance from the place of its detections. None where there is nothing to judge.
+    error is its distance from the place of its detections. None where there is nothing to compare.
     """
     out: dict[str, Any] = dict.fromkeys(('precision', 'recall', 'landmark_rmse_m'))
     if not log.stamps:

@@ -2,7 +2,7 @@
 """``rlml-lab study ekf``: RLML, the EKF with each extractor and dead reckoning on the same drives.
 
 Three questions: how good is each system on what it will be given (study_ekf_drives), whether its
-covariance tells the truth where association is no matter (study_ekf_consistency), and what its
+covariance is consistent where association is no matter (study_ekf_consistency), and what its
 parts cost (study_ekf_speed).
 """
 
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     ]
     rows: dict[str, dict[str, dict[int, Any]]] = {w: {} for w in args.world}
     with Progress('drives', len(tasks), args.json) as progress:
-        for k, (task, figures) in enumerate(each(drives.judge_drive, tasks, args.jobs), 1):
+        for k, (task, figures) in enumerate(each(drives.evaluate_drive, tasks, args.jobs), 1):
             for system, f in figures.items():
                 rows[task[0]].setdefault(system, {})[task[1]] = f
             progress.update(k, f'{task[0]}, seed {task[1]}')

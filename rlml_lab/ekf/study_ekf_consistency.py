@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether the published covariance is true: pose NEES over the first loop, associations known.
 
-Reflectors tell who they are, there are no ghosts, and the filters know the wheels' noise exactly;
+Reflectors have ids, there are no ghosts, and the filters know the wheels' noise exactly;
 what is left is the estimator. The NEES of N drives at one instant is chi^2 of 3 N degrees of
 freedom over N if the covariance is right.
 """
@@ -109,18 +109,18 @@ def rows(summary: Mapping[str, Any]) -> list[list[str]]:
 def run_all(seeds: int, jobs: int, quiet: bool) -> dict[str, Series]:
     """All cases over all seeds, by '<case>, <system>'."""
     tasks = [(case, seed) for case in CASES for seed in range(seeds)]
-    found: dict[str, dict[int, Judged]] = {}
+    found: dict[str, dict[int, CaseErrors]] = {}
     with Progress('known associations', len(tasks), quiet) as progress:
-        for k, ((case, seed), by_system) in enumerate(each(judge_case, tasks, jobs), 1):
-            for system, judged in by_system.items():
-                found.setdefault(f'{case}, {system}', {})[seed] = judged
+        for k, ((case, seed), by_system) in enumerate(each(evaluate_case, tasks, jobs), 1):
+            for system, errors in by_system.items():
+                found.setdefault(f'{case}, {system}', {})[seed] = errors
             progress.update(k, f'{case}, seed {seed}')
     order = [f'{case}, {system}' for case in CASES for system in SYSTEMS]
     return {name: series([found[name][s] for s in sorted(found[name])]) for name in order}
 
 
 @dataclass(frozen=True)
-class Judged:
+class CaseErrors:
     """One run at its stamps: NEES, heading error [rad] and position error [m], each (n,)."""
 
     stamps: NDArray[np.int64]
@@ -129,7 +129,7 @@ class Judged:
     position: Array
 
 
-def series(runs: Sequence[Judged]) -> Series:
+def series(runs: Sequence[CaseErrors]) -> Series:
     """The runs at the instants that all of them know."""
     common = runs[0].stamps[np.isfinite(runs[0].nees)]
     for r in runs[1:]:
@@ -177,7 +177,7 @@ def knows(p: SimulatorParameters) -> EkfParameters:
     return params
 
 
-def judge_case(name: str, seed: int) -> dict[str, Judged]:
+def evaluate_case(name: str, seed: int) -> dict[str, CaseErrors]:
     """All systems on the first loop of one drive."""
     p = simulator(CASES[name])
     messages, truth = simulate(p, seed)
@@ -194,7 +194,7 @@ def judge_case(name: str, seed: int) -> dict[str, Judged]:
         for frames in process(slam, observations):
             log.add(frames)
         errors = trajectory_errors(log.trajectory(), truth.trajectory)
-        out[system] = Judged(
+        out[system] = CaseErrors(
             errors.stamps,
             nees(errors, np.array(log.covs)),
             errors.errors[:, 2],

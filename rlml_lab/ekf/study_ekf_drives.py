@@ -41,7 +41,7 @@ COLUMNS: dict[str, tuple[str, float, int]] = {
 HEADER = ['world, system', *(c[0] for c in COLUMNS.values())]
 
 
-def judge_drive(
+def evaluate_drive(
     world: str, seed: int, values: Mapping[str, Any], systems: Sequence[str], duration: float
 ) -> dict[str, dict[str, Any]]:
     """Figures of each system on one simulated drive."""

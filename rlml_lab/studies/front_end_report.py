@@ -36,7 +36,7 @@ def write_report(folder: Path, summary: Mapping[str, Any]) -> None:
         page.heading('Drives'),
         page.paragraph(
             'Default parameters; poses as published live; mean over the seeds (worst seed). '
-            'Faults: wheel slip in 5 % of the time, worn wheels that tell 4 % less speed and 5 % '
+            'Faults: wheel slip in 5 % of the time, worn wheels that give 4 % less speed and 5 % '
             'more turn, as many ghosts as detections, 40 % of the detections missed, 0.5 s in '
             'every 10 s without scan and reflectors, stamps that jitter by 20 ms (1 sigma).'
         ),

@@ -56,7 +56,7 @@ class ScaleFit:
 
 
 def ranges_of(data: Lego, scanner: Array, params: Spikes) -> Ranges:
-    """Ranges to the cylinders; the estimated ``scanner`` poses (n, 3) tell which is which."""
+    """Ranges to the cylinders; the estimated ``scanner`` poses (n, 3) associate them."""
     stamps = np.array([scan.stamp for scan in data.scans])
     T = se2.align(scanner[:, :2], at(data.track, stamps * 1e-9))
     T_arena_laser = se2.compose(se2.compose(T, scanner), np.array([0.0, 0.0, T_BASE_LASER[2]]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How late the LEGO robot's streams are stamped, each told without the error that is reported.
+"""How late the LEGO robot's streams are stamped, each without the error that is reported.
 
 The scanner against the wheels by turns: those between two scans, from what both see of the same
 cylinders alone, are those of the wheels that much earlier. The camera against the wheels by ways:

@@ -35,7 +35,7 @@ from rlml_slam.types import EdgeKind, Frame, Odometry
 
 SIGMA = np.array([0.03, 0.03, 0.01])  # of a relation: about what the benchmark's authors state
 WRONG, WRONG_TURN = 1.0, np.radians(15.0)  # [m], [rad]: another place, not a poor match
-AWAY = 2_000_000_000  # [ns] a keyframe farther from any relation is not judged
+AWAY = 2_000_000_000  # [ns] a keyframe farther from any relation is not checked
 REACH = 5.0  # [m] from a submap's anchor, in which a closure should be found
 
 
@@ -71,11 +71,11 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Drive the system, judge its closures, print."""
+    """Drive the system, check its closures, print."""
     relations = read_relations(args.relations)
     slam = drive(args.bag, args.scale, args.turn, args.json)
     stamps, poses = slam.trajectory()
-    figures = judge(slam, relations)
+    figures = evaluate(slam, relations)
     errors = relation_errors(Trajectory(stamps, poses), relations).summary()
     figures |= {k: errors[k] for k in ('trans_mean_m', 'trans_max_m', 'rot_mean_deg')}
     if args.json:
@@ -119,7 +119,7 @@ def reference(relations: Relations) -> tuple[NDArray[np.int64], Array, NDArray[n
     return stamps, graph.poses.copy(), part.astype(np.int64)
 
 
-def judge(slam: Slam, relations: Relations) -> dict[str, float]:
+def evaluate(slam: Slam, relations: Relations) -> dict[str, float]:
     """How many closures were right, wrong, disabled, and how many of those within reach found."""
     known, poses, part = reference(relations)
     stamps, path = slam.trajectory()
@@ -132,7 +132,7 @@ def judge(slam: Slam, relations: Relations) -> dict[str, float]:
     tried = [c for c in back_end.scans.closures
              if is_known[c.i] and is_known[c.j] and part[at[c.i]] == part[at[c.j]]]  # fmt: skip
     out = dict.fromkeys(
-        ('accepted', 'judged', 'right', 'right_disabled', 'wrong', 'wrong_disabled'), 0.0
+        ('accepted', 'checked', 'right', 'right_disabled', 'wrong', 'wrong_disabled'), 0.0
     )
     out['accepted'] = float(sum(c.accepted for c in back_end.scans.closures))
     reachable = found = 0
@@ -143,7 +143,7 @@ def judge(slam: Slam, relations: Relations) -> dict[str, float]:
             continue
         e = se2.between(back_end.graph.edges.measured[c.edge], T)
         verdict = 'wrong' if np.hypot(e[0], e[1]) > WRONG or abs(e[2]) > WRONG_TURN else 'right'
-        out['judged'] += 1.0
+        out['checked'] += 1.0
         out[verdict] += 1.0
         out[f'{verdict}_disabled'] += c.fate.state is not State.ACTIVE
         found += verdict == 'right' and bool(np.hypot(T[0], T[1]) < REACH)

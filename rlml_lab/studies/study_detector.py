@@ -81,24 +81,24 @@ def run(args: argparse.Namespace) -> int:
         done = 0
         for diameter in DIAMETERS:
             for distance in DISTANCES:
-                figures = judge_cylinders(p, laser, diameter, distance, args.scans, args.seed)
+                figures = evaluate_cylinders(p, laser, diameter, distance, args.scans, args.seed)
                 summary['cylinders'].append(figures)
                 done += 1
                 progress.update(done, f'{1e3 * diameter:.0f} mm at {distance:.0f} m')
-        summary['rooms'] = judge_rooms(p, laser, args.rooms, 0, args.seed)
+        summary['rooms'] = evaluate_rooms(p, laser, args.rooms, 0, args.seed)
         progress.update(done + 1, 'rooms')
-        summary['vests'] = judge_rooms(p, laser, args.rooms, 1, args.seed)
+        summary['vests'] = evaluate_rooms(p, laser, args.rooms, 1, args.seed)
         progress.update(done + 2, 'vests')
-        summary['worlds'] = judge_worlds(p, args.drive, args.seed)
+        summary['worlds'] = evaluate_worlds(p, args.drive, args.seed)
         progress.update(done + 3, 'worlds')
-        summary['hall'] = judge_hall(p, args.drive, args.seed)
+        summary['hall'] = evaluate_hall(p, args.drive, args.seed)
         progress.update(done + 4, 'hall')
     summary['ms_per_1440_beams'] = cost(p, laser, args.seed)
     print(json.dumps(summary) if args.json else text(summary))
     return 0
 
 
-def judge_cylinders(
+def evaluate_cylinders(
     p: Detector, laser: Laser, diameter: float, distance: float, scans: int, seed: int
 ) -> dict[str, Any]:
     """Errors of centres along and across the beam [mm], NEES and share detected."""
@@ -144,7 +144,7 @@ def matched(points: Array, truth: Array) -> NDArray[np.int64]:
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
-def judge_rooms(p: Detector, laser: Laser, rooms: int, vests: int, seed: int) -> dict[str, Any]:
+def evaluate_rooms(p: Detector, laser: Laser, rooms: int, vests: int, seed: int) -> dict[str, Any]:
     """False detections in rooms without reflectors, and what bright spots were rejected for."""
     rng = np.random.default_rng([seed, 7, vests])
     still = StillLaser(laser, seed)
@@ -162,7 +162,7 @@ def judge_rooms(p: Detector, laser: Laser, rooms: int, vests: int, seed: int) ->
     }
 
 
-def judge_worlds(p: Detector, duration: float, seed: int) -> dict[str, Any]:
+def evaluate_worlds(p: Detector, duration: float, seed: int) -> dict[str, Any]:
     """False detections in drives through the package's worlds, their reflectors taken away."""
     scans = false = 0
     for name in WORLDS:
@@ -176,7 +176,7 @@ def judge_worlds(p: Detector, duration: float, seed: int) -> dict[str, Any]:
     return {'scans': scans, 'false': false, 'false_per_1000_scans': 1e3 * false / scans}
 
 
-def judge_hall(p: Detector, duration: float, seed: int) -> dict[str, Any]:
+def evaluate_hall(p: Detector, duration: float, seed: int) -> dict[str, Any]:
     """A drive through the hall: detections against the reflectors that can be seen."""
     p = replace(p, flat_width=p.flat_width or HALL_FLAT)
     exact = {

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """``study front-end``: what each sensor is worth, what faults cost, whether sigma is true.
 
-Poses are judged as published live. Every system of a drive is given the same messages; a fault
-leaves all other noise of its seed as it was. Carried robots are judged by how long they take to
+Poses are evaluated as published live. Every system of a drive is given the same messages; a fault
+leaves all other noise of its seed as it was. Carried robots are evaluated by how long they take to
 know that they are lost, and where they are.
 """
 
@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     ]
     rows: dict[str, dict[int, dict[str, float]]] = {}
     with Progress('drives', len(tasks), args.json) as progress:
-        for k, (task, figures) in enumerate(each(judge_drive, tasks, args.jobs), 1):
+        for k, (task, figures) in enumerate(each(evaluate_drive, tasks, args.jobs), 1):
             for sensors, f in figures.items():
                 rows.setdefault(f'{task[0]}, {task[1] or sensors}', {})[task[2]] = f
             progress.update(k, f'{task[0]}, {task[1] or "clean"}, seed {task[2]}')
@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
     with Progress('kidnaps', kidnaps, args.json) as progress:
         carried = []
         for k, (_, f) in enumerate(
-            each(judge_kidnap, [(seed, values) for seed in range(kidnaps)], args.jobs), 1
+            each(evaluate_kidnap, [(seed, values) for seed in range(kidnaps)], args.jobs), 1
         ):
             carried.append(f)
             progress.update(k, f'found after {f["found_s"]} s')
@@ -144,7 +144,7 @@ def system(p: SimulatorParameters, values: Mapping[str, Any], sensors: str = 'bo
     return slam
 
 
-def judge_drive(
+def evaluate_drive(
     world: str, fault: str, seed: int, sensors: Sequence[str], values: Mapping[str, Any]
 ) -> dict[str, dict[str, float]]:
     """Figures of each system on one drive."""
@@ -176,7 +176,7 @@ def figures_of(frames: Sequence[Frame], truth: Truth) -> dict[str, float]:
     }
 
 
-def judge_kidnap(seed: int, values: Mapping[str, Any]) -> dict[str, Any]:
+def evaluate_kidnap(seed: int, values: Mapping[str, Any]) -> dict[str, Any]:
     """A robot that is carried to where it has been: seconds until it knows, and errors."""
     rng = np.random.default_rng(seed)
     at = float(rng.uniform(*KIDNAPPED))

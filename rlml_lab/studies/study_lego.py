@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the system, print the figures, draw the picture."""
     data = read_lego(args.folder)
     result = drive(data, read_yaml(args.config, EkfParameters) if args.config else {})
-    figures = judge(data, result) | judge_scale(data, result)
+    figures = evaluate(data, result) | evaluate_scale(data, result)
     if args.out is not None:
         write_atomically(args.out, picture(data, result))
     if args.json:
@@ -124,8 +124,8 @@ def drive(data: Lego, values: dict[str, Any] | None = None) -> Result:
     stamps, poses = slam.trajectory()
     odometry = np.array([o.pose for o in data.odometry])
     odometry[:, 2] = np.unwrap(odometry[:, 2])
-    told = [o.stamp for o in data.odometry]
-    wheels = np.stack([np.interp(stamps, told, odometry[:, i]) for i in range(3)], -1)
+    odometry_stamps = [o.stamp for o in data.odometry]
+    wheels = np.stack([np.interp(stamps, odometry_stamps, odometry[:, i]) for i in range(3)], -1)
     return Result(se2.compose(poses, SCANNER), se2.compose(wheels, SCANNER), slam.reflectors())
 
 
@@ -134,10 +134,10 @@ def track_places(data: Lego) -> Array:
     return at(data.track, np.array([scan.stamp for scan in data.scans]) * 1e-9)
 
 
-def judge(data: Lego, result: Result) -> dict[str, Any]:
+def evaluate(data: Lego, result: Result) -> dict[str, Any]:
     """Errors [m]; the track and the landmarks are each aligned, rigidly and with a scale.
 
-    The scales tell how much larger the camera's and the arena's metre are than the laser's.
+    The scales say how much larger the camera's and the arena's metre are than the laser's.
     ``position_rmse_as_camera_m`` is what remains where the camera has a metre of its own and
     follows a point of its own on the robot, ``camera_point_m`` ahead of the scanner and to its
     left.
@@ -166,12 +166,12 @@ def judge(data: Lego, result: Result) -> dict[str, Any]:
     }
 
 
-def judge_scale(data: Lego, result: Result) -> dict[str, Any]:
+def evaluate_scale(data: Lego, result: Result) -> dict[str, Any]:
     """How large the camera's track is by the ranges to the true cylinders, and how late it is.
 
-    The filter tells which range is of which cylinder, and no more. About ``track_grows_about_m``
+    The filter is used only to associate ranges with cylinders. About ``track_grows_about_m``
     the camera shows the robot's ways too large. ``position_rmse_track_scaled_m`` is what the EKF
-    has to a track of the size that the ranges tell. The lags are those of the streams' stamps.
+    has to a track of the size that the ranges give. The lags are those of the streams' stamps.
     """
     track, ranges = data.track, cylinder_ranges(data, result)
     free = fit_scale(track, data.landmarks, ranges)
@@ -258,7 +258,7 @@ def picture(data: Lego, result: Result) -> bytes:
     """Truth, dead reckoning, EKF and its landmarks with 95 % ellipses, in the arena.
 
     Each as far as a rigid alignment brings it; on the left to the camera's track as it is, on the
-    right to the track of the size that the ranges to the true cylinders tell.
+    right to the track of the size that the ranges to the true cylinders give.
     """
     # matplotlib takes half a second to import, which other commands need not wait for
     from matplotlib.figure import Figure

@@ -2,8 +2,8 @@
 """``rlml-lab study lifelong``: hours in one hall, in which reflectors are moved.
 
 The robot drives its loop again and again with the whole system. Half-way, some reflectors are put
-elsewhere. Of each part of the time, it is told how large the map is, what a keyframe costs, and
-how good the poses are.
+elsewhere. Of each part of the time, the study reports the size of the map, the cost of a keyframe,
+and the error of the poses.
 """
 
 from __future__ import annotations
@@ -89,10 +89,10 @@ def run(args: argparse.Namespace) -> int:
         return 0
     print(line(TITLES), flush=True)
 
-    def tell(r: dict[str, Any]) -> None:
+    def print_part(r: dict[str, Any]) -> None:
         print(cells(r), flush=True)
 
-    figures = drive(params, simulator, args.seed, args.parts, tell)
+    figures = drive(params, simulator, args.seed, args.parts, print_part)
     print(verdict(figures['reflectors']))
     return 0
 
@@ -102,11 +102,11 @@ def drive(
     simulator: SimulatorParameters,
     seed: int,
     parts: int,
-    tell: Callable[[dict[str, Any]], None] | None = None,
+    report: Callable[[dict[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
     """The whole drive; a dictionary per part, and what became of the reflectors.
 
-    Each part is told as soon as it is over, and how far the drive is.
+    Each part is reported as soon as it is over, and how far the drive is.
     """
     keep_large_apart()
     rng = np.random.default_rng(seed)
@@ -126,10 +126,10 @@ def drive(
     def end_part(t: float) -> None:
         rows.append(row(slam, errors, t, before))
         errors.clear()
-        if tell is not None:
-            tell(rows[-1])
+        if report is not None:
+            report(rows[-1])
 
-    with Progress('lifelong', duration, tell is None) as progress:
+    with Progress('lifelong', duration, report is None) as progress:
         for event in simulation:
             t = simulation.progress * duration
             if not is_moved and t >= 0.5 * duration:
@@ -156,7 +156,7 @@ def drive(
                 progress.update(t, f'{len(slam.back_end.keyframes)} keyframes')
     slam.finish()
     end_part(duration)
-    return {'parts': rows, 'reflectors': judge(slam, world, simulation.world, moved)}
+    return {'parts': rows, 'reflectors': evaluate(slam, world, simulation.world, moved)}
 
 
 def loop_of(world: World, rng: np.random.Generator) -> World:
@@ -242,7 +242,7 @@ def row(slam: Slam, errors: list[float], t: float, before_mb: float) -> dict[str
     }
 
 
-def judge(slam: Slam, before: World, after: World, moved: NDArray[np.int64]) -> dict[str, Any]:
+def evaluate(slam: Slam, before: World, after: World, moved: NDArray[np.int64]) -> dict[str, Any]:
     """How many reflectors of each sort the map has, and how far the unmoved ones in it are off."""
     found = slam.reflectors()
     start = se2.inverse(before.start)
@@ -257,8 +257,8 @@ def judge(slam: Slam, before: World, after: World, moved: NDArray[np.int64]) -> 
     there = gaps[gaps < CLOSE]
     states = slam.back_end.reflector_states()
 
-    def told(points: Array, *kinds: str) -> int:
-        """How many of ``points`` are told to be of one of some kinds."""
+    def classified(points: Array, *kinds: str) -> int:
+        """How many of ``points`` are classified as one of some kinds."""
         at = [s.origin.place if s.origin else s.place for s in states if s.state in kinds]
         gap = np.linalg.norm(points[:, None] - np.array(at).reshape(-1, 2)[None], axis=-1)
         return int((gap.min(axis=1, initial=np.inf) < CLOSE).sum())
@@ -267,10 +267,10 @@ def judge(slam: Slam, before: World, after: World, moved: NDArray[np.int64]) -> 
         'mapped': len(found),
         'unmoved_mapped': len(there),
         'unmoved': len(still),
-        'unmoved_told_to_be_there': told(old[still], 'present'),
+        'unmoved_present': classified(old[still], 'present'),
         'unmoved_rmse_m': float(np.sqrt(np.mean(there**2))) if len(there) else None,
-        'moved_learned_anew': int((near(new[moved]) < CLOSE).sum()),
-        'moved_told': told(old[moved], 'moved'),
+        'moved_mapped': int((near(new[moved]) < CLOSE).sum()),
+        'moved_found': classified(old[moved], 'moved'),
         'moved_still_at_old_place': int((near(old[moved]) < CLOSE).sum()),
         'moved': len(moved),
     }
@@ -292,8 +292,8 @@ def verdict(r: dict[str, Any]) -> str:
     by = '' if off is None else f', off by {100 * off:.1f} cm'
     return (
         f'{r["unmoved_mapped"]} of {r["unmoved"]} reflectors that stayed are in the map{by}; '
-        f'{r["moved_learned_anew"]} of {r["moved"]} that were '
-        f'moved are there anew, {r["moved_told"]} told to be moved, '
+        f'{r["moved_mapped"]} of {r["moved"]} that were '
+        f'moved are mapped, {r["moved_found"]} classified as moved, '
         f'{r["moved_still_at_old_place"]} still where they were; {r["mapped"]} in all, '
-        f'{r["unmoved_told_to_be_there"]} of those that stayed without a change'
+        f'{r["unmoved_present"]} of those that stayed without a change'
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``rlml-lab study relocalization``: whether reflectors tell the place, and whether it is right.
+"""``rlml-lab study relocalization``: whether reflectors give the pose, and whether it is right.
 
 Each pose has a layout of its own, a map of it with errors, and detections of which a share is
 missing and a share is ghosts. A layout that looks the same turned by half must never be unique,
@@ -129,7 +129,7 @@ def add_parser(subparsers: Any) -> None:
     """Declare ``rlml-lab study relocalization``."""
     parser = subparsers.add_parser(
         'relocalization',
-        help='whether reflectors alone tell the place, and whether the verdict is right',
+        help='whether reflectors alone give the pose, and whether the answer is right',
     )
     parser.add_argument('--poses', type=int, default=1000, metavar='N', help='per layout')
     parser.add_argument('--seed', type=int, default=0, metavar='N', help='default: %(default)s')
@@ -142,7 +142,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Judge every layout, and maps of other layouts, and print a row for each."""
+    """Evaluate every layout, and maps of other layouts, and print a row for each."""
     if args.poses < 1 or args.jobs < 1:
         raise ParameterError('study relocalization: --poses and --jobs must be 1 or more')
     params = replace(Relocalization(), max_range=args.max_range)
@@ -153,14 +153,14 @@ def run(args: argparse.Namespace) -> int:
     ]
     rows: dict[str, dict[str, float | None]] = {}
     with Progress('layouts', len(tasks), args.json) as progress:
-        for n, (task, figures) in enumerate(each(judge, tasks, args.jobs), 1):
+        for n, (task, figures) in enumerate(each(evaluate, tasks, args.jobs), 1):
             rows[f'{task[0]}, map of another' if task[1] else task[0]] = figures
             progress.update(n, task[0])
     print(json.dumps({'poses': args.poses, 'layouts': rows}) if args.json else text(rows))
     return 0
 
 
-def judge(
+def evaluate(
     layout: str, foreign: bool, poses: int, seed: int, params: Relocalization
 ) -> dict[str, float | None]:
     """Figures of one layout; ``foreign``: with the map of another pose's layout, None is right."""

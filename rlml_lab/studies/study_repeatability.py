@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``study repeatability``: how often spikes and RANSAC lines of a real log are seen again.
 
-A log whose poses were corrected by someone else tells where each extracted landmark lies. Places
+A log whose poses were corrected by someone else gives where each extracted landmark lies. Places
 nearer than a radius are one landmark; a good extractor finds few landmarks many times.
 """
 

@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def version(which: int) -> Content:
-    """A map of which every number tells the version."""
+    """A map whose every number is that of its version."""
     grid = np.full((SIDE, SIDE), which, dtype=np.int64)
     return Content({'pose': np.full((1000, 3), float(which)), 'grid': grid}, {'version': which})
 
@@ -85,9 +85,9 @@ def kill(path: Path, kills: int, rng: np.random.Generator, quiet: bool = True) -
     with Progress('kills', max(kills, 1), quiet) as progress:
         for k in range(kills):
             newest = _kill_once(path, last, rng)
-            found = _judge(path, newest)
+            found = _classify(path, newest)
             out[found] += 1
-            out['previous ' + _judge(path.with_name(path.name + PREVIOUS), newest - 1)] += 1
+            out['previous ' + _classify(path.with_name(path.name + PREVIOUS), newest - 1)] += 1
             if found in (WHOLE, OLDER):
                 last = int(map_container.read(path).description['version'])
             progress.update(k + 1, '')
@@ -110,7 +110,7 @@ def _kill_once(path: Path, last: int, rng: np.random.Generator) -> int:
     return int(rest[-1]) if rest else newest
 
 
-def _judge(path: Path, newest: int) -> str:
+def _classify(path: Path, newest: int) -> str:
     """What a file is, where versions up to ``newest`` were begun to be saved."""
     try:
         content = map_container.read(path)
@@ -144,7 +144,7 @@ def _refusal(path: Path) -> str:
         map_container.read(path)
     except FileFormatError as e:
         named = path.name + PREVIOUS in str(e)
-        return 'refused' if named and _judge(path.with_name(path.name + PREVIOUS), 1) == WHOLE \
+        return 'refused' if named and _classify(path.with_name(path.name + PREVIOUS), 1) == WHOLE \
             else LOST  # fmt: skip
     except Exception:  # of whatever kind: that is what is looked for
         return CRASHED

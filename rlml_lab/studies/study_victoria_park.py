@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
         read_yaml(args.config, EkfParameters) if args.config else {}, EkfParameters
     )
     results = {s: drive(data, s, params, args.duration, args.json) for s in args.system}
-    figures = {s: judge(r, data.gps) for s, r in results.items()}
+    figures = {s: evaluate(r, data.gps) for s, r in results.items()}
     if args.out is not None:
         write_atomically(args.out, picture(results, figures, data.gps))
     if args.json:
@@ -112,7 +112,7 @@ def drive(
     return Result(Trajectory(*slam.trajectory()), slam.reflectors(), wall, np.array(log.wall_ms))
 
 
-def judge(result: Result, gps: Trajectory) -> dict[str, Any]:
+def evaluate(result: Result, gps: Trajectory) -> dict[str, Any]:
     """Position errors [m] where GPS is known, trees, and time."""
     errors = trajectory_errors(result.trajectory, gps, aligned=True).summary()
     out: dict[str, Any] = {k: round(errors[k], 3) for k in ('rmse_m', 'median_m', 'max_m')}

@@ -55,7 +55,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         'worlds',
         help='accuracy and consistency over seeds and worlds',
-        description='Drives through simulated worlds offline and judges the poses as published '
+        description='Drives through simulated worlds offline and evaluates the poses as published '
         'live. A consistent pose covariance gives a mean NEES of 3.',
     )
     parser.add_argument('--seeds', type=int, default=10, metavar='N', help='default: %(default)s')
@@ -109,14 +109,14 @@ def _run_all(
 ) -> Iterator[tuple[Case, dict[str, Any]]]:
     if jobs == 1:
         for case in cases:
-            yield case, judge_case(case, params, simulator)
+            yield case, evaluate_case(case, params, simulator)
         return
     # a fresh interpreter per worker: a forked one would share the kernels' threads and locks
     context = multiprocessing.get_context('spawn')
     with ProcessPoolExecutor(jobs, mp_context=context) as pool:
         n = len(cases)
         yield from zip(
-            cases, pool.map(judge_case, cases, [params] * n, [simulator] * n), strict=True
+            cases, pool.map(evaluate_case, cases, [params] * n, [simulator] * n), strict=True
         )
 
 
@@ -154,7 +154,7 @@ def drive(case: Case, params: Parameters, simulator: Mapping[str, Any] | None = 
     return result
 
 
-def judge_case(
+def evaluate_case(
     case: Case, params: Parameters, simulator: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """Figures of one drive: those of metrics.json, largest sigma, and what was not OK and why."""

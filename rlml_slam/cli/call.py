@@ -7,7 +7,7 @@ import argparse
 import importlib
 from typing import Any
 
-from rlml_slam.cli.support.service_call import call, told
+from rlml_slam.cli.support.service_call import call, message_of
 from rlml_slam.errors import InputError
 
 SWITCH = {'on': True, 'off': False}
@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     kind = getattr(importlib.import_module(f'{package}.srv'), name)
     answer = call(args.node, args.service, kind, fields)
     if name != 'LoadMap':
-        print(told(answer))
+        print(message_of(answer))
     elif answer.result != kind.Response.RESULT_SUCCESS:
         raise InputError(f'load_map: {args.node} refused the map, and its log says why')
     else:

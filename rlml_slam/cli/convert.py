@@ -32,7 +32,7 @@ ODOM, BASE, WORLD = 'odom', 'base_link', 'world'
 class Recording:
     """What goes into a bag. ``sensors``: T_base_sensor (3,) by frame.
 
-    ``truth`` and ``true_reflectors`` are in the frame ``world``; a truth with NaN headings tells
+    ``truth`` and ``true_reflectors`` are in the frame ``world``; a truth with NaN headings has
     positions only.
     """
 
@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def storage_of(bag: Path, wanted: str | None) -> Literal['mcap', 'sqlite3']:
-    """The storage that is asked for, else the one that the suffix tells, else mcap."""
+    """The storage that is asked for, else the one of the suffix, else mcap."""
     if wanted == 'sqlite3' or (wanted is None and bag.suffix in SQLITE_SUFFIXES):
         return 'sqlite3'
     return 'mcap'

@@ -12,12 +12,12 @@ import numpy as np
 from rlml_slam.cli.support.live_session import LISTENERS, Source, drive
 from rlml_slam.params import Simulator
 from rlml_slam.report.outputs import make_folder, write_outputs
-from rlml_slam.report.summary import tell
+from rlml_slam.report.summary import print_summary
 from rlml_slam.simulation.world import World
 from rlml_slam.simulation.world_file import load_world
 
 RATE = 2.0  # simulated seconds per second: two cores keep up with three processes and a recorder
-GYRO_RATE = 50.0  # [Hz] simulated: more would cost CPU time and tell nothing new
+GYRO_RATE = 50.0  # [Hz] simulated: a higher rate costs CPU time without any gain
 STILL = 1.0  # [s] simulated: standing before and after the drive
 
 
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
             flush=True,
         )
     result = drive(source(args, world), out, args.json)
-    return tell(result, write_outputs(result, out), out, args.json)
+    return print_summary(result, write_outputs(result, out), out, args.json)
 
 
 def source(args: argparse.Namespace, world: World) -> Source:
@@ -67,7 +67,7 @@ def source(args: argparse.Namespace, world: World) -> Source:
             'still_time': STILL, 'gyro.rate': GYRO_RATE, 'wait_for_subscribers': LISTENERS,
         },
         lambda recorder: recorder.distance / length,
-        # where there is no tf2_msgs, /tf_static cannot tell it
+        # where there is no tf2_msgs, /tf_static has no laser pose
         {'laser_pose': list(Simulator().laser_pose), 'map_update_interval': 1.0},
         keeps_map=True,
     )  # fmt: skip

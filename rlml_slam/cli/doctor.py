@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``rlml doctor``: what the scans of a bag are like, and which threshold tells its reflectors."""
+"""``rlml doctor``: the scans of a bag in figures, and a threshold for its reflectors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MOST_SCANS = 500  # looked at, spread over the bag
 QUANTILES = (0.05, 0.5, 0.95, 0.999)
 DECAYS = np.concatenate([[0.0], np.geomspace(0.005, 2.0, 60)])  # [1/m] tried for the curve
 WELL_SEEN = 5.0  # beams on a spot whose width counts
-FEW = 10  # bright spots of an octave that tell how bright reflectors are there
+FEW = 10  # bright spots that an octave needs for an estimate of the brightness of reflectors
 
 
 def add_parser(subparsers: Any) -> None:
@@ -149,9 +149,11 @@ def examine(e: Evidence, p: Detector) -> dict[str, Any]:
         figures['proposed'] = {'detector.threshold': 'bit'}
         return figures
     if len(e.spots):
-        # beams far apart do not tell a width
-        told = e.widths > WELL_SEEN * e.spots[:, 0] * abs(s.angle_increment)
-        figures['width_median_m'] = float(np.median(e.widths[told])) if told.any() else None
+        # a width is measured where several beams hit
+        measured = e.widths > WELL_SEEN * e.spots[:, 0] * abs(s.angle_increment)
+        figures['width_median_m'] = (
+            float(np.median(e.widths[measured])) if measured.any() else None
+        )
         figures['brightness_of_reflectors'] = float(np.median(e.spots[:, 1]))
         figures['range_of_reflectors_m'] = [float(v) for v in np.quantile(e.spots[:, 0], [0, 1])]
         a, k, floor, margin = propose(e, p)
@@ -210,7 +212,7 @@ def words(f: dict[str, Any]) -> list[str]:
     if not f['has_intensities']:
         return [
             f'{f["beams"]} beams, one every {f["step_deg"]:.3g} degrees.',
-            'The scans have no intensities: reflectors cannot be told. Switch them on in the '
+            'The scans have no intensities: reflectors cannot be detected. Switch them on in the '
             "laser's driver.",
         ]
     if 'intensity_quantiles' not in f:
@@ -226,7 +228,7 @@ def words(f: dict[str, Any]) -> list[str]:
             'vendors set (65534 and more).'
         )
     elif f['intensity_values'] <= 2:
-        out.append('Intensities are all alike: they tell nothing of reflectors.')
+        out.append('All intensities are equal: reflectors cannot be detected by them.')
     if f['reflectors_mean'] == 0.0:
         out.append('No reflector is seen: nothing is bright enough and of the right shape.')
     else:

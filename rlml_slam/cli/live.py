@@ -12,7 +12,7 @@ from rlml_slam.cli.support.live_session import LISTENERS, Source, drive
 from rlml_slam.cli.support.recorder import Recorder
 from rlml_slam.params import Parameters, Player, from_mapping, read_yaml
 from rlml_slam.report.outputs import make_folder, write_outputs
-from rlml_slam.report.summary import tell
+from rlml_slam.report.summary import print_summary
 from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.codecs.decode import frame
 from rlml_slam.ros.sensor_input import STREAMS
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     out = make_folder(args.out)
     result = drive(played, out, args.json)
     result.truth = truth
-    return tell(result, write_outputs(result, out), out, args.json)
+    return print_summary(result, write_outputs(result, out), out, args.json)
 
 
 def source(
@@ -71,7 +71,7 @@ def source(
         system,
         args.config,
         (inputs.topics[sensor], STREAMS[sensor][1]),
-        # a survey and a map to localize in are in the map_directory that the file tells
+        # a survey and a map to localize in are in the map_directory of the parameter file
         keeps_map=not (
             params.back_end.survey or params.node.continue_map or params.node.mode != 'mapping'
         ),

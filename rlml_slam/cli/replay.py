@@ -27,7 +27,7 @@ from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.maps.survey import Survey
 from rlml_slam.params import EkfParameters, Parameters, from_mapping, read_yaml
 from rlml_slam.report.outputs import make_folder, write_outputs
-from rlml_slam.report.summary import tell
+from rlml_slam.report.summary import print_summary
 from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.slam.back_end.back_end import BackEnd
@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
         args.bag, params, truth, args.system, quiet=args.json, known=known, begun=begun,
         surveyed=surveyed,
     )  # fmt: skip
-    return tell(result, write_outputs(result, args.out), args.out, args.json)
+    return print_summary(result, write_outputs(result, args.out), args.out, args.json)
 
 
 def load_known(path: Path) -> SavedMap:

@@ -6,8 +6,8 @@
     ROBOTLASER1 <as RAWLASER1 up to i..> x y theta odom_x odom_y odom_theta tv rv <3> ipc_time ..
     ODOM x y theta tv rv accel ipc_time host logger_time
 
-The stamps are ipc_time, or logger_time where no laser line tells the other. (x, y, theta) is the
-laser's pose and odom_… the robot's, so the two tell where the laser sits. Old lines do not say
+The stamps are ipc_time, or logger_time where no laser line has the other. (x, y, theta) is the
+laser's pose and odom_… the robot's, so the two give the laser's pose on it. Old lines do not say
 what angles their beams have: 180 or 181 of them step by 1 degree and 360 or 361 by half a degree
 from -90 on, 400 or 401 by a quarter from -50 on (a SICK set to 100 degrees), as CARMEN reads them;
 any other number spans 180 degrees.
@@ -44,7 +44,7 @@ class CarmenLog:
     """What a log holds, in the order of stamps.
 
     ``T_base_laser`` (3,); ``odometry`` is from ODOM lines, else from the laser lines. ``counts``:
-    lines by kind, ``broken``, ``out_of_order`` scans, ``invalid_stamp``; ``first_error`` tells
+    lines by kind, ``broken``, ``out_of_order`` scans, ``invalid_stamp``; ``first_error`` says
     the first broken line. ``set_back`` [ns] is by how much the scans' clock went back at most.
     """
 
@@ -135,7 +135,7 @@ class _Reader:
         return _LaserLine(scan, laser, robot)
 
     def _angles(self, n: int) -> tuple[float, float]:
-        """Angle [rad] of the first of n beams and the step, of a line that tells neither."""
+        """Angle [rad] of the first of n beams and the step, of a line that has neither."""
         if self._fov is not None:
             return -0.5 * self._fov, self._fov / max(n - 1, 1)
         start, step = OLD_ANGLES.get(n + 1 - n % 2, (-90.0, 180.0 / max(n - 1, 1)))

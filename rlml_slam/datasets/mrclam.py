@@ -9,7 +9,7 @@
 
 Files may be compressed (.gz, .xz). Measurements are in the robot's frame.
 
-The camera tells the range from how large a barcode looks, which is what tells its depth along the
+The camera measures a range by the size of a barcode in the image, which gives the depth along the
 optical axis: a pinhole camera shows a barcode of height s at depth Z as f s/Z pixels, wherever in
 the picture it is. The logged ranges are depths times one factor; against the truth of data set 6
 they are right to 1 % for each robot once divided by the cosine of the bearing, and off by 10 %

@@ -21,7 +21,7 @@ from rlml_slam.types import Motion
 def bridge(
     motion: Motion, before: Array | None, after: Array | None, dt: float, noise: MotionNoise
 ) -> Motion:
-    """An unknown ``motion`` over ``dt`` seconds, as raw odometry (3,) at its ends tells it.
+    """An unknown ``motion`` over ``dt`` seconds, from the raw odometry (3,) at its ends.
 
     Without odometry there, or where it was reset, it stays unknown.
     """

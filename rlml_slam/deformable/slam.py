@@ -35,7 +35,7 @@ class DeformableSlam:
         self.begin_at(np.array(self._p.node.map_start_pose))
 
     def begin_at(self, pose: Array, cov: Array | None = None) -> None:
-        """Begin anew at ``pose`` (3,) with covariance ``cov`` (3, 3) and no features."""
+        """Restart at ``pose`` (3,) with covariance ``cov`` (3, 3) and no features."""
         p = self._p
         self._window = DeformableWindow(p.deformable, p.reflector, pose, cov)
         self._bias = GyroBias(p.motion)
@@ -67,7 +67,7 @@ class DeformableSlam:
             trouble.append(str(e))
             estimate = self._window.update(stamp, motion, _nothing(stamp), self.velocity)
         except SolverError as e:
-            trouble.append(f'{e}: began anew')
+            trouble.append(f'{e}: restarted')
             self._begin_after(motion)
             estimate = self._window.update(stamp, motion, detections, self.velocity)
         first, self._stamp = self._stamp is None, stamp
@@ -90,7 +90,7 @@ class DeformableSlam:
         return replace(motion, cov=motion.cov + floor)
 
     def _begin_after(self, motion: Motion) -> None:
-        """Begin anew where the robot is by odometry."""
+        """Restart where the robot is by odometry."""
         if self.estimate is None:
             self.begin_at(np.array(self._p.node.map_start_pose))
             return

@@ -3,7 +3,7 @@
 
 A robot works beside a carrier (a cart train, a trailer, a conveyor) whose reflectors move with a
 known nominal velocity and deform. Each update adds a step; once the window is full the oldest is
-marginalised. Features appear and disappear; they are told apart by id, or by association.
+marginalised. Features appear and disappear; they are identified by id, or by association.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class CarrierVelocity:
 class Features:
     """Confirmed features: ``points`` (m, 2), ``cov`` (m, 2, 2) in the estimate's frame.
 
-    ``keys`` (m,) are never reused; ``ids`` (m,) are ANONYMOUS where the feature does not tell.
+    ``keys`` (m,) are never reused; ``ids`` (m,) are ANONYMOUS where the feature has none.
     """
 
     keys: NDArray[np.int64]
@@ -61,7 +61,7 @@ class WindowEstimate:
     """The newest step: ``pose`` (3,), ``cov`` (3, 3), features, and how it came about.
 
     ``joint_cov`` (3 + 2m, 3 + 2m) is of the pose and the confirmed features in their order.
-    ``keys`` (k,) and ``statuses`` (k,) tell what became of each detection, key -1 for none.
+    ``keys`` (k,) and ``statuses`` (k,) say what became of each detection, key -1 for none.
     """
 
     stamp: int

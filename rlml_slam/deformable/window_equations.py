@@ -2,7 +2,7 @@
 """Normal equations of a sliding window of robot and features, and marginalisation of its oldest.
 
 A step's state is (x, y, theta, f_1x, f_1y, ...) with a slot for every feature that the window may
-hold, (n,) with n = 3 + 2 M. ``active`` (M,) tells which slots are in use at a step; the others
+hold, (n,) with n = 3 + 2 M. ``active`` (M,) says which slots are in use at a step; the others
 have identity rows, so that all blocks keep one size and the equations stay block tridiagonal.
 A feature lives on into the next step where it is active in both.
 """

@@ -22,7 +22,7 @@ MATCH_RADIUS = 0.5  # [m] an anonymous reflector farther from every true one is 
 
 
 @dataclass(frozen=True)
-class Judged:
+class RunErrors:
     """Errors of a run against its truth: optimised and live, and the live poses' NEES.
 
     ``nees`` (n,) is NaN where a covariance is singular or the truth has no heading, and all of
@@ -34,7 +34,7 @@ class Judged:
     nees: Array
 
 
-def judge(run: Run) -> Judged | None:
+def run_errors(run: Run) -> RunErrors | None:
     """Errors, None where no truth is known at any of the stamps.
 
     A truth in a frame of its own is aligned to each trajectory first.
@@ -47,7 +47,9 @@ def judge(run: Run) -> Judged | None:
     optimized = trajectory_errors(run.trajectory, truth, aligned)
     live = trajectory_errors(run.frames.trajectory(), truth, aligned)
     unknown = np.full(len(live.errors), np.nan)
-    return Judged(optimized, live, unknown if aligned else nees(live, np.array(run.frames.covs)))
+    return RunErrors(
+        optimized, live, unknown if aligned else nees(live, np.array(run.frames.covs))
+    )
 
 
 def nees(errors: TrajectoryErrors, covs: Array) -> Array:
@@ -67,7 +69,7 @@ def nees(errors: TrajectoryErrors, covs: Array) -> Array:
     return out
 
 
-def metrics(run: Run, judged: Judged | None = None) -> dict[str, Any]:
+def metrics(run: Run, errors: RunErrors | None = None) -> dict[str, Any]:
     """All figures of a run, ready for JSON; those of the truth only where it is known."""
     n, wall, duration = len(run.frames.stamps), run.wall_s, run.duration_s
     out: dict[str, Any] = {
@@ -87,15 +89,15 @@ def metrics(run: Run, judged: Judged | None = None) -> dict[str, Any]:
         'health': {k: round(v, 4) for k, v in run.health_share().items()},
         'problem': run.problem,
     }
-    judged = judge(run) if judged is None else judged
-    if judged is not None and run.truth is not None:
-        out |= _truth_figures(run, judged)
+    errors = run_errors(run) if errors is None else errors
+    if errors is not None and run.truth is not None:
+        out |= _truth_figures(run, errors)
     return out | dict(run.extra)
 
 
-def _truth_figures(run: Run, judged: Judged) -> dict[str, Any]:
+def _truth_figures(run: Run, errors: RunErrors) -> dict[str, Any]:
     assert run.truth is not None
-    optimized, live = judged.optimized.summary(), judged.live.summary()
+    optimized, live = errors.optimized.summary(), errors.live.summary()
     out: dict[str, Any] = {
         'alignment': 'none' if run.truth.is_map else 'se2',
         'truth_matched': optimized['matched'],
@@ -106,10 +108,10 @@ def _truth_figures(run: Run, judged: Judged) -> dict[str, Any]:
     if 'heading_rmse_deg' in optimized:
         out['heading_rmse_deg'] = optimized['heading_rmse_deg']
         out['live_heading_rmse_deg'] = live['heading_rmse_deg']
-    if np.isfinite(judged.nees).any():
-        out['nees_mean'] = float(np.nanmean(judged.nees))
+    if np.isfinite(errors.nees).any():
+        out['nees_mean'] = float(np.nanmean(errors.nees))
     if len(run.truth.reflectors):
-        out |= reflector_figures(run, judged.optimized.T_truth_map)
+        out |= reflector_figures(run, errors.optimized.T_truth_map)
     return {k: round(v, 6) if isinstance(v, float) else v for k, v in out.items()}
 
 

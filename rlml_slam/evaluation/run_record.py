@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one run of the system left behind, whoever drove it: replay, study or demo.
+"""The record of one run of the system: of a replay, a study or a live drive.
 
 Everything that is written and drawn is made from a Run.
 """
@@ -36,7 +36,7 @@ class Truth:
 
 @dataclass
 class FrameLog:
-    """The front end's answers, one entry per frame, without the measurements themselves."""
+    """The frames of the front end, one entry each, without the measurements themselves."""
 
     stamps: list[int] = field(default_factory=list)
     poses: list[Array] = field(default_factory=list)
@@ -74,15 +74,15 @@ class FrameLog:
 
 @dataclass
 class Run:
-    """Inputs' fate, estimates, products and cost of one run.
+    """Inputs, estimates, products and cost of one run.
 
     ``trajectory`` is the optimised one; ``keyframes`` (k, 3) are poses in the map and
-    ``closures`` (c, 2, 2) the ends of the accepted loop closures there, of which
-    ``closure_table`` tells all, empty where nothing is known of them. ``back_end_ms`` (k,)
-    has the cost per keyframe, ``reflector_states`` what has become of the reflectors. ``inputs``
-    counts what became of the messages of each stream, ``topics`` says where in a bag they are.
+    ``closures`` (c, 2, 2) the ends of the accepted loop closures there, and
+    ``closure_table`` has a row for each candidate, empty where there was none. ``back_end_ms``
+    (k,) has the cost per keyframe, ``reflector_states`` the state of each reflector. ``inputs``
+    counts used, late and invalid messages by stream, ``topics`` has the topic of each.
     ``problem`` says in one line what ended the run early or what of it is missing, empty without
-    either. ``stored`` is the whole map. ``extra`` goes into metrics.json as it is.
+    either. ``stored`` is the whole map. ``extra`` is added to metrics.json.
     """
 
     name: str

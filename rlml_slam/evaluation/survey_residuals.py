@@ -18,10 +18,10 @@ MOVED = 3.0  # [m] one that is missing and one that is new are one that was move
 
 
 def compare(found: Reflectors, surveyed: Survey, in_survey_frame: bool = False) -> dict[str, Any]:
-    """Residuals, and what is missing, new or moved. Raises MapError where nothing tells the place.
+    """Residuals, and what is missing, new or moved. Raises MapError if no pose fits.
 
     ``T_survey_map`` makes the sum of the squared residuals as small as it can be; a map that is
-    ``in_plant``, in the frame of the survey, is not moved.
+    ``in_survey_frame`` is not moved.
     """
     if in_survey_frame:
         T, pairs = np.zeros(3), pairs_at(found, surveyed, np.zeros(3), SIGMA)

@@ -24,7 +24,7 @@ from rlml_slam.ros.systems.carrier_velocity import VelocityInput
 from rlml_slam.ros.systems.deformable_messages import EstimatePublisher
 from rlml_slam.types import Observation
 
-KEPT = 6000  # updates whose cost the diagnostics tell: 10 minutes at 10 Hz
+KEPT = 6000  # updates whose cost the diagnostics report: 10 minutes at 10 Hz
 
 
 class DeformableSlamNode(Node):
@@ -61,7 +61,7 @@ class DeformableSlamNode(Node):
         self._updates += 1
 
     def start_at(self, msg: PoseWithCovarianceStamped) -> None:
-        """Begin anew at a pose of the map."""
+        """Restart at a pose of the map."""
         start = decode.start_pose(msg, self._map_frame)
         self.slam.begin_at(start.pose, start.cov)
         self.get_logger().info(f'begins at {np.round(start.pose, 3).tolist()}')

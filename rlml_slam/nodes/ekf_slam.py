@@ -61,7 +61,7 @@ class EkfSlamNode(Node):
             self.products.publish(self.estimator, None, frame.stamp)
 
     def start_at(self, msg: PoseWithCovarianceStamped) -> None:
-        """Begin anew at a pose of the map."""
+        """Restart at a pose of the map."""
         start = decode.start_pose(msg, self.params.node.map_frame)
         self._begin(start.pose, start.cov, self.map_services.saved)
 

@@ -47,10 +47,12 @@ class SimulatorNode(Node):
         # steady timers: with use_sim_time, a ROS timer would wait for this node's own clock
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(0.005, self.tick, clock=steady)
-        self.create_timer(1.0, lambda: self._topics.tell(self.simulation.time), clock=steady)
+        self.create_timer(
+            1.0, lambda: self._topics.publish_clock(self.simulation.time), clock=steady
+        )
 
     def on_cmd_vel(self, msg: Any) -> None:
-        """Drive as told."""
+        """Drive with the commanded velocity."""
         try:
             self.simulation.command(*decode.twist(msg))
         except InputError as e:
@@ -80,7 +82,7 @@ class SimulatorNode(Node):
     def _finish(self, now: float) -> None:
         if self._finished is None:
             self._topics.publish(self.simulation.rest())
-            self._topics.tell(self.simulation.time)
+            self._topics.publish_clock(self.simulation.time)
             self._finished = now
             seconds = (self.simulation.time - START) / SECOND
             self.get_logger().info(f'the drive is done after {seconds:.1f} s')

@@ -12,7 +12,7 @@ import numpy as np
 
 from rlml_slam.datasets.tum import Trajectory, write_tum
 from rlml_slam.errors import MapError
-from rlml_slam.evaluation.metrics import judge, metrics
+from rlml_slam.evaluation.metrics import RunErrors, metrics, run_errors
 from rlml_slam.evaluation.run_record import Run
 from rlml_slam.maps import map_container, reflector_file
 from rlml_slam.maps.atomic_file import write_atomically
@@ -39,10 +39,10 @@ def write_outputs(run: Run, folder: str | Path) -> dict[str, Any]:
     if run.reflector_states:
         table = state_table(run.reflector_states)
         write_atomically(folder / 'reflector_states.csv', table.encode())
-    judged = judge(run)
-    figures = metrics(run, judged)
+    errors = run_errors(run)
+    figures = metrics(run, errors)
     write_atomically(folder / 'metrics.json', (json.dumps(figures, indent=2) + '\n').encode())
-    write_report(run, judged, figures, folder)
+    write_report(run, errors, figures, folder)
     return figures
 
 
@@ -58,13 +58,15 @@ def make_folder(folder: str | Path) -> Path:
     return folder
 
 
-def write_report(run: Run, judged: Any, figures: dict[str, Any], folder: Path) -> None:
+def write_report(
+    run: Run, errors: RunErrors | None, figures: dict[str, Any], folder: Path
+) -> None:
     """Pictures as PNG, and report.html that carries the same ones inside."""
     # matplotlib takes half a second to import, which other commands need not wait for
     from rlml_slam.report.pictures import draw
     from rlml_slam.report.report import report_html
 
-    pictures = draw(run, judged)
+    pictures = draw(run, errors)
     for name, png in pictures.items():
         write_atomically(folder / f'{name}.png', png)
     html = report_html(run, figures, pictures)

@@ -18,13 +18,13 @@ from matplotlib.patches import Ellipse
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from rlml_slam import se2
-from rlml_slam.evaluation.metrics import Judged
+from rlml_slam.evaluation.metrics import RunErrors
 from rlml_slam.evaluation.run_record import Run
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.se2 import Array
 from rlml_slam.types import Level
 
-# one colour per thing, the same in every picture; told apart in grey and by the colour-blind
+# one colour per thing, the same in every picture; distinct in grey and for the colour-blind
 PATH, LIVE, TRUTH, CLOSURE, REFLECTOR = '#1f5fbf', '#e08a1e', '#3b3b3b', '#2a9d63', '#c2185b'
 LEVELS = {Level.OK: '#8fcfa8', Level.DEGRADED: '#f2c14e', Level.LOST: '#d9534f'}
 GRID_MAP = LinearSegmentedColormap.from_list('grid', ['#ffffff', '#20242a'])
@@ -34,11 +34,11 @@ CHI2_95 = 5.991  # of two degrees of freedom: the 95 % ellipse
 DPI = 150
 
 
-def draw(run: Run, judged: Judged | None) -> dict[str, bytes]:
+def draw(run: Run, errors: RunErrors | None) -> dict[str, bytes]:
     """PNG by name: ``map``, ``health``, ``timing``, and ``errors`` where the truth is known."""
     pictures = {'map': map_picture(run)}
-    if judged is not None:
-        pictures['errors'] = error_picture(run, judged)
+    if errors is not None:
+        pictures['errors'] = error_picture(run, errors)
     if run.frames.stamps:
         pictures['health'] = health_picture(run)
     if run.frames.wall_ms:
@@ -164,10 +164,10 @@ def ellipse(point: Array, cov: Array) -> Ellipse:
     return Ellipse(tuple(point), axes[1], axes[0], angle=float(angle))
 
 
-def error_picture(run: Run, judged: Judged) -> bytes:
+def error_picture(run: Run, errors: RunErrors) -> bytes:
     """Errors over time of the live poses with their 3 sigma bands, and of the optimised ones."""
     start = run.frames.stamps[0]
-    live, optimized = judged.live, judged.optimized
+    live, optimized = errors.live, errors.optimized
     R = np.eye(3)
     R[:2, :2] = se2.rotation(live.T_truth_map[2])
     covs = R @ np.array(run.frames.covs)[live.indices] @ R.T

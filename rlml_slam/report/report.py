@@ -52,7 +52,7 @@ def report_html(run: Run, figures: Mapping[str, Any], pictures: Mapping[str, byt
         f'<div class="cards">{"".join(_cards(figures))}</div>',
     ]
     if run.problem:
-        parts.append(_section('The results are not whole', escape(run.problem), 'problem'))
+        parts.append(_section('The results are incomplete', escape(run.problem), 'problem'))
     parts += [_picture(name, pictures[name]) for name in ('map', 'errors') if name in pictures]
     parts.append(_section('Figures', _table(summary_rows(figures))))
     if figures.get('survey', {}).get('found'):
@@ -60,7 +60,7 @@ def report_html(run: Run, figures: Mapping[str, Any], pictures: Mapping[str, byt
     changed = [told(s).partition(': ') for s in run.reflector_states if s.state != PRESENT]
     if changed:
         rows = [(kind, what) for kind, _, what in changed]
-        parts.append(_section('Reflectors that are not simply there', _table(rows)))
+        parts.append(_section('New, moved, missing and ghost reflectors', _table(rows)))
     parts += [_picture(name, pictures[name]) for name in ('health', 'timing') if name in pictures]
     spells = list(bad_spells(run))
     if spells:
@@ -80,7 +80,7 @@ def _subtitle(f: Mapping[str, Any]) -> str:
 
 
 def _cards(f: Mapping[str, Any]) -> Iterator[str]:
-    """The few figures that tell whether the run was good."""
+    """The few figures that show whether the run was good."""
     cards: list[tuple[str, str]] = []
     if 'ate_rmse_m' in f:
         cards.append((f'{100 * f["live_ate_rmse_m"]:.1f} cm', 'position RMSE, live'))

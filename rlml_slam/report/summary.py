@@ -98,7 +98,7 @@ def summary_text(title: str, figures: Mapping[str, Any]) -> str:
     return '\n'.join([title, *(f'  {name:<{width}}  {value}' for name, value in rows)])
 
 
-def tell(run: Run, figures: Mapping[str, Any], folder: Path, as_json: bool) -> int:
+def print_summary(run: Run, figures: Mapping[str, Any], folder: Path, as_json: bool) -> int:
     """Print the figures of a run whose results are in a folder, and its problem; the exit code."""
     if as_json:
         print(json.dumps(figures))

@@ -37,7 +37,7 @@ class HealthPublisher:
         self._publisher = node.create_publisher(
             rclpy_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', 10
         )
-        # steady: with simulated time, silence of /clock must be told as well
+        # steady: with simulated time, silence of /clock must be reported as well
         node.create_timer(PERIOD, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     @property

@@ -129,11 +129,11 @@ def _detect(
     seen = np.concatenate([ids[kept], np.full(num, ANONYMOUS, dtype=np.int64)])
     order = generator.permutation(len(found))
     found, seen = found[order], seen[order]
-    told = seen if settings.ids else np.full(len(seen), ANONYMOUS, dtype=np.int64)
+    ids = seen if settings.ids else np.full(len(seen), ANONYMOUS, dtype=np.int64)
     cov = np.broadcast_to(settings.sigma**2 * np.eye(2), (len(found), 2, 2)).copy()
     stamp = round(1e9 * k * dt)
     diameters = np.full(len(found), np.nan)
-    return Detections(stamp, 'base_link', found, cov, told, diameters), seen
+    return Detections(stamp, 'base_link', found, cov, ids, diameters), seen
 
 
 def true_features(step: CarrierStep) -> dict[int, Array]:

@@ -146,7 +146,7 @@ class Simulation:
         self._static = self.world.static.joined(moved.geometry())
 
     def kidnap(self, distance: float) -> None:
-        """Carry the robot ``distance`` [m] along its route, at once; no sensor but sight tells."""
+        """Carry the robot ``distance`` [m] along its route at once, unseen by odometry and IMU."""
         if self._route.length > 0.0:
             self._track.carry(np.array(self._route.skip(distance)))
 

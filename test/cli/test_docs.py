@@ -161,15 +161,15 @@ def test_topics_are_those_of_the_node(nodes, name, direction):
         for info in of_topic(topic)
         if info.node_name == name and topic not in OF_EVERY_NODE
     }
-    told = {
+    documented = {
         ('/' + t.name.lstrip('/'), t.type, t.qos)
         for t in TOPICS
         if (t.node, t.direction) == (name, direction)
     }
     if not has_tf():  # the same transforms go elsewhere, or nowhere
-        told = {t for t in told if not t[0].startswith('/tf')}
+        documented = {t for t in documented if not t[0].startswith('/tf')}
         found = {t for t in found if not t[0].endswith('map_to_odom')}
-    assert found == told
+    assert found == documented
 
 
 @pytest.mark.parametrize('name', NODES)
@@ -179,10 +179,10 @@ def test_services_are_those_of_the_node(nodes, name):
         for service, kinds in nodes[name].get_service_names_and_types_by_node(name, '/')
         if not kinds[0].startswith(('rcl_interfaces', 'type_description_interfaces'))
     }
-    told = {
+    documented = {
         ('/' + s.name.replace('~', name).lstrip('/'), s.type) for s in SERVICES if s.node == name
     }
-    assert found == told
+    assert found == documented
 
 
 def test_topics_of_parameters_have_their_names():

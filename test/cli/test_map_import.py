@@ -53,7 +53,7 @@ def test_text_becomes_the_same_graph(mapped, folder):
         kept = slice(None)
         if name.startswith(('edge', 'sighted')):  # what is disabled is not written
             kept = mapped.arrays[f'{name.split("_")[0]}_enabled']
-        # the file's numbers are exact, but for headings that are wrapped anew
+        # the file's numbers are exact, but for headings that are wrapped again
         np.testing.assert_allclose(
             content.arrays[name], mapped.arrays[name][kept], rtol=0, atol=1e-9, err_msg=name
         )

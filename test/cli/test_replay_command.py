@@ -101,8 +101,8 @@ def test_summary_says_which_topic_was_taken(tmp_path, capsys):
 
 def test_both_topics_of_reflectors_are_told():
     topics = {'scan': '/front', 'reflectors': '/cloud', 'reflector_poses': '/poses'}
-    told = sources(topics, ['/rear'])
-    assert told == {'scan': '/front, /rear', 'reflectors': '/cloud, /poses'}
+    found = sources(topics, ['/rear'])
+    assert found == {'scan': '/front, /rear', 'reflectors': '/cloud, /poses'}
     assert sources({'odom': '/odom'}, ['/rear']) == {'odom': '/odom', 'scan': '/rear'}
 
 
@@ -128,8 +128,8 @@ def test_odometry_is_left_out_where_it_is_withheld(tmp_path, capsys):
 
 
 def test_no_such_bag_is_one_line(tmp_path, capsys):
-    assert main(['replay', str(tmp_path / 'gone'), '--out', str(tmp_path / 'out')]) == 1
-    assert capsys.readouterr().err.endswith('gone: no such bag\n')
+    assert main(['replay', str(tmp_path / 'missing'), '--out', str(tmp_path / 'out')]) == 1
+    assert capsys.readouterr().err.endswith('missing: no such bag\n')
 
 
 def made_scan(stamp):

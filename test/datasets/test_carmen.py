@@ -141,7 +141,7 @@ def test_time_of_the_logger_serves_where_there_is_no_other(tmp_path):
     log = read(tmp_path, *lines)
     assert [scan.stamp for scan in log.scans] == [100_000_000, 500_000_000]
     assert [sample.stamp for sample in log.odometry] == [100_000_000]
-    # one line that tells its time is not set beside another clock
+    # one line that has its time is not set beside another clock
     assert [scan.stamp for scan in read(tmp_path, *lines, flaser(4, 7.0)).scans] == [7 * 10**9]
 
 

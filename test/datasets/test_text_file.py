@@ -18,7 +18,7 @@ TEXT = b'# a comment\n1 2\n\n  3 4  \n'
 
 @pytest.mark.parametrize('pack', [bytes, gzip.compress, lzma.compress])
 def test_lines_are_read_whatever_packs_them(tmp_path, pack):
-    # the name does not tell: the content does
+    # the content decides, not the name
     path = tmp_path / 'numbers.dat'
     path.write_bytes(pack(TEXT))
     assert list(read_lines(path)) == [(2, '1 2'), (4, '3 4')]
@@ -33,8 +33,8 @@ def test_truncated_archive_is_named(tmp_path, pack):
 
 
 def test_missing_file_is_named(tmp_path):
-    with pytest.raises(FileFormatError, match=r'gone\.txt: cannot be read: No such file'):
-        list(read_lines(tmp_path / 'gone.txt'))
+    with pytest.raises(FileFormatError, match=r'missing\.txt: cannot be read: No such file'):
+        list(read_lines(tmp_path / 'missing.txt'))
 
 
 @pytest.mark.parametrize(

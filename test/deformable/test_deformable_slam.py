@@ -205,7 +205,7 @@ def test_unsolvable_window_begins_anew_where_the_robot_is(monkeypatch):
 
     monkeypatch.setattr(slam._window, 'update', fail)
     frame = slam.process(observe(run[-1]))
-    assert frame.health.reasons[0] == 'singular: began anew'
+    assert frame.health.reasons[0] == 'singular: restarted'
     step = np.linalg.norm(slam.estimate.pose[:2] - answers[-1][1].pose[:2])
     assert step == pytest.approx(np.linalg.norm(run[-1].motion.delta[:2]), abs=1e-6)
     assert np.all(np.diag(frame.cov_map) >= np.diag(answers[-1][1].cov))

@@ -101,7 +101,7 @@ def test_noiseless_run_has_no_error(kind):
             motion=Motion(s.motion.delta, s.motion.cov * 1e14),
         )
         for s in run
-    ]  # the estimator is told honest sizes of 0.1
+    ]  # the estimator is given the true sizes of 0.1
     estimates, owner, _ = follow(run)
     for estimate, step in zip(estimates, run, strict=True):
         # sigma 1e-9 and marginalisation at 1e-4 convergence leave some 1e-8

@@ -89,7 +89,7 @@ def test_without_alignment_a_shift_is_an_error():
     assert_allclose(trajectory_errors(moved, truth).distances, 0.5)
 
 
-def test_truth_without_headings_judges_positions():
+def test_truth_without_headings_compares_positions():
     truth = wavy()
     blind = Trajectory(truth.stamps, truth.poses * [1.0, 1.0, np.nan])
     s = trajectory_errors(truth, blind).summary()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``rlml-lab bench robust`` and ``rlml optimize --robust``: wrong closures are found and told."""
+"""``rlml-lab bench robust`` and ``rlml optimize --robust``: wrong closures are listed."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_a_cluster_of_wrong_closures_agrees_on_one_false_placing():
     assert_allclose(se2.wrap(moved[:, 2] - moved[0, 2]), 0.0, atol=1e-9)
 
 
-def test_benchmark_judges_against_the_graph_without_wrong_closures(graph_file, capsys):
+def test_benchmark_compares_with_the_graph_without_wrong_closures(graph_file, capsys):
     words = ['bench', 'robust', str(graph_file), '--wrong', '0', '20', '20%', '--seeds', '2']
     rivals = ['gtsam gnc', 'gtsam cauchy', 'gtsam dcs']
     assert main([*words, '--json', *(w for r in rivals for w in ('--without', r))]) == 0
@@ -149,9 +149,9 @@ def test_optimize_tells_which_closures_it_disabled(graph_file, tmp_path, capsys,
     before = len(graph.edges)
     add_random(graph, 2, np.random.default_rng(5))
     write_graph(tmp_path / 'wrong.g2o', graph)
-    told = [graph_file, tmp_path / 'wrong.g2o']
+    paths = [graph_file, tmp_path / 'wrong.g2o']
     figures = []
-    for path in told:
+    for path in paths:
         assert rlml(['optimize', str(path), '--robust', robust, '--json']) == 0
         figures.append(json.loads(capsys.readouterr().out))
     assert figures[1]['refused'][-2:] == [before, before + 1]

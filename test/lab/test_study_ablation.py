@@ -69,9 +69,9 @@ def test_study_is_written_and_told(tmp_path, capsys):
     arguments = ['study', 'front-end', '--seeds', '1', '--world', 'corridor', '--kidnaps', '0']
     arguments += ['--sensors', 'odometry', 'both', '--fault', 'dropout', '--out', str(tmp_path)]
     assert main([*arguments, '--json']) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told == json.loads((tmp_path / 'results.json').read_text())
-    drives = told['drives']
+    figures = json.loads(capsys.readouterr().out)
+    assert figures == json.loads((tmp_path / 'results.json').read_text())
+    drives = figures['drives']
     assert list(drives) == ['corridor, odometry', 'corridor, both', 'corridor, dropout']
     assert (
         drives['corridor, both']['ate_m']['mean'] < drives['corridor, odometry']['ate_m']['mean']
@@ -79,7 +79,7 @@ def test_study_is_written_and_told(tmp_path, capsys):
     ratio = (
         drives['corridor, dropout']['ate_m']['mean'] / drives['corridor, both']['ate_m']['mean']
     )
-    assert told['robustness']['corridor, dropout']['ratio'] == pytest.approx(ratio)
+    assert figures['robustness']['corridor, dropout']['ratio'] == pytest.approx(ratio)
     page = (tmp_path / 'report.html').read_text()
     assert 'corridor, dropout' in page
     assert 'no robot was carried away' in page

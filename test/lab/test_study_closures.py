@@ -29,16 +29,16 @@ def test_reference_agrees_with_all_relations_of_a_part():
 
 
 def test_odometry_is_spoilt_step_by_step(monkeypatch):
-    told = []
+    sent = []
     slam = MisledSlam(Parameters())
     monkeypatch.setattr(
-        slam.synchronizer, 'add_odometry', lambda sample: told.append(sample) or []
+        slam.synchronizer, 'add_odometry', lambda sample: sent.append(sample) or []
     )
     slam.scale, slam.turn = 1.1, 1.05
     pose = np.array([1.0, 2.0, 0.5])
     for k in range(3):
         slam.add_odometry(Odometry(k, pose))
         pose = se2.compose(pose, se2.exp([0.2, 0.0, 0.1]))
-    assert_allclose(told[0].pose, [1.0, 2.0, 0.5])
-    for a, b in itertools.pairwise(told):
+    assert_allclose(sent[0].pose, [1.0, 2.0, 0.5])
+    for a, b in itertools.pairwise(sent):
         assert_allclose(se2.log(se2.between(a.pose, b.pose)), [0.22, 0.0, 0.105], atol=1e-12)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The EKF study: association judged by true places, the NEES of many drives, the page."""
+"""The EKF study: association checked by true positions, the NEES of many drives, the page."""
 
 from __future__ import annotations
 
@@ -92,13 +92,13 @@ def test_a_wall_is_in_one_place_from_everywhere():
 
 
 def drives(scale, seeds=60, n=50):
-    """Judged runs whose errors have ``scale`` times the believed variance."""
+    """Runs whose errors have ``scale`` times the believed variance."""
     rng = np.random.default_rng(5)
     out = []
     for _ in range(seeds):
         e = np.sqrt(scale) * rng.standard_normal((n, 3))
         stamps = np.arange(n, dtype=np.int64) * 10**8
-        out.append(consistency.Judged(stamps, (e**2).sum(axis=1), e[:, 2], np.abs(e[:, 0])))
+        out.append(consistency.CaseErrors(stamps, (e**2).sum(axis=1), e[:, 2], np.abs(e[:, 0])))
     return consistency.series(out)
 
 
@@ -119,8 +119,10 @@ def test_overconfident_covariance_is_called_so():
 
 
 def test_only_instants_known_to_all_seeds_count():
-    a = consistency.Judged(np.array([1, 2, 3]), np.ones(3), np.zeros(3), np.zeros(3))
-    b = consistency.Judged(np.array([2, 3, 4]), np.array([np.nan, 5, 6]), np.zeros(3), np.zeros(3))
+    a = consistency.CaseErrors(np.array([1, 2, 3]), np.ones(3), np.zeros(3), np.zeros(3))
+    b = consistency.CaseErrors(
+        np.array([2, 3, 4]), np.array([np.nan, 5, 6]), np.zeros(3), np.zeros(3)
+    )
     assert_allclose(consistency.series([a, b]).nees, [[1.0], [5.0]])
 
 

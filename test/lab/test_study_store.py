@@ -16,14 +16,14 @@ def test_nothing_is_lost_to_kills_and_damages(capsys):
 
 
 def test_what_is_wrong_is_found(tmp_path, monkeypatch):
-    """The judge is not blind: files that mix versions, or lack the one before, are told."""
+    """Files that mix versions, or lack the one before, are found."""
     path = map_container.write(tmp_path / 'a.rlml', study.version(3))
-    assert study._judge(path, 3) == study.WHOLE
-    assert study._judge(path, 9) == study.OLDER
-    assert study._judge(path, 2) == study.WRONG
+    assert study._classify(path, 3) == study.WHOLE
+    assert study._classify(path, 9) == study.OLDER
+    assert study._classify(path, 2) == study.WRONG
     mixed = study.version(3)
     mixed.arrays['pose'][7] = 2.0
-    assert study._judge(map_container.write(tmp_path / 'b.rlml', mixed), 3) == study.WRONG
+    assert study._classify(map_container.write(tmp_path / 'b.rlml', mixed), 3) == study.WRONG
     path.write_bytes(path.read_bytes()[:-1])
     assert study._refusal(path) == study.LOST
     monkeypatch.setattr(map_container, '_is_whole', lambda path: False)
@@ -31,5 +31,5 @@ def test_what_is_wrong_is_found(tmp_path, monkeypatch):
 
 
 def test_report_counts(capsys):
-    told = study.text({'kills': {'whole': 3, 'previous whole': 3}, 'damages': {}})
-    assert told == '3 kills: 3 previous whole, 3 whole\n0 damages: none'
+    text = study.text({'kills': {'whole': 3, 'previous whole': 3}, 'damages': {}})
+    assert text == '3 kills: 3 previous whole, 3 whole\n0 damages: none'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Corrections of map to odom are told, and taken over no faster than wanted."""
+"""Corrections of map to odom are reported, and taken over no faster than wanted."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ SLOW = replace(BackEnd(), correction_speed=0.2, correction_turn_rate=0.1)
 
 
 def run(params, targets, bases):
-    told = []
-    steady = SmoothedCorrection(params, lambda stamp, jump: told.append((stamp, jump)))
+    reported = []
+    steady = SmoothedCorrection(params, lambda stamp, jump: reported.append((stamp, jump)))
     out = [
         steady.follow(k * STEP, t, b) for k, (t, b) in enumerate(zip(targets, bases, strict=True))
     ]
-    return np.array(out), told
+    return np.array(out), reported
 
 
 def corrected(by, n=60, at=5):
@@ -36,16 +36,16 @@ def corrected(by, n=60, at=5):
 
 def test_without_a_limit_it_follows_at_once():
     targets, bases = corrected((0.3, -0.1, 0.05))
-    out, told = run(BackEnd(), targets, bases)
+    out, reported = run(BackEnd(), targets, bases)
     np.testing.assert_allclose(out, targets, atol=1e-9)
-    ((stamp, jump),) = told
+    ((stamp, jump),) = reported
     assert stamp == 5 * STEP
     np.testing.assert_allclose(jump, [0.3, -0.1, 0.05], atol=1e-9)
 
 
 def test_robot_is_moved_no_faster_than_wanted_and_arrives():
     targets, bases = corrected((0.3, -0.1, 0.05))
-    out, told = run(SLOW, targets, bases)
+    out, reported = run(SLOW, targets, bases)
     shown = se2.compose(out, bases)
     steps = se2.between(shown[:-1], shown[1:])
     assert np.hypot(steps[:, 0], steps[:, 1]).max() <= 0.2 * 0.1 + 1e-9
@@ -54,7 +54,7 @@ def test_robot_is_moved_no_faster_than_wanted_and_arrives():
     # 0.316 m at 0.2 m/s
     arrived = np.argmax(np.abs(out - targets[-1]).max(axis=1) < 1e-9)
     assert arrived == 5 + 15
-    assert len(told) == 1  # the jump of the estimate, not each step after it
+    assert len(reported) == 1  # the jump of the estimate, not each step after it
 
 
 def test_limit_holds_for_a_robot_that_drives():
@@ -71,9 +71,9 @@ def test_limit_holds_for_a_robot_that_drives():
 @pytest.mark.parametrize('by', [(3.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
 def test_robot_that_was_elsewhere_all_the_time_is_put_there_at_once(by):
     targets, bases = corrected(by)
-    out, told = run(SLOW, targets, bases)
+    out, reported = run(SLOW, targets, bases)
     np.testing.assert_allclose(out, targets, atol=1e-9)
-    assert len(told) == 1
+    assert len(reported) == 1
 
 
 def test_small_corrections_are_no_jumps():

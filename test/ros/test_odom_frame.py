@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where odom lies, told by frames with and without odometry."""
+"""Where odom lies, estimated from frames with and without odometry."""
 
 from __future__ import annotations
 

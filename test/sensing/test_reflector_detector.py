@@ -16,7 +16,12 @@ from scipy.integrate import quad
 from scipy.optimize import least_squares
 
 from rlml_lab.studies.detector_scenes import Scene, StillLaser, cylinders, room, surface
-from rlml_lab.studies.study_detector import judge_cylinders, judge_hall, judge_rooms, judge_worlds
+from rlml_lab.studies.study_detector import (
+    evaluate_cylinders,
+    evaluate_hall,
+    evaluate_rooms,
+    evaluate_worlds,
+)
 from rlml_slam import se2
 from rlml_slam.params import Detector, Laser
 from rlml_slam.sensing.reflectors.background_intensity import is_circular
@@ -338,7 +343,7 @@ def test_the_sweeps_motion_is_taken_out():
 @pytest.mark.parametrize('diameter', [0.04, 0.06, 0.1])
 @pytest.mark.parametrize('distance', [2.0, 10.0, 25.0])
 def test_centres_are_unbiased_and_their_covariance_is_honest(diameter, distance):
-    f = judge_cylinders(Detector(), Laser(), diameter, distance, scans=60, seed=1)
+    f = evaluate_cylinders(Detector(), Laser(), diameter, distance, scans=60, seed=1)
     # 2 mm asked for, and three sigmas of what 720 cylinders tell
     limit = 2.0 + 3.0 * f['bias_error_mm']
     assert abs(f['bias_along_mm']) < limit
@@ -350,16 +355,16 @@ def test_centres_are_unbiased_and_their_covariance_is_honest(diameter, distance)
 
 
 def test_people_and_glossy_walls_are_no_reflectors():
-    worlds = judge_worlds(Detector(), 20.0, seed=3)
+    worlds = evaluate_worlds(Detector(), 20.0, seed=3)
     assert worlds['scans'] > 700
     assert worlds['false_per_1000_scans'] <= 1.0
-    rooms = judge_rooms(Detector(), Laser(), 1000, 0, seed=3)
+    rooms = evaluate_rooms(Detector(), Laser(), 1000, 0, seed=3)
     assert sum(rooms['rejected'].values()) > 500  # there is much that tempts
     assert rooms['false'] <= 5
 
 
 def test_the_hall_is_seen_in_motion():
-    f = judge_hall(Detector(), 30.0, seed=2)
+    f = evaluate_hall(Detector(), 30.0, seed=2)
     assert f['visible'] > 1000
     assert f['detected'] > 0.9
     assert f['false'] == 0

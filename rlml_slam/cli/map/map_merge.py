@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``rlml map merge``: two saved maps as one, where their reflectors tell how they lie."""
+"""``rlml map merge``: two saved maps as one, aligned by the reflectors that both have."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ class BagInputs:
             for _, _, message in itertools.islice(self._bag.messages([topic]), most):
                 yield message
         except BagError:
-            return  # the damage is met again, and told, when the inputs are read
+            return  # reading the inputs meets the damage again and reports it
 
     def _read_tf(self) -> None:
         """Static transforms wherever they are in the bag, and those that /tf begins with."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A question to a running node, by a service that answers in words."""
+"""Call a service of a running node that answers with a message."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ WORK = 120.0  # [s] in which it answers: to save or to search a large map takes 
 
 
 def ask(node: str, service: str, argument: str | None = None) -> str:
-    """The answer of a running node; InputError with its words where it refuses."""
+    """The answer of a running node; InputError with its message where it refuses."""
     from diagnostic_msgs.srv import AddDiagnostics
     from std_srvs.srv import Trigger
 
     if argument is None:
-        return told(call(node, service, Trigger, {}))
-    return told(call(node, service, AddDiagnostics, {'load_namespace': argument}))
+        return message_of(call(node, service, Trigger, {}))
+    return message_of(call(node, service, AddDiagnostics, {'load_namespace': argument}))
 
 
-def told(answer: Any) -> str:
-    """The words of an answer; InputError with them where it is no success."""
+def message_of(answer: Any) -> str:
+    """The message of an answer; InputError with it where the service refused."""
     if not answer.success:
         raise InputError(str(answer.message))
     return str(answer.message)

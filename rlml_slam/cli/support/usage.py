@@ -24,7 +24,7 @@ class Usage:
 
 
 def usage(pid: int, time: float) -> Usage | None:
-    """Of one process; None where it is gone or the system does not say."""
+    """Of one process; None where it has ended or the system does not say."""
     try:
         # the command's name may hold spaces and brackets: fields are counted after it
         fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()

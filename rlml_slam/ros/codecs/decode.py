@@ -3,7 +3,7 @@
 
 So the same functions read rclpy's messages and those that rosbags reads from ROS 1 and ROS 2
 bags. Each raises InputError that names topic and field where a message cannot be believed; what
-can be judged only in context (order of stamps, known frames) is left to the sequencer.
+can be checked only in context (order of stamps, known frames) is left to the sequencer.
 """
 
 from __future__ import annotations
@@ -208,7 +208,7 @@ def start_pose(msg: Any, map_frame: str, topic: str = 'initialpose') -> PoseEsti
 
 
 def _planar_covariance(msg: Any, topic: str) -> Array:
-    """(3, 3) of x, y and yaw as it is told: finite, without a negative variance."""
+    """(3, 3) of x, y and yaw: finite, without a negative variance."""
     full = np.asarray(msg.pose.covariance, dtype=np.float64)
     cov = np.array(full.reshape(6, 6)[_PLANAR])
     if not np.isfinite(cov).all() or (np.diag(cov) < 0.0).any():

@@ -3,7 +3,7 @@
 
 The library makes an object of every part of a message; an Odometry has nine of them, and two
 arrays that nobody reads. Layout: the CDR of OMG's DDSI-RTPS, little-endian, where each number is
-aligned to its size, counted from the end of the four bytes that tell the encoding.
+aligned to its size, counted from the end of the four bytes of the encoding.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 ENCODING = b'\x00\x01'  # plain, little-endian
-START = 4  # bytes that tell it
+START = 4  # bytes of the encoding
 _HEADER = Struct('<iII')  # sec, nanosec, bytes of the frame id
 _LENGTH = Struct('<I')
 _POSE = Struct('<7d')

@@ -37,7 +37,7 @@ class CarrierMessages:
         self._odom = np.zeros(3)
 
     def __call__(self, step: CarrierStep, after: CarrierStep) -> list[tuple[str, Any]]:
-        """(topic, message) of a step; ``after`` tells the velocity that the carrier now takes."""
+        """(topic, message) of a step; ``after`` announces the next velocity of the carrier."""
         make, p, stamp = self._make, self._p, START + step.stamp
         self._odom = compose(self._odom, step.motion.delta)
         velocity = CarrierVelocity(after.linear, after.angular)

@@ -30,7 +30,7 @@ class DetectorHealth:
         self._publisher = node.create_publisher(
             rclpy_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', 10
         )
-        # steady: with simulated time, silence of /clock must be told as well
+        # steady: with simulated time, silence of /clock must be reported as well
         node.create_timer(PERIOD, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def update(self, scan: Scan, found: Found) -> None:

@@ -20,7 +20,7 @@ from rlml_slam.ros.codecs.message_types import make_rclpy
 
 
 class EkfServices:
-    """save_map, load_map and reset; ``begin(saved)`` starts anew, in a map or without one."""
+    """save_map, load_map and reset; ``begin(saved)`` restarts, in a map or without one."""
 
     def __init__(
         self,
@@ -73,5 +73,5 @@ class EkfServices:
     def reset(self, _request: Any, response: Any) -> Any:
         """Forget what was estimated and begin at map_start_pose; a loaded map stays."""
         self._begin(self.saved)
-        response.success, response.message = True, 'the map begins anew'
+        response.success, response.message = True, 'the map was discarded and restarted'
         return response

@@ -177,7 +177,7 @@ class SimulatedTopics:
             self._publishers[topic].publish(message)
             self.published[topic] += 1
 
-    def tell(self, stamp: int) -> None:
+    def publish_clock(self, stamp: int) -> None:
         """Say on /diagnostics how many messages were published."""
         figures = {f'{topic} published': n for topic, n in self.published.items()}
         self._diagnostics.publish(

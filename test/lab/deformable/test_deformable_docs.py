@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/deformable.md says what the code says, as far as that can be told in a second."""
+"""docs/deformable.md says what the code says, as far as a second of checks can show."""
 
 from __future__ import annotations
 
