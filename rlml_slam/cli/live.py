@@ -15,7 +15,7 @@ from rlml_slam.report.outputs import make_folder, write_outputs
 from rlml_slam.report.summary import print_summary
 from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.codecs.decode import frame
-from rlml_slam.ros.sensor_input import STREAMS
+from rlml_slam.ros.sensor_input import PLACED, STREAMS
 
 
 def add_parser(subparsers: Any) -> None:
@@ -58,7 +58,7 @@ def source(
 
     # nodes listen to the topics that replay takes
     system: dict[str, Any] = {STREAMS[s][0]: topic for s, topic in inputs.topics.items()}
-    sensor = next(s for s in ('scan', 'reflectors', 'reflector_poses') if s in inputs.topics)
+    sensor = next(s for s in PLACED if s in inputs.topics)
     system |= sensor_place(bag, inputs, inputs.topics[sensor])
     return Source(
         f'{Path(args.bag).resolve().name}, live',

@@ -29,7 +29,7 @@ from rlml_slam.params import EkfParameters, Parameters, from_mapping, read_yaml
 from rlml_slam.report.outputs import make_folder, write_outputs
 from rlml_slam.report.summary import print_summary
 from rlml_slam.ros.bags.bag import BagReader
-from rlml_slam.ros.sensor_input import SensorInput
+from rlml_slam.ros.sensor_input import SensorInput, counted_as
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.closures.closure_table import closure_table
 from rlml_slam.slam.offline.slam import Slam
@@ -250,9 +250,9 @@ def fates(
     """
     unread: Counter[str] = Counter()
     for stream, topic in topics.items():
-        unread[_counted_as(stream)] += skipped.get(topic, 0)
+        unread[counted_as(stream)] += skipped.get(topic, 0)
     out: dict[str, dict[str, int]] = {}
-    for stream in dict.fromkeys([*map(_counted_as, topics), *counts]):
+    for stream in dict.fromkeys([*map(counted_as, topics), *counts]):
         fate = {'used': 0, 'late': 0, 'invalid': 0} | dict(counts.get(stream, {}))
         fate['invalid'] += unread[stream]
         out[stream] = fate
@@ -263,9 +263,5 @@ def sources(topics: Mapping[str, str], more_scans: Iterable[str] = ()) -> dict[s
     """The topics of a bag that each counted stream came from."""
     out: dict[str, list[str]] = {}
     for stream, topic in (*topics.items(), *(('scan', topic) for topic in more_scans)):
-        out.setdefault(_counted_as(stream), []).append(topic)
+        out.setdefault(counted_as(stream), []).append(topic)
     return {stream: ', '.join(names) for stream, names in out.items()}
-
-
-def _counted_as(stream: str) -> str:
-    return 'reflectors' if stream == 'reflector_poses' else stream

@@ -3,11 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Generic, Protocol, TypeVar
 
 from rlml_slam.errors import InputError
-from rlml_slam.params import Node, Parameters
+from rlml_slam.params import Node, Parameters, Reflector
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.codecs.decode import frame
 from rlml_slam.ros.tf import Extrinsics
@@ -26,11 +26,21 @@ STREAMS: Mapping[str, tuple[str, str, bool]] = {
     'reflectors': ('reflectors_topic', 'sensor_msgs/msg/PointCloud2', False),
     'reflector_poses': ('reflector_poses_topic', 'geometry_msgs/msg/PoseArray', False),
 }
+# streams of reflectors, and what reads their messages
+DETECTIONS: Mapping[str, Callable[[Any, Reflector], Detections]] = {
+    'reflectors': decode.detections,
+    'reflector_poses': decode.detections_of_poses,
+}
 USED_BY = {
     'scan': 'use_scan', 'odom': 'use_odom', 'imu': 'use_imu',
-    'reflectors': 'use_reflectors', 'reflector_poses': 'use_reflectors',
+    **dict.fromkeys(DETECTIONS, 'use_reflectors'),
 }  # fmt: skip
-PLACED = ('scan', 'reflectors', 'reflector_poses')  # streams whose sensor has to have a place
+PLACED = ('scan', *DETECTIONS)  # streams whose sensor has to have a place
+
+
+def counted_as(stream: str) -> str:
+    """The name under which inputs of a stream are counted: one for all that bring reflectors."""
+    return 'reflectors' if stream in DETECTIONS else stream
 
 
 def topics_of(node: Node, stream: str) -> tuple[str, ...]:
@@ -80,8 +90,7 @@ class SensorInput(Generic[Out]):
                 self.is_placed(msg)
             sample = self._converted(stream, msg)
         except InputError as e:
-            name = 'reflectors' if stream == 'reflector_poses' else stream
-            self._inputs.count(name, 'invalid', str(e))
+            self._inputs.count(counted_as(stream), 'invalid', str(e))
             return []
         if isinstance(sample, Scan):
             return self._target.add_scan(sample)
@@ -110,7 +119,6 @@ class SensorInput(Generic[Out]):
         return self.extrinsics.hangs(base, sensor)
 
     def _converted(self, stream: str, msg: Any) -> Odometry | Imu | Scan | Detections:
-        noise = self._p.reflector
         if stream == 'scan':
             scan = decode.scan(msg)
             return mirrored_scan(scan) if self.hangs(scan.frame_id) else scan
@@ -119,6 +127,5 @@ class SensorInput(Generic[Out]):
         if stream == 'imu':
             up = self.extrinsics.up(self._p.node.base_frame, frame(msg.header.frame_id))
             return decode.imu(msg, up=up)
-        read = decode.detections if stream == 'reflectors' else decode.detections_of_poses
-        seen = read(msg, noise)
+        seen = DETECTIONS[stream](msg, self._p.reflector)
         return mirrored_detections(seen) if self.hangs(seen.frame_id) else seen

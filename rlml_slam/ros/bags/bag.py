@@ -33,7 +33,7 @@ from rlml_slam.params import Node
 from rlml_slam.ros.bags.bag_recovery import BagRecovery
 from rlml_slam.ros.codecs.fast_decode import READERS
 from rlml_slam.ros.codecs.message_types import bag_types
-from rlml_slam.ros.sensor_input import STREAMS, USED_BY, topics_of
+from rlml_slam.ros.sensor_input import PLACED, STREAMS, USED_BY, topics_of
 
 
 @dataclass(frozen=True)
@@ -259,7 +259,7 @@ def choose_topics(topics: Mapping[str, Topic], node: Node) -> dict[str, str]:
             )
         if fitting:
             chosen[stream] = fitting[0]
-    if not chosen.keys() & {'scan', 'reflectors', 'reflector_poses'}:
+    if not chosen.keys() & set(PLACED):
         listed = ', '.join(f'{t.name} ({t.msgtype})' for t in topics.values()) or 'nothing'
         raise BagError(f'no scan and no reflectors in the bag, which has {listed}')
     return chosen
