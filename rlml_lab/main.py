@@ -65,6 +65,7 @@ COMMANDS: Table = {
             ),
         },
     ),
+    'results': Command('rlml_lab.results', 'the page of benchmarks, from docs/benchmarks.json'),
     'bench': Group(
         'measured speed and quality against other libraries',
         {
