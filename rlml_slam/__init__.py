@@ -7,7 +7,8 @@ The names below are the Python API; each is imported when it is first used.
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = '0.1.0'
+from rlml_slam.version import __version__ as __version__
+
 __all__ = [
     'Parameters',
     'RlmlError',

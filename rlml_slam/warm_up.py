@@ -10,8 +10,7 @@ import importlib
 import pkgutil
 import sys
 from collections.abc import Callable, Iterator
-
-import rlml_slam
+from pathlib import Path
 
 OTHER_SYSTEMS = ('deformable', 'ekf')  # compiled when they are first used
 OUTER = ('ros', 'nodes', 'cli', 'datasets', 'evaluation', 'report')  # tiers without kernels
@@ -19,7 +18,7 @@ OUTER = ('ros', 'nodes', 'cli', 'datasets', 'evaluation', 'report')  # tiers wit
 
 def core_modules() -> Iterator[str]:
     """Names of all modules of the core."""
-    for module in pkgutil.walk_packages(rlml_slam.__path__, 'rlml_slam.'):
+    for module in pkgutil.walk_packages([str(Path(__file__).parent)], 'rlml_slam.'):
         if module.name.split('.')[1] not in OUTER:
             yield module.name
 

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, TypeAlias
 
-from rlml_slam import __version__
 from rlml_slam.errors import RlmlError
+from rlml_slam.version import __version__
 
 INTERRUPTED = 130  # what a shell reports for Ctrl-C
 

@@ -8,12 +8,12 @@ from collections.abc import Iterator, Mapping
 from html import escape
 from typing import Any
 
-from rlml_slam import __version__
 from rlml_slam.evaluation.run_record import Run
 from rlml_slam.evaluation.survey_residuals import changes, name_of
 from rlml_slam.report.summary import summary_rows
 from rlml_slam.slam.landmarks.reflector_states import PRESENT, told
 from rlml_slam.types import Level
+from rlml_slam.version import __version__
 
 CAPTIONS = {
     'map': 'Map, trajectory, reflectors with 95 % ellipses, and loop closures',

@@ -29,7 +29,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam import __version__
 from rlml_slam.errors import FileFormatError, MapError, SolverError
 from rlml_slam.graph.model.factor_table import FactorKind, FactorTable
 from rlml_slam.graph.model.graph import Graph
@@ -43,6 +42,7 @@ from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.closures.loop_closure import Closure
 from rlml_slam.slam.keyframes import Keyframe
 from rlml_slam.types import Reflectors
+from rlml_slam.version import __version__
 
 FORMAT, VERSION = 'rlml_slam map', 1
 COLUMNS = ('nodes', 'measured', 'information', 'kinds', 'enabled')
