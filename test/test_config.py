@@ -185,7 +185,7 @@ with BagReader(sys.argv[1]) as bag:
         feed.add(stream_of[topic], message)
 slam.finish()
 slam.occupancy_grid(), slam.reflectors(), slam.trajectory()
-assert any(c.accepted for c in slam.back_end.scans.closures)
+assert any(c.accepted for c in slam.back_end.loop_closer.records)
 print('late:', *sorted(compiled() - before))
 """
     done = subprocess.run(

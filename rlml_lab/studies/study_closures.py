@@ -129,12 +129,12 @@ def evaluate(slam: Slam, relations: Relations) -> dict[str, float]:
     # from the pose that the relations know to the keyframe, as the estimate has it
     step = se2.between(path[nearest(stamps, known[at])], path[nearest(stamps, keys)])
     true, is_known = se2.compose(poses[at], step), np.abs(known[at] - keys) <= AWAY
-    tried = [c for c in back_end.scans.closures
+    tried = [c for c in back_end.loop_closer.records
              if is_known[c.i] and is_known[c.j] and part[at[c.i]] == part[at[c.j]]]  # fmt: skip
     out = dict.fromkeys(
         ('accepted', 'checked', 'right', 'right_disabled', 'wrong', 'wrong_disabled'), 0.0
     )
-    out['accepted'] = float(sum(c.accepted for c in back_end.scans.closures))
+    out['accepted'] = float(sum(c.accepted for c in back_end.loop_closer.records))
     reachable = found = 0
     for c in tried:
         T = se2.between(true[c.i], true[c.j])
@@ -145,6 +145,6 @@ def evaluate(slam: Slam, relations: Relations) -> dict[str, float]:
         verdict = 'wrong' if np.hypot(e[0], e[1]) > WRONG or abs(e[2]) > WRONG_TURN else 'right'
         out['checked'] += 1.0
         out[verdict] += 1.0
-        out[f'{verdict}_disabled'] += c.fate.state is not State.ACTIVE
+        out[f'{verdict}_disabled'] += c.status.state is not State.ACTIVE
         found += verdict == 'right' and bool(np.hypot(T[0], T[1]) < REACH)
     return out | {'within_reach': float(reachable), 'recall': found / max(reachable, 1)}

@@ -231,7 +231,7 @@ def row(slam: Slam, errors: list[float], t: float, before_mb: float) -> dict[str
         'keyframes': len(back_end.keyframes),
         'edges': int(back_end.graph.edges.enabled.sum()),
         'sightings': int(back_end.graph.sightings.enabled.sum()),
-        'submaps': back_end.scans.num_submaps,
+        'submaps': back_end.scan_graph.num_submaps,
         'memory_mb': memory_mb,
         'grown_mb': memory_mb - before_mb,
         'taken': len(ms),

@@ -17,7 +17,7 @@ from rlml_slam.errors import InputError, MapError
 from rlml_slam.maps import map_container
 from rlml_slam.params import Parameters
 from rlml_slam.slam.back_end.back_end import BackEnd
-from rlml_slam.slam.closures.closure_table import COLUMNS, closure_table, told
+from rlml_slam.slam.closures.closure_table import COLUMNS, closure_table, describe
 from rlml_slam.slam.store import map_file
 
 
@@ -65,7 +65,7 @@ def revoke(path: Path, number: int) -> str:
     warm_up.compile_loaded()
     content, closure = map_file.revoked(map_file.load(path), number)
     map_container.write(path, content)
-    return told(closure)
+    return describe(closure)
 
 
 def read(folder: Path) -> list[dict[str, str]]:
@@ -73,7 +73,7 @@ def read(folder: Path) -> list[dict[str, str]]:
     if folder.is_file():
         back_end = BackEnd(Parameters())
         map_file.restore(map_file.load(folder), back_end)
-        return parse(closure_table(back_end.scans.closures), str(folder))
+        return parse(closure_table(back_end.loop_closer.records), str(folder))
     path = folder / 'closures.csv'
     try:
         return parse(path.read_text(encoding='utf-8'), str(path))

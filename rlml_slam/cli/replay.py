@@ -220,7 +220,7 @@ def collect(slam: Slam | EkfSlam, log: FrameLog, name: str, truth: Truth | None)
     back_end = slam.back_end
     indices = [key.index for key in back_end.keyframes]
     poses = back_end.graph.poses
-    tried = back_end.scans.closures
+    tried = back_end.loop_closer.records
     ends = [poses[[c.i, c.j], :2] for c in tried if c.accepted]
     return Run(
         name,
@@ -230,7 +230,7 @@ def collect(slam: Slam | EkfSlam, log: FrameLog, name: str, truth: Truth | None)
         grid,
         np.array(poses[indices]).reshape(-1, 3),
         np.array(ends).reshape(-1, 2, 2),
-        back_end.scans.tried[False],
+        back_end.loop_closer.tried[False],
         np.array([u.wall_ms for u in slam.updates]),
         truth=truth,
         problem=problem,

@@ -22,7 +22,7 @@ from rlml_slam.ros.declare import declare
 from rlml_slam.ros.diagnostics import HealthPublisher
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensors import checked
-from rlml_slam.slam.closures.closure_table import fates
+from rlml_slam.slam.closures.closure_table import state_counts
 
 DEPTH = 200  # of the front end's answers: none may be lost while the map is drawn
 SETTLE_PERIOD = 0.1  # [s] between two looks whether the input has fallen silent
@@ -75,12 +75,12 @@ class BackEndNode(Node):
         return {
             'keyframes': len(back_end.graph.poses),
             'edges': len(back_end.graph.edges),
-            'closures accepted': back_end.scans.tried[True],
-            'closures rejected': back_end.scans.tried[False],
-            **fates(back_end.scans.closures),
+            'closures accepted': back_end.loop_closer.tried[True],
+            'closures rejected': back_end.loop_closer.tried[False],
+            **state_counts(back_end.loop_closer.records),
             **self.mapper.continued,
             **({} if back_end.survey_frame is None else {'survey': back_end.survey_frame.why}),
-            'constellations not searched': back_end.constellations.not_searched,
+            'constellations not searched': back_end.constellation_search.not_searched,
             'frames waiting for the worker': self.mapper.worker.backlog,
             'frames without their points or detections': self.join.incomplete,
         }

@@ -11,7 +11,7 @@ from typing import Any
 from rlml_slam.evaluation.run_record import Run
 from rlml_slam.evaluation.survey_residuals import changes, name_of
 from rlml_slam.report.summary import summary_rows
-from rlml_slam.slam.landmarks.reflector_states import PRESENT, told
+from rlml_slam.slam.landmarks.reflector_states import PRESENT, describe
 from rlml_slam.types import Level
 from rlml_slam.version import __version__
 
@@ -57,7 +57,7 @@ def report_html(run: Run, figures: Mapping[str, Any], pictures: Mapping[str, byt
     parts.append(_section('Figures', _table(summary_rows(figures))))
     if figures.get('survey', {}).get('found'):
         parts.append(_section('Reflectors against the survey', _table(_residuals(figures))))
-    changed = [told(s).partition(': ') for s in run.reflector_states if s.state != PRESENT]
+    changed = [describe(s).partition(': ') for s in run.reflector_states if s.state != PRESENT]
     if changed:
         rows = [(kind, what) for kind, _, what in changed]
         parts.append(_section('New, moved, missing and ghost reflectors', _table(rows)))

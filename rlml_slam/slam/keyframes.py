@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keyframes, and what is collected between two of them."""
+"""Keyframes, and the measurements that are collected between two of them."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ from rlml_slam.motion import STILL, compose_motion
 from rlml_slam.se2 import Array
 from rlml_slam.types import ANONYMOUS, Frame, Motion
 
-# [m, m, rad] of an edge over a jump: it keeps the graph in one piece, and what is seen at both
-# of its ends, which the place was found with, says where they are
+# [m, m, rad] of the edge over a jump, from before a relocalization to after it: it keeps the graph
+# connected, and reflectors and submaps seen at both ends determine the relative pose
 JUMP_SIGMA = np.array([0.5, 0.5, 0.2])
-AGREE = 9.2  # 99 % of a chi-square with 2 degrees of freedom
+SIGHTING_GATE = 9.2  # 99 % of a chi-square with 2 degrees of freedom
 
 
 @dataclass(eq=False)
 class Keyframe:
-    """A pose of the graph; ``points`` (n, 2) and ``origin`` (2,) are its scan in base, or None.
+    """Pose of the graph; ``points`` (n, 2) and ``origin`` (2,) are its scan in base, or None.
 
-    ``index`` changes when keyframes before it go; ``points`` may be replaced by those of a scan
-    that was taken later at the same place, at ``scan_stamp``. ``jumped``: no motion leads to it.
+    ``index`` changes when keyframes before it are removed; ``points`` may be replaced by a later
+    scan of the same place, taken at ``scan_stamp``. ``detector_ran`` near it, with or without
+    reflectors. ``jumped``: it follows a relocalization, and no motion leads to it.
     """
 
     index: int
@@ -35,11 +36,11 @@ class Keyframe:
     points: NDArray[np.float32] | None
     origin: Array | None
     scan_stamp: int
-    looked: bool = False  # for reflectors
+    detector_ran: bool = False
     jumped: bool = False
 
     def take_scan(self, other: Keyframe, T: Array) -> None:
-        """Replace the scan by that of another keyframe, which stood at ``T`` (3,) from here."""
+        """Replace the scan by that of another keyframe at the relative pose ``T`` (3,)."""
         if other.points is not None and other.origin is not None:
             self.points = se2.transform(T, other.points).astype(np.float32)
             self.origin = se2.transform(T, other.origin[None])[0]
@@ -48,7 +49,7 @@ class Keyframe:
 
 @dataclass
 class Sighting:
-    """All detections of one reflector near one keyframe, fused in information form."""
+    """Detections of one reflector near one keyframe, fused in information form."""
 
     information: Array = field(default_factory=lambda: np.zeros((2, 2)))
     weighted: Array = field(default_factory=lambda: np.zeros(2))
@@ -63,10 +64,10 @@ class Sighting:
         self.count += 1
 
     def agrees(self, z: Array, cov: Array) -> bool:
-        """Whether z (2,) can be of the same place: an outlier must not be averaged in."""
+        """Whether a detection z (2,) with cov (2, 2) passes the gate; outliers are not fused."""
         d = z - self.z
-        spread = cov + np.linalg.inv(self.information)
-        return bool(d @ np.linalg.solve(spread, d) < AGREE)
+        S = cov + np.linalg.inv(self.information)
+        return bool(d @ np.linalg.solve(S, d) < SIGHTING_GATE)
 
     @property
     def z(self) -> Array:
@@ -75,7 +76,7 @@ class Sighting:
 
 
 class Interval:
-    """What happened since the last keyframe: motion, and reflectors seen from its frame."""
+    """Motion and reflector detections since the last keyframe, in its frame."""
 
     def __init__(self, T_local: Array) -> None:
         self._T_local = T_local
@@ -84,25 +85,25 @@ class Interval:
         self.sightings: dict[int, list[Sighting]] = {}
         self.ids: dict[int, int] = {}
         self.diameters: dict[int, float] = {}
-        self.looked = False  # for reflectors
-        self.first_look = self.last_look = 0  # stamps
-        self.detected: list[tuple[int, Array]] = []  # key or -1, and place, of each detection
+        self.detector_ran = False
+        self.first_stamp = self.last_stamp = 0  # of detections [ns]
+        self.detected: list[tuple[int, Array]] = []  # key or -1, position (2,) of each detection
 
     def add_motion(self, frame: Frame) -> None:
-        """Compose the odometry motion of one more frame."""
+        """Compose with the odometry of one more frame."""
         self.motion = compose_motion(self.motion, frame.observation.motion)
         self.scanned |= bool(np.isfinite(frame.scan_score))
 
     def jump(self, frame: Frame) -> None:
-        """The frame's place was found anew: only that place tells how far it is from here."""
+        """The frame was relocalized: replace the motion by its pose, with a wide covariance."""
         delta = se2.between(self._T_local, frame.T_local_base)
         self.motion = Motion(delta, np.diag(JUMP_SIGMA**2), known=False)
 
     def add_detections(self, frame: Frame) -> None:
-        """Move the frame's associated detections to the keyframe and fuse them.
+        """Transform the frame's detections to the keyframe and fuse those of one reflector.
 
-        The place between keyframe and frame is the front end's; its error is at most that of
-        the odometry, which is what is added to the detection's.
+        The relative pose is the front end's; the covariance of the odometry, an upper bound of
+        its error, is added to that of the detection.
         """
         d = frame.observation.detections
         if d is None:
@@ -110,11 +111,11 @@ class Interval:
         T = se2.between(self._T_local, frame.T_local_base)
         z = se2.transform(T, d.points)
         R = se2.rotation(T[2])
-        self.looked, self.last_look = True, frame.stamp
-        self.first_look = self.first_look or frame.stamp
+        self.detector_ran, self.last_stamp = True, frame.stamp
+        self.first_stamp = self.first_stamp or frame.stamp
         self.detected += zip(frame.landmarks.tolist(), z, strict=True)
         for k in np.flatnonzero(frame.landmarks >= 0):
-            self._tell(int(frame.landmarks[k]), int(d.ids[k]), float(d.diameters[k]))
+            self._set_identity(int(frame.landmarks[k]), int(d.ids[k]), float(d.diameters[k]))
             J = np.array([[1.0, 0.0, -(z[k, 1] - T[1])], [0.0, 1.0, z[k, 0] - T[0]]])
             cov = R @ d.cov[k] @ R.T + J @ self.motion.cov @ J.T
             groups = self.sightings.setdefault(int(frame.landmarks[k]), [])
@@ -124,8 +125,8 @@ class Interval:
                 groups.append(group)
             group.add(z[k], cov)
 
-    def _tell(self, key: int, id_: int, diameter: float) -> None:
-        """What a detection says of its reflector besides the place."""
+    def _set_identity(self, key: int, id_: int, diameter: float) -> None:
+        """Id and diameter of a reflector, where the detection has them."""
         if id_ != ANONYMOUS:
             self.ids[key] = id_
         if math.isfinite(diameter):

@@ -155,7 +155,7 @@ def test_back_end_is_told_of_by_its_diagnostics(live):
     assert figures['keyframes'] >= 2
     assert figures['frames without their points or detections'] == 0
     assert figures['constellations not searched'] == 0
-    back.mapper.back_end.constellations.not_searched = 2
+    back.mapper.back_end.constellation_search.not_searched = 2
     assert back.figures()['constellations not searched'] == 2
 
 
@@ -216,7 +216,7 @@ def test_loop_closures_are_listed_and_revoked_by_service(live):
     i, j = 0, len(back_end.keyframes) - 1
     delta = se2.between(back_end.graph.poses[i], back_end.graph.poses[j])
     edge = back_end.graph.add_edge(EdgeKind.CLOSURE, i, j, delta, np.eye(3))
-    back_end.scans.closures.append(Closure(i, j, delta, 0.7, edge, 'fits', number=0))
+    back_end.loop_closer.records.append(Closure(i, j, delta, 0.7, edge, 'fits', number=0))
     listed = live.call(Trigger, 'back_end/closures', Trigger.Request())
     assert listed.success
     assert parse(listed.message, 'back_end')[0]['state'] == 'active'

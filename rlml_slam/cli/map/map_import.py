@@ -67,7 +67,8 @@ def import_map(folder: Path) -> Content:
     arrays: dict[str, NDArray[Any]] = {
         'pose': graph.poses, 'pose_fixed': graph.fixed_poses,
         'landmark': graph.landmarks, 'landmark_fixed': graph.fixed_landmarks,
-        **map_file.arrays_of(keys), **back_end.scans.arrays(), **back_end.path.arrays(),
+        **map_file.arrays_of(keys), **back_end.scan_graph.arrays(),
+        **back_end.loop_closer.arrays(), **back_end.frame_trajectory.arrays(),
         'path_motion': between(graph.poses[:-1], graph.poses[1:]).reshape(-1, 3),
         **_reflectors(known, graph, folder),
     }  # fmt: skip
@@ -115,7 +116,7 @@ def _reflectors(known: Reflectors, graph: Graph, folder: Path) -> dict[str, NDAr
         )
     node, s = gap.argmin(axis=1), graph.sightings
     seen = s.nodes.reshape(-1, 2)
-    rows, beside = [], []
+    rows, together = [], []
     for key, landmark in zip(known.keys.tolist(), node.tolist(), strict=True):
         factor = np.flatnonzero(seen[:, 1] == landmark)
         row = np.zeros(len(factor), dtype=SIGHTING)
@@ -123,12 +124,12 @@ def _reflectors(known: Reflectors, graph: Graph, folder: Path) -> dict[str, NDAr
         row['z'], row['information'] = s.measured[factor], s.information[factor]
         rows.append(row)
         others = np.unique(seen[np.isin(seen[:, 0], row['pose']), 1])
-        beside += [(key, int(k)) for k in known.keys[np.isin(node, others)]]
+        together += [(key, int(k)) for k in known.keys[np.isin(node, others)]]
     return {
         'reflector_key': known.keys, 'reflector_node': node, 'reflector_id': known.ids,
         'reflector_diameter': known.diameters, 'reflector_count': known.sightings,
         'reflector_sightings': np.array([len(row) for row in rows], dtype=np.int64),
-        'reflector_beside': np.array(beside, dtype=np.int64).reshape(-1, 2),
+        'reflector_seen_together': np.array(together, dtype=np.int64).reshape(-1, 2),
         'reflector_alias': np.zeros((0, 2), dtype=np.int64),
         'sighting': np.concatenate([np.zeros(0, dtype=SIGHTING), *rows]),
     }  # fmt: skip

@@ -56,5 +56,5 @@ def _take(run: Run, folder: Path) -> None:
     run.stored = map_file.load(folder / f'{NAME}.rlml')
     back_end = BackEnd(map_file.parameters_of(run.stored))
     map_file.restore(run.stored, back_end)
-    run.closure_table = closure_table(back_end.scans.closures)
+    run.closure_table = closure_table(back_end.loop_closer.records)
     run.reflector_states = tuple(back_end.reflector_states())

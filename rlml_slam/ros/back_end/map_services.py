@@ -83,7 +83,7 @@ class MapServices:
     def closures(self, _request: Any, response: Any) -> None:
         """All loop closures with their records, as a table of comma-separated values."""
         response.success = True
-        response.message = closure_table(self._mapper.back_end.scans.closures)
+        response.message = closure_table(self._mapper.back_end.loop_closer.records)
 
     def reflectors(self, _request: Any, response: Any) -> None:
         """What has become of each reflector, as a table of comma-separated values."""

@@ -30,7 +30,7 @@ from rlml_slam.ros.odom_frame import OdomFrame
 from rlml_slam.ros.tf import TransformPublisher
 from rlml_slam.se2 import Array
 from rlml_slam.slam.back_end.back_end import BackEnd
-from rlml_slam.slam.closures.closure_table import told
+from rlml_slam.slam.closures.closure_table import describe
 from rlml_slam.slam.relocalization.global_localization import localize_globally
 from rlml_slam.slam.relocalization.recovery import Recovery
 from rlml_slam.slam.store import map_file
@@ -117,9 +117,9 @@ class Mapper:
                 place = self.back_end.graph.poses[update.keyframe, :2]
                 self._topics.update(frame.stamp, place, update)
                 for closure in update.changed:
-                    self._logger.warning(told(closure))
-                if update.gone:
-                    keys = ', '.join(map(str, update.gone))
+                    self._logger.warning(describe(closure))
+                if update.removed:
+                    keys = ', '.join(map(str, update.removed))
                     self._logger.warning(f'no longer seen where they were: reflectors {keys}')
                 if update.optimized:
                     self._tell_of_plant()
@@ -244,10 +244,10 @@ class Mapper:
         if self.saved is not None:
             raise MapError('the map that is localized in does not change')
         closure = self.back_end.revoke(int(number))
-        self._logger.warning(told(closure))
+        self._logger.warning(describe(closure))
         self._topics.correct(self.stamp, self.back_end)
         self.publish_map()
-        return told(closure)
+        return describe(closure)
 
     def publish_map(self) -> None:
         """In the worker: send map, trajectory, reflectors and graph now."""

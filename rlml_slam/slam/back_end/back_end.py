@@ -1,37 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The RLML back end: keyframes and reflectors in one graph, loop closures, the map (eq. 12-14)."""
+"""Back end of RLML: keyframes and reflectors in one graph, loop closures, the map (eq. 12-14)."""
 
 from __future__ import annotations
 
-import math
 import time
-from bisect import bisect_right
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
 from rlml_slam.errors import MapError
-from rlml_slam.estimation.correction import Correction, ReferencePose, either, turned
+from rlml_slam.estimation.correction import ReferencePose
 from rlml_slam.graph.batch.marginals import Marginals
 from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.factors import relative_information
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.graph.model.robust_loss import Loss, Losses, LossKind
-from rlml_slam.maps.occupancy import OccupancyGrid, render
+from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.survey import Survey, same
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
-from rlml_slam.slam.back_end.path_covariance import PathCovariance, held
+from rlml_slam.slam.back_end.keyframe_selection import (
+    draw,
+    is_keyframe,
+    keyframe_of,
+    odometry_edge,
+)
+from rlml_slam.slam.back_end.maintenance import GraphMaintenance
+from rlml_slam.slam.back_end.path_covariance import PathCovariance, newest_covariance
 from rlml_slam.slam.back_end.scan_graph import ScanGraph
 from rlml_slam.slam.back_end.sparsification import Sparsifier
-from rlml_slam.slam.back_end.trajectory import Path
-from rlml_slam.slam.closures.closure_monitor import ClosureMonitor
-from rlml_slam.slam.closures.constellation_closure import Constellations
+from rlml_slam.slam.back_end.trajectory import FrameTrajectory
+from rlml_slam.slam.closures.constellation_closure import ConstellationSearch
+from rlml_slam.slam.closures.loop_closer import LoopCloser
 from rlml_slam.slam.closures.loop_closure import Closure
 from rlml_slam.slam.keyframes import Interval, Keyframe
 from rlml_slam.slam.landmarks.delayed_association import DelayedAssociation
@@ -44,12 +47,12 @@ from rlml_slam.types import Belief, EdgeKind, Frame, Reflectors
 
 @dataclass(frozen=True)
 class Update:
-    """What one keyframe did; ``T_map_local`` (3,) corrects the front end where ``optimized``.
+    """Result of one keyframe; ``T_map_local`` (3,) corrects the front end where ``optimized``.
 
-    ``known``: how well the keyframe's pose is known with it, None where no one asked the graph.
-    ``closures`` were tried with it; ``changed`` are those, of any time, that it had disabled or
-    enabled again. ``gone`` are all keys of reflectors that are no longer there. ``cpu_ms`` is the
-    time that the thread computed, without what it waited for others.
+    ``known`` is the covariance of the keyframe's pose, None before the first solve. ``closures``
+    were accepted or rejected with this keyframe; ``changed`` are earlier ones that were disabled
+    or enabled with it, ``removed`` the keys of reflectors removed from the map. ``cpu_ms`` is the
+    processor time of the thread.
     """
 
     keyframe: int
@@ -59,14 +62,14 @@ class Update:
     wall_ms: float
     known: ReferencePose | None = None
     changed: tuple[Closure, ...] = ()
-    gone: tuple[int, ...] = ()
+    removed: tuple[int, ...] = ()
     cpu_ms: float = 0.0
 
 
 class BackEnd:
-    """The graph over all keyframes; ``add`` each frame, read the map at any time.
+    """Graph of keyframes and reflectors; ``add`` each frame, read the map at any time.
 
-    With a ``survey``, its frame becomes that of the map as soon as the reflectors tell it.
+    With a ``survey``, the map moves to its frame as soon as the reflectors match it.
     """
 
     def __init__(self, params: Parameters, survey: Survey | None = None) -> None:
@@ -75,322 +78,234 @@ class BackEnd:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything."""
+        """Start with an empty map."""
         p = self._p
-        self.is_told = False  # which detection is of which reflector: not to be asked again
-        # wheels slip; the front end's own motion, without any, does not
-        slips = Loss(LossKind.CAUCHY, p.back_end.odometry_robust_scale)
-        self.graph = Graph(
-            Losses(
-                odometry=slips if p.node.use_odom else Loss(),
-                closure=Loss(LossKind.HUBER, p.back_end.closure_robust_scale),
-                scan=Loss(LossKind.CAUCHY, p.back_end.scan_robust_scale),
-                reflector=Loss(LossKind.CAUCHY, p.reflector.robust_scale),
-            )
-        )
-        self.live = OnlineSolver(self.graph, p.solver)
+        # frames come with final associations (a second pass): none is delayed, merged or closed
+        self.associations_are_final = False
+        self.graph = Graph(_losses(p))
+        self.solver = OnlineSolver(self.graph, p.solver)
         self.keyframes: list[Keyframe] = []
-        self.scans = ScanGraph(p, self.live)
-        self.reflector_graph = ReflectorGraph(p.reflector, self.live)
-        self.constellations = Constellations(p, self.graph, self.reflector_graph)
+        self.scan_graph = ScanGraph(p, self.graph)
+        self.reflector_graph = ReflectorGraph(p.reflector, self.solver)
+        self.loop_closer = LoopCloser(p, self.solver)
+        self.constellation_search = ConstellationSearch(p, self.graph, self.reflector_graph)
         self.delayed_association = DelayedAssociation(p.reflector, self.reflector_graph)
-        self.sparsifier = Sparsifier(p, self.live, self.scans, self.reflector_graph)
-        self.path = Path(p.back_end.max_trajectory_frames)
+        self.sparsifier = Sparsifier(
+            p, self.solver, self.scan_graph, self.loop_closer, self.reflector_graph
+        )
+        self.frame_trajectory = FrameTrajectory(p.back_end.max_trajectory_frames)
         self.persistence = LandmarkPersistence(p, self.graph, self.reflector_graph)
-        self._gone: tuple[int, ...] = ()  # since the newest keyframe began
-        self.closure_monitor = ClosureMonitor(p, self.live)
         self.path_covariance = PathCovariance()
-        self.survey_frame = self._plant_frame(self._survey)
-        self._changed: tuple[Closure, ...] = ()  # since the newest keyframe began
+        self.survey_frame = None if self._survey is None else self._frame_of(self._survey)
         self.T_map_local = np.zeros(3)
         self.known: ReferencePose | None = None
+        self.interval: Interval | None = None
+        self._keyframes_since_solve = 0
+        # of the newest keyframe, for its update
         self._optimized = False
-        self._interval: Interval | None = None
-        self._since_optimized = 0
-        # what keeps the graph small takes as long as a solve or a closure: each is put off until
-        # a keyframe that had neither, or until the next solve
-        self._chores: deque[Callable[[], None]] = deque()
-
-    def _plant_frame(self, survey: Survey | None) -> SurveyFrame | None:
-        if survey is None:
-            return None
-        return SurveyFrame(self._p, self.live, self.reflector_graph, survey)
-
-    def add(self, frame: Frame) -> Update | None:
-        """Take one frame of the front end; an Update where it became a keyframe."""
-        began = time.perf_counter(), time.thread_time()
-        if self._interval is not None:
-            self._interval.add_motion(frame)
-            if frame.jumped:
-                self._interval.jump(frame)
-                self.scans.begin_piece()
-        update = None
-        if self._is_key(frame):
-            update = self._add_keyframe(frame, began)
-        assert self._interval is not None
-        if not frame.unconfirmed:
-            self._interval.add_detections(frame)
-        newest = self.keyframes[-1]
-        self.path.add(frame.stamp, se2.between(newest.T_local, frame.T_local_base))
-        return update
-
-    def _is_key(self, frame: Frame) -> bool:
-        if not self.keyframes:
-            return True
-        if frame.unconfirmed or frame.jumped:
-            return frame.jumped  # of a robot that does not know where it is, nothing is mapped
-        p, last = self._p.back_end, self.keyframes[-1]
-        step = se2.between(last.T_local, frame.T_local_base)
-        distance, turn = math.hypot(step[0], step[1]), abs(step[2])
-        if distance >= p.minimum_travel_distance or turn >= p.minimum_travel_heading:
-            return True
-        moved = distance > 0.02 or turn > 0.02
-        return moved and (frame.stamp - last.stamp) * 1e-9 >= p.minimum_time
-
-    def _add_keyframe(self, frame: Frame, began: tuple[float, float]) -> Update:
-        self._optimized, self._changed, self._gone = False, (), ()
-        key = self._node(frame)
-        closures = () if self.is_told else self._return()
-        if key.points is not None:
-            closures += self.scans.add(key)
-        self._join(self.scans.take_pairs())
-        self._since_optimized += 1
-        due = self._since_optimized >= self._p.back_end.optimize_every
-        if due and self._is_behind:
-            self.optimize()
-            self.sparsifier.thin()
-            while self._chores:
-                self._chores.popleft()()
-            self._chores.extend((self._sparsify, self._prune))
-        elif self._chores and not closures:
-            self._chores.popleft()()
-        return Update(
-            key.index,
-            self.T_map_local,
-            self._optimized,
-            closures,
-            (time.perf_counter() - began[0]) * 1e3,
-            self.known,
-            self._changed,
-            self._gone,
-            (time.thread_time() - began[1]) * 1e3,
+        self._changed: tuple[Closure, ...] = ()
+        self._removed: tuple[int, ...] = ()
+        self.maintenance = GraphMaintenance(
+            self.sparsifier, self.frame_trajectory, self.path_covariance
         )
 
-    def _sparsify(self) -> None:
-        if self.sparsifier.sparsify(self.keyframes, self.path):
-            self.path_covariance.keep(self.keyframes)
+    def _frame_of(self, survey: Survey) -> SurveyFrame:
+        return SurveyFrame(self._p, self.solver, self.reflector_graph, survey)
 
-    def _prune(self) -> None:
-        self.sparsifier.prune(len(self.keyframes))
+    def use_survey_of_map(self, survey: Survey) -> None:
+        """Use the survey whose frame a saved map has; MapError if another one was given."""
+        if self._survey is not None and not same(survey, self._survey):
+            raise MapError('the map has the frame of another survey')
+        self.survey_frame = self._frame_of(survey)
+        self.survey_frame.found = True
 
-    def _node(self, frame: Frame) -> Keyframe:
-        """A new pose, tied to the last one by the relative motion (e^P of eq. 12)."""
-        o, interval = frame.observation, self._interval
-        if interval is None:
-            # the first keyframe is the gauge
+    def add(self, frame: Frame) -> Update | None:
+        """Add a frame of the front end; an Update if it became a keyframe."""
+        start = time.perf_counter(), time.thread_time()
+        if self.interval is not None:
+            self.interval.add_motion(frame)
+            if frame.jumped:
+                self.interval.jump(frame)
+                self.scan_graph.finish_active()
+        update = None
+        last = self.keyframes[-1] if self.keyframes else None
+        if is_keyframe(last, frame, self._p.back_end):
+            update = self._add_keyframe(frame, start)
+        assert self.interval is not None
+        if not frame.unconfirmed:
+            self.interval.add_detections(frame)
+        T_key_base = se2.between(self.keyframes[-1].T_local, frame.T_local_base)
+        self.frame_trajectory.add(frame.stamp, T_key_base)
+        return update
+
+    def _add_keyframe(self, frame: Frame, start: tuple[float, float]) -> Update:
+        self._optimized, self._changed, self._removed = False, (), ()
+        key = self._add_pose(frame)
+        closures = self._close_loops(key)
+        self._join_reflectors()
+        self._keyframes_since_solve += 1
+        is_due = self._keyframes_since_solve >= self._p.back_end.optimize_every
+        if is_due and self._has_changed:
+            self.optimize()
+            self.maintenance.after_solve(self.keyframes)
+        elif not closures:
+            self.maintenance.run_step(self.keyframes)
+        return Update(
+            key.index, self.T_map_local, self._optimized, closures,
+            (time.perf_counter() - start[0]) * 1e3, self.known, self._changed, self._removed,
+            (time.thread_time() - start[1]) * 1e3,
+        )  # fmt: skip
+
+    def _add_pose(self, frame: Frame) -> Keyframe:
+        """New pose, with an odometry edge from the last one (e^P of eq. 12)."""
+        interval = self.interval
+        if interval is None:  # the first keyframe is the gauge
             index = self.graph.add_pose(frame.T_local_base, fixed=True)
         else:
-            self._see_reflectors(interval)
-            since, scanned = interval.motion, interval.scanned
+            self._add_sightings(interval)
             last = self.keyframes[-1]
-            # with scans the front end's motion is the better mean; without, it holds the
-            # reflectors already, which have their own factors; but where odometry knows nothing,
-            # its covariance is so wide that this counts for little and the mean for much
-            ours = scanned or not since.known
             motion = se2.between(last.T_local, frame.T_local_base)
-            delta = motion if ours else since.delta
-            self.path.begin_keyframe(motion)
+            self.frame_trajectory.begin_keyframe(motion)
             index = self.graph.add_pose(se2.compose(self.graph.poses[last.index], motion))
-            cov = since.cov + np.diag(np.array(self._p.back_end.edge_variance_floor))
-            if self._p.back_end.edge_covariance == 'sum':
-                # eq. 14 to the letter, in the axes of the frame it is used in
-                R = np.eye(3)
-                R[:2, :2] = se2.rotation(last.T_local[2]).T
-                cov = R @ (last.cov_local + frame.cov_local) @ R.T + 1e-9 * np.eye(3)
-            self.graph.add_edge(
-                EdgeKind.ODOMETRY, index - 1, index, delta, relative_information(delta, cov)
-            )
+            delta, cov = odometry_edge(last, frame, interval, self._p.back_end)
+            information = relative_information(delta, cov)
+            self.graph.add_edge(EdgeKind.ODOMETRY, index - 1, index, delta, information)
             self.delayed_association.move(delta, cov)
-        # a scan that the front end could not place has no place in the map either
-        placed = frame.scan_used or not self.keyframes
-        points = o.points.astype(np.float32) if placed and o.points is not None else None
-        key = Keyframe(
-            index, frame.stamp, frame.T_local_base, frame.cov_local,
-            points, o.origin if placed else None, frame.stamp, jumped=frame.jumped,
-        )  # fmt: skip
+        key = keyframe_of(index, frame, is_first=not self.keyframes)
         self.keyframes.append(key)
         if frame.jumped:
-            self.path_covariance.begin(key)
-        self._interval = Interval(frame.T_local_base)
+            self.path_covariance.start(key)
+        self.interval = Interval(frame.T_local_base)
         return key
 
-    def _return(self) -> tuple[Closure, ...]:
-        """Loops closed by reflectors at the keyframe before the newest, which saw none yet."""
-        place = self.constellations.look(self.keyframes[:-1])
-        return () if place is None else self.scans.enter(place)
-
-    def _join(self, pairs: Sequence[tuple[int, int]]) -> None:
-        """Reflectors that a closure tells to be the same are one from then on."""
-        alive = {m.key for m in self.reflector_graph.alive()}
-        resolve = self.reflector_graph.resolve
-        here = [(a, b) for a, b in pairs if {resolve(a), resolve(b)} <= alive]
-        for old, new in here:
-            self.reflector_graph.join(old, new)
-        if here:
-            self.delayed_association.drop()
-            self.rejoin()
-
-    @property
-    def _is_behind(self) -> bool:
-        """Whether the graph has gained anything that the estimate does not show."""
-        return self.scans.changed or self.reflector_graph.changed
-
-    def _see_reflectors(self, interval: Interval) -> None:
-        """The reflectors seen near the newest keyframe, and what they tell of earlier ones."""
+    def _add_sightings(self, interval: Interval) -> None:
+        """Reflectors seen near the newest keyframe: sightings, association, persistence."""
         pose = len(self.keyframes) - 1
-        if not self.is_told and self.delayed_association.begins(interval):
-            if self._is_behind:
+        if not self.associations_are_final and self.delayed_association.begins(interval):
+            if self._has_changed:
                 self.optimize()
             self.delayed_association.begin(pose)
-        self.delayed_association.see(interval)
+        self.delayed_association.add(interval)
         self.reflector_graph.add(pose, interval)
         if self.delayed_association.decide():
-            self.rejoin()
-        self._gone += self.persistence.look(self.keyframes, interval)
-        if self._gone and self.survey_frame is not None:
-            self.survey_frame.hold()
-        forgotten = interval.last_look - int(2e9 * self._p.reflector.candidate_timeout)
-        self.reflector_graph.drop_candidates(forgotten, self.delayed_association.pending)
+            self.optimize_after_join()
+        self._removed += self.persistence.update(self.keyframes, interval)
+        if self._removed and self.survey_frame is not None:
+            self.survey_frame.update_gauge()
+        oldest = interval.last_stamp - int(2e9 * self._p.reflector.candidate_timeout)
+        self.reflector_graph.drop_candidates(oldest, self.delayed_association.pending)
 
-    def rejoin(self) -> None:
-        """Solve after reflectors were joined that stood apart, as far as the drift had gone.
+    def _close_loops(self, key: Keyframe) -> tuple[Closure, ...]:
+        """Closures by reflectors at the keyframe before, and by the scan of the new one."""
+        closures: tuple[Closure, ...] = ()
+        if not self.associations_are_final:
+            proposed = self.constellation_search.search(self.keyframes[:-1])
+            if proposed is not None:
+                points = self.scan_graph.thinned(proposed.key)
+                closures += self.loop_closer.confirm(proposed, points, self.scan_graph.finished)
+        points = self.scan_graph.add(key)
+        if points is not None:
+            closures += self.loop_closer.search(key, points, self.scan_graph.finished)
+        return closures
 
-        To the robust losses such a joint looks like an outlier: they come second.
-        """
-        robust = self.graph.losses
-        self.graph.losses = replace(robust, odometry=Loss(), reflector=Loss())
-        self.live.solve_all()
-        self.graph.losses = robust
-        self.optimize()
-
-    def optimize(self, final: bool = False) -> None:
-        """Solve eq. 13, merge reflectors that turned out to be one, correct the local frame.
-
-        Closures that turn out wrong are disabled; with ``final`` no doubt about them is put off.
-        """
-        if len(self.keyframes) < 2:
-            return
-        solve = self.live.solve_all if final else self.live.solve
-        solve()
-        if not self.is_told and self.reflector_graph.merge(self.delayed_association.pending):
-            solve()
-        # open hypotheses are about places in the frame of now
-        if (
-            self.survey_frame is not None
-            and not self.delayed_association.pending
-            and self.survey_frame.update()
-        ):
-            solve()
-        changed = self.closure_monitor.review(self.scans.closures, final)
-        if changed:
-            self._changed += changed
-            self.path_covariance.forget()
-        self.live.solve()
-        self._optimized = True
-        self._since_optimized = 0
-        self.scans.solved()
-        self.reflector_graph.changed = False
-        last = self.keyframes[-1]
-        self.T_map_local = se2.compose(self.graph.poses[last.index], se2.inverse(last.T_local))
-        self.known = self._known()
-
-    def _known(self) -> ReferencePose:
-        """How well the newest keyframe is known in the map.
-
-        Nothing that was seen near it is in the graph yet: that is of the keyframe before, from
-        which the front end's covariance has grown. What the graph and any way that leads there
-        have both seen neither judges better; of the survey the graph alone knows, and of loops
-        where reflectors hold the pose.
-        """
-        before, last = self.keyframes[-2:]
-        cov = self.live.joint([before.index])
-        if self.survey_frame is None or not self.survey_frame.found:
-            self.path_covariance.close(self.scans.closures, self.keyframes, self.graph.edges)
-            if not self._is_held(before):
-                heading = float(self.T_map_local[2] + before.T_local[2])
-                cov = either(cov, turned(self.path_covariance.cov(before), heading))
-        since = Correction(self.T_map_local, ReferencePose(before.T_local, before.cov_local, cov))
-        _, cov_map = since.apply(last.T_local, last.cov_local)
-        return ReferencePose(last.T_local, last.cov_local, cov_map)
-
-    def _is_held(self, key: Keyframe) -> bool:
-        """Whether reflectors that were in the map when it was last tied together hold a pose."""
-        enabled = self.graph.edges.enabled
-        if not enabled[self.scans.closures.edges].any():
-            return False
-        newest = self.path_covariance.newest
-        until = bisect_right(self.keyframes, newest, key=lambda k: k.stamp) - 1
-        return held(self.graph.sightings, key.index, until)
+    def _join_reflectors(self) -> None:
+        """Join the reflectors that new closures have identified."""
+        if self.reflector_graph.join_mapped(self.loop_closer.take_reflector_pairs()):
+            self.delayed_association.drop()
+            self.optimize_after_join()
 
     def revoke(self, number: int) -> Closure:
-        """Take a loop closure out of the map for good; SolverError if there is no such one."""
-        closure = self.closure_monitor.revoke(self.scans.closures, number)
-        self.path_covariance.forget()
+        """Remove a loop closure for good; raises SolverError if there is none of this number."""
+        closure = self.loop_closer.revoke(number)
+        self.path_covariance.remove_closures()
         self.optimize()
         return closure
 
+    @property
+    def _has_changed(self) -> bool:
+        """Whether closures or sightings were added since the last solve."""
+        return self.loop_closer.changed or self.reflector_graph.changed
+
+    def optimize(self, final: bool = False) -> None:
+        """Solve eq. 13, merge reflectors, align with the survey, check closures, correct.
+
+        ``final``: by the batch solver, and a selection of closures is not put off.
+        """
+        if len(self.keyframes) < 2:
+            return
+        solve = self.solver.solve_all if final else self.solver.solve
+        solve()
+        if self._merge_reflectors():
+            solve()
+        if self._align_with_survey():
+            solve()
+        if self.loop_closer.needs_selection(final):
+            enabled = self.loop_closer.select()
+            self.solver.solve_all()
+            self._update_closures(enabled)
+        self.solver.solve()  # the incremental factorization, where the batch solver was last
+        self._correct_local_frame()
+
+    def optimize_after_join(self) -> None:
+        """Optimize after reflectors were joined that are as far apart as the drift.
+
+        To a robust loss such a join looks like an outlier: the first solve is quadratic.
+        """
+        robust = self.graph.losses
+        self.graph.losses = replace(robust, odometry=Loss(), reflector=Loss())
+        self.solver.solve_all()
+        self.graph.losses = robust
+        self.optimize()
+
+    def _merge_reflectors(self) -> bool:
+        if self.associations_are_final:
+            return False
+        return self.reflector_graph.merge(self.delayed_association.pending)
+
+    def _align_with_survey(self) -> bool:
+        """Whether the survey changed the graph; pending hypotheses keep the current frame."""
+        if self.survey_frame is None or self.delayed_association.pending:
+            return False
+        return self.survey_frame.update()
+
+    def _update_closures(self, enabled: Mapping[int, bool]) -> None:
+        changed = self.loop_closer.update_states(enabled)
+        if changed:
+            self._changed += changed
+            self.path_covariance.remove_closures()
+
+    def _correct_local_frame(self) -> None:
+        """Set ``T_map_local`` and its covariance from the newest keyframe."""
+        self._optimized, self._keyframes_since_solve = True, 0
+        self.loop_closer.mark_solved()
+        self.reflector_graph.mark_solved()
+        last = self.keyframes[-1]
+        self.T_map_local = T = se2.compose(self.graph.poses[last.index], se2.inverse(last.T_local))
+        is_surveyed = self.survey_frame is not None and self.survey_frame.found
+        bound = None if is_surveyed else self.path_covariance
+        records = self.loop_closer.records
+        self.known = newest_covariance(self.solver, bound, records, self.keyframes, T)
+
+    def finish(self) -> None:
+        """Add what was collected since the last keyframe, decide associations, optimize."""
+        if self.interval is not None and self.keyframes:
+            self._add_sightings(self.interval)
+            self.interval = Interval(self.keyframes[-1].T_local)
+            if self.delayed_association.decide(final=True):
+                self.optimize_after_join()
+            self.optimize(final=True)
+
     def belief(self) -> Belief | None:
-        """The newest keyframe and the reflectors, with joint covariance; None without any."""
+        """Newest keyframe and all reflectors, with joint covariance; None without reflectors."""
         if not self.keyframes or not self.reflector_graph.found:
             return None
         return self.reflector_graph.belief(self.keyframes[-1].index)
 
-    def finish(self) -> None:
-        """Use what is still collected, look for the last closures and optimise."""
-        if self._interval is not None and self.keyframes:
-            self._see_reflectors(self._interval)
-            self._interval = Interval(self.keyframes[-1].T_local)
-            self.scans.finish()
-            if self.delayed_association.decide(final=True):
-                self.rejoin()
-            self.optimize(final=True)
-
-    def start_from(
-        self,
-        keys: list[Keyframe],
-        arrays: Mapping[str, NDArray[Any]],
-        survey: Survey | None = None,
-    ) -> None:
-        """Go on with a map whose graph is there already; the local frame is the map's from now on.
-
-        The next frame has to be one that ``jumped``: no motion leads to it. A ``survey`` is that
-        whose frame the map has. Raises MapError if that is another one than was given to be used.
-        """
-        if survey is not None:
-            if self._survey is not None and not same(survey, self._survey):
-                raise MapError('the map has the frame of another survey')
-            self.survey_frame = self._plant_frame(survey)
-            assert self.survey_frame is not None
-            self.survey_frame.found = True
-        last = keys[-1]
-        for key in keys:
-            if key.jumped:
-                self.path_covariance.begin(key)
-        T_map = self.graph.poses[last.index].copy()
-        last.cov_local = turned(last.cov_local, float(T_map[2] - last.T_local[2]))
-        last.T_local = T_map
-        self.keyframes = keys
-        self.scans.restore(arrays, keys)
-        self.reflector_graph.restore(arrays)
-        self.path.restore(arrays)
-        self._interval = Interval(last.T_local)
-
-    # --- products ------------------------------------------------------------------------------
-
-    def trajectory(self) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Array]:
+    def trajectory(self) -> tuple[NDArray[np.int64], Array]:
         """Stamps (n,) and poses (n, 3) in the map frame of every frame so far."""
-        poses = self.graph.poses
-        return self.path.stamps(), self.path.poses(poses) if self.keyframes else np.zeros((0, 3))
+        if not self.keyframes:
+            return self.frame_trajectory.stamps(), np.zeros((0, 3))
+        return self.frame_trajectory.stamps(), self.frame_trajectory.poses(self.graph.poses)
 
     def marginals(self) -> Marginals:
         """Covariances at the current estimate."""
@@ -401,17 +316,20 @@ class BackEnd:
         return self.reflector_graph.reflectors()
 
     def reflector_states(self) -> list[ReflectorState]:
-        """What has become of each reflector, those that are gone and ghosts among them."""
+        """State of each reflector, removed ones and ghosts included."""
         return reflector_states(self.reflector_graph, self._p.reflector)
 
     def occupancy_grid(self) -> OccupancyGrid | None:
-        """The map rendered from the keyframes' scans, None without any scan."""
-        keys = [k for k in self.keyframes if k.points is not None and len(k.points)]
-        if not keys:
-            return None
-        return render(
-            self.graph.poses[[k.index for k in keys]],
-            [k.points for k in keys if k.points is not None],
-            [k.origin for k in keys if k.origin is not None],
-            self._p.back_end.resolution,
-        )
+        """The occupancy grid from the keyframes' scans, None without any scan."""
+        return draw(self.graph.poses, self.keyframes, self._p.back_end.resolution)
+
+
+def _losses(p: Parameters) -> Losses:
+    """Robust losses; the front end's own motion, without wheels that may slip, has none."""
+    odometry = Loss(LossKind.CAUCHY, p.back_end.odometry_robust_scale)
+    return Losses(
+        odometry=odometry if p.node.use_odom else Loss(),
+        closure=Loss(LossKind.HUBER, p.back_end.closure_robust_scale),
+        scan=Loss(LossKind.CAUCHY, p.back_end.scan_robust_scale),
+        reflector=Loss(LossKind.CAUCHY, p.reflector.robust_scale),
+    )

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well a keyframe is known by the ways that lead to it, each taken by itself.
+"""Bounds of the covariance of keyframes, from single paths of odometry and closures.
 
-The graph takes the errors of its edges for independent, and so averages out over a long way what
-wheels err by for as long, and over many closures what these have in common. The front end's joint
-state knows what lasts, but no loop that scans have closed. Its covariance is that of the way
-driven; a closure brings another one, by the place that was seen again. What errors the two share
-nobody knows, so they are fused by covariance intersection (Julier, Uhlmann 1997), which is right
-whatever these are.
+The graph takes the errors of its edges as independent. Over a long drive it averages out errors
+of the wheels that last as long, and over many closures the errors that these share. The front end
+estimates the lasting errors, but it has no closures of scans. Here, the covariance of a keyframe
+is that of the front end along the driven path; a closure adds that of another path. The
+correlation of the two is unknown, so they are fused by covariance intersection (Julier, Uhlmann
+1997), which is consistent for any correlation.
 
-What a way grows by between two keyframes is taken to be what the front end's covariance does. It
-is less where a lasting error cancels, out and back by one way, and more where it adds to itself:
-a bound that is often near, and never the only one (:func:`correction.either`).
+Between two keyframes, the covariance grows as that of the front end. That is an approximation: the
+true growth is smaller where a lasting error cancels (out and back on one path) and larger where it
+accumulates. The result is used together with the graph's own covariance only
+(:func:`correction.either`).
 """
 
 from __future__ import annotations
@@ -20,77 +21,86 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rlml_slam.estimation.correction import Correction, ReferencePose, carried, positive, turned
+from rlml_slam.estimation.correction import (
+    Correction,
+    ReferencePose,
+    carried,
+    either,
+    positive,
+    turned,
+)
+from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.factor_table import FactorTable
+from rlml_slam.graph.model.graph import Graph
 from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.closure_records import ClosureRecords
 from rlml_slam.slam.keyframes import Keyframe
 
-WEIGHTS = np.linspace(0.0, 1.0, 11)  # of one of two that are fused; the best of these is as good
+WEIGHTS = np.linspace(0.0, 1.0, 11)  # tried for covariance intersection
 
 
 class PathCovariance:
     """Covariances (3, 3) of keyframes in the map, each in the axes of its own pose.
 
-    They are kept for keyframes at which a way other than the one driven came in. From the one
-    before and the one after, they grow as the front end's does.
+    Entries are kept for the keyframes at which closures end. Before and after an entry, the
+    covariance grows as the front end's does.
     """
 
     def __init__(self) -> None:
         self._stamps: list[int] = []
-        self._known: list[ReferencePose] = []  # at these, as if the local frame were the map
-        self._begun: list[int] = []
-        self._num = 0  # closures below this number are in it
+        self._known: list[ReferencePose] = []  # entries, in the axes of the local frame
+        self._starts: list[int] = []  # stamps of keyframes after a jump
+        self._num_closures = 0  # closures below this number are included
 
     def cov(self, key: Keyframe) -> Array:
-        """That of a keyframe."""
+        """Covariance (3, 3) of a keyframe."""
         k = bisect_right(self._stamps, key.stamp)
         known = self._known[k - 1] if k else None
         _, cov = Correction(np.zeros(3), known).apply(key.T_local, key.cov_local)
-        if k < len(self._stamps) and self._stamps[k] not in self._begun:
+        if k < len(self._stamps) and self._stamps[k] not in self._starts:
             later = self._known[k]
-            way = later.pose[:2] - key.T_local[:2]
-            grown = positive(later.cov_local - carried(key.cov_local, way))
-            cov = intersection(cov, carried(later.cov_map + grown, -way))
+            lever = later.pose[:2] - key.T_local[:2]
+            growth = positive(later.cov_local - carried(key.cov_local, lever))
+            cov = intersection(cov, carried(later.cov_map + growth, -lever))
         return turned(cov, -key.T_local[2])
 
     @property
     def newest(self) -> int:
-        """Stamp of the last keyframe at which another way came in, -1 before the first."""
+        """Stamp of the last entry, -1 before the first."""
         return self._stamps[-1] if self._stamps else -1
 
-    def begin(self, key: Keyframe) -> None:
-        """No way leads to a keyframe: the front end says how well it found its place."""
-        self._begun.append(key.stamp)
+    def start(self, key: Keyframe) -> None:
+        """Start at a keyframe after a jump, with the covariance of its relocalization."""
+        self._starts.append(key.stamp)
         self._enter(key, turned(key.cov_local, -key.T_local[2]))
 
-    def close(
+    def add_closures(
         self, closures: ClosureRecords, keys: Sequence[Keyframe], edges: FactorTable
     ) -> None:
-        """Take in what is new of all closures; ``keys`` are the keyframes, by index."""
-        fresh = [c for c in closures.accepted(self._num) if edges.enabled[c.edge]]
-        for c in sorted(fresh, key=lambda c: c.number):
-            self._num = c.number + 1
+        """Include new closures; ``keys`` are the keyframes by index."""
+        new = [c for c in closures.accepted(self._num_closures) if edges.enabled[c.edge]]
+        for c in sorted(new, key=lambda c: c.number):
+            self._num_closures = c.number + 1
             T = edges.measured[c.edge]
-            across = turned(carried(self.cov(keys[c.i]), T[:2]), -T[2])
-            across += np.linalg.inv(edges.information[c.edge])
-            self._enter(keys[c.j], intersection(self.cov(keys[c.j]), across))
+            cov = turned(carried(self.cov(keys[c.i]), T[:2]), -T[2])
+            cov += np.linalg.inv(edges.information[c.edge])
+            self._enter(keys[c.j], intersection(self.cov(keys[c.j]), cov))
 
-    def forget(self) -> None:
-        """Other closures are right than were: those that are come in anew."""
-        at = [self._stamps.index(stamp) for stamp in self._begun]
-        self._stamps, self._known = list(self._begun), [self._known[k] for k in at]
-        self._num = 0
+    def remove_closures(self) -> None:
+        """Closures were disabled or enabled: the enabled ones have to be added again."""
+        at = [self._stamps.index(stamp) for stamp in self._starts]
+        self._stamps, self._known = list(self._starts), [self._known[k] for k in at]
+        self._num_closures = 0
 
     def keep(self, keys: Sequence[Keyframe]) -> None:
-        """Let go of what tells nothing of the keyframes that are left, however long it goes on.
+        """Remove entries that are not needed for the keyframes that are left.
 
-        One of these is told of by the last entry up to it, and by the first one after it.
+        For each of these the last entry up to it and the first one after it are kept.
         """
         stamps = sorted(key.stamp for key in keys)
-        self._begun = [self._begun[k] for k in _ends(stamps, self._begun)]
-        begun = [self._stamps.index(stamp) for stamp in self._begun]
-        kept = sorted({*_ends(stamps, self._stamps), *begun})
+        self._starts = [self._starts[k] for k in _ends(stamps, self._starts)]
+        starts = [self._stamps.index(stamp) for stamp in self._starts]
+        kept = sorted({*_ends(stamps, self._stamps), *starts})
         self._stamps = [self._stamps[k] for k in kept]
         self._known = [self._known[k] for k in kept]
 
@@ -102,7 +112,7 @@ class PathCovariance:
 
 
 def _ends(stamps: Sequence[int], entries: Sequence[int]) -> list[int]:
-    """Of the ``entries`` between each two neighbours of ``stamps``, the first one and the last.
+    """Indices of the first and last of the ``entries`` between each two neighbouring ``stamps``.
 
     Both ascend; an entry at one of the ``stamps`` is before it.
     """
@@ -113,11 +123,49 @@ def _ends(stamps: Sequence[int], entries: Sequence[int]) -> list[int]:
     ]  # fmt: skip
 
 
-def held(sightings: FactorTable, pose: int, until: int) -> bool:
-    """Whether reflectors seen at a pose of the graph hold it: two, in all three directions.
+def newest_covariance(
+    solver: OnlineSolver,
+    bound: PathCovariance | None,
+    closures: ClosureRecords,
+    keys: Sequence[Keyframe],
+    T_map_local: Array,
+) -> ReferencePose:
+    """Covariance of the newest keyframe in the map, after a solve.
 
-    Poses before it, up to ``until``, have to have seen these as well, else they tie it to nothing
-    else. What they tell does not pass through the wheels, so no way by these need be asked then.
+    Its sightings are not in the graph yet: it is that of the keyframe before, grown by the front
+    end's since. The path covariance is a lower ``bound`` where no reflectors constrain the pose;
+    None in a map with the frame of a survey.
+    """
+    before, last = keys[-2:]
+    cov = solver.joint([before.index])
+    if bound is not None:
+        bound.add_closures(closures, keys, solver.graph.edges)
+        if not _is_constrained(solver.graph, bound, closures, keys, before):
+            heading = float(T_map_local[2] + before.T_local[2])
+            cov = either(cov, turned(bound.cov(before), heading))
+    since = Correction(T_map_local, ReferencePose(before.T_local, before.cov_local, cov))
+    _, cov_map = since.apply(last.T_local, last.cov_local)
+    return ReferencePose(last.T_local, last.cov_local, cov_map)
+
+
+def _is_constrained(
+    graph: Graph,
+    covariance: PathCovariance,
+    closures: ClosureRecords,
+    keys: Sequence[Keyframe],
+    key: Keyframe,
+) -> bool:
+    """Whether reflectors that were mapped at the last closure constrain a keyframe."""
+    if not graph.edges.enabled[closures.edges].any():
+        return False
+    until = bisect_right(keys, covariance.newest, key=lambda k: k.stamp) - 1
+    return is_constrained_by_reflectors(graph.sightings, key.index, until)
+
+
+def is_constrained_by_reflectors(sightings: FactorTable, pose: int, until: int) -> bool:
+    """Whether at least two reflectors seen at a pose were also seen at poses up to ``until``.
+
+    They constrain all three coordinates, without odometry in between.
     """
     until = min(until, pose - 1)
     poses, landmarks = sightings.nodes[sightings.enabled].T
@@ -126,8 +174,7 @@ def held(sightings: FactorTable, pose: int, until: int) -> bool:
 
 def intersection(P: Array, Q: Array) -> Array:
     """(w P^-1 + (1 - w) Q^-1)^-1 of covariances (3, 3), with the w for which it is smallest."""
-    # P may be singular, that of the pose where all began
-    if np.linalg.det(P) <= 0.0:
+    if np.linalg.det(P) <= 0.0:  # of the first pose, which is fixed
         return P
     A, B = np.linalg.inv(P), np.linalg.inv(Q)
     mixed = WEIGHTS[:, None, None] * A + (1.0 - WEIGHTS)[:, None, None] * B

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""With which submaps a keyframe may close a loop, and how far around to search in each."""
+"""Candidate submaps for loop closures of a keyframe, and the search window in each."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap
 from rlml_slam.slam.keyframes import Keyframe
 
-SIGMAS = 3.0  # how far off a keyframe is looked for: the bound holds all but the ends of the tails
+SIGMAS = 3.0  # half width of the search window, in standard deviations of the drift
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A submap in which a keyframe may be at ``guess`` (3,), its grid's frame.
+    """Submap to search for a keyframe expected at ``guess`` (3,) of the grid frame.
 
-    Searched is the square of half width ``window`` [m] around it, turned by up to ``angle`` [rad].
+    The search window is the square of half width ``window`` [m] around it, and headings that
+    differ by up to ``angle`` [rad].
     """
 
     m: KeyframeSubmap
@@ -33,19 +34,19 @@ class Candidate:
     angle: float
 
     @property
-    def searched(self) -> float:
-        """Area [m²] of the search, were it made at all headings: of as many places as it is."""
+    def search_area(self) -> float:
+        """Area [m²] at all headings that has the volume of the search window."""
         return (2.0 * self.window) ** 2 * self.angle / math.pi
 
 
 def candidates(
     graph: Graph, key: Keyframe, among: Sequence[KeyframeSubmap], p: LoopClosure
 ) -> list[Candidate]:
-    """Those ``among`` submaps where the keyframe may be, the nearest first.
+    """Submaps ``among`` which the keyframe may be, the nearest first.
 
-    How far it may be off from each, the graph bounds (graph/reach.py). Where that is more than
-    the least window, there may be more submaps in reach than are tried at a time: of the others,
-    that one is tried as well whose last turn is longest ago.
+    The drift relative to each is bounded by the graph (graph/robust/path_bound.py). With a large
+    drift more submaps are in range than are searched for one keyframe: the one of them whose last
+    search is longest ago is added.
     """
     pose = graph.poses[key.index]
     if not among:
@@ -59,24 +60,20 @@ def candidates(
     if not order:
         return []
     anchors = np.array([among[k].anchor.index for k in order], dtype=np.int64)
-    off = SIGMAS * reach(graph, key.index, anchors)
-    windows = np.clip(off[:, 0], p.search_window, p.max_search_window).tolist()
-    angles = np.clip(off[:, 1], p.search_angle, p.max_search_angle).tolist()
+    drift = SIGMAS * reach(graph, key.index, anchors)
+    windows = np.clip(drift[:, 0], p.search_window, p.max_search_window).tolist()
+    angles = np.clip(drift[:, 1], p.search_angle, p.max_search_angle).tolist()
     found = [
         (among[k], window, angle)
         for k, window, angle in zip(order, windows, angles, strict=True)
         if gaps[k] < p.max_distance + window - p.search_window
     ]
     first, others = found[: p.max_candidates], found[p.max_candidates :]
-    lost = [c for c in others if c[1] > p.search_window]
-    chosen = first + sorted(lost, key=lambda c: c[0].turn)[:1]
+    wide = [c for c in others if c[1] > p.search_window]
+    chosen = first + sorted(wide, key=lambda c: c[0].last_search)[:1]
     for m, _, _ in chosen:
-        m.turn = key.stamp
+        m.last_search = key.stamp
     return [
-        Candidate(m, se2.between(_grid(graph, m), pose), window, angle)
+        Candidate(m, se2.between(m.grid_pose(graph.poses), pose), window, angle)
         for m, window, angle in chosen
     ]
-
-
-def _grid(graph: Graph, m: KeyframeSubmap) -> Array:
-    return se2.compose(graph.poses[m.anchor.index], m.T_anchor_grid)

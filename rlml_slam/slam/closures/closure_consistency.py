@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a scan that fits a submap may close a loop yet, or has to wait for others that agree.
+"""Consistency check of loop closures before they are added to the graph.
 
-Where rooms are alike, a scan fits in a wrong one as well as in its own. What tells them apart is
-where the graph, of all odometry, scans and closures so far, expects the keyframe: the evidence
-(graph/evidence.py) of that for the closure. What is far from there enters only with others that
-agree with it around a short loop (pairwise consistency, Mangelson et al. 2018), seen from places
-apart, for from one place a wrong room stays alike, and along a corridor or between racks for as
-far as one sees there. The surer the graph, the more of them it takes.
+In buildings with similar rooms a scan fits in a wrong room as well as in its own. The evidence is
+the log likelihood ratio of correct to wrong matches, given where the graph expects the keyframe
+(graph/robust/inlier_evidence.py). A closure far from there is added only with others that agree
+with it around a short loop (pairwise consistency: Mangelson et al. 2018) and that were seen from
+other viewpoints: from one viewpoint, a similar room stays similar. The smaller the covariance of
+the graph, the more such closures are required.
 """
 
 from __future__ import annotations
@@ -24,54 +24,54 @@ from rlml_slam.graph.robust.inlier_evidence import evidence
 from rlml_slam.se2 import Array
 
 Ints = NDArray[np.int64]
-APART = 1.0  # [m] between the places of two views that tell more than one
-# Chance that a wrong place, alike in one view, is alike in the next one as well. Of the wrong
-# matches of two real logs, fewer were.
-ALIKE = 0.1
-RISK = 0.1  # chances that any of the closures that wait agrees with another by accident
+MIN_BASELINE = 1.0  # [m] between two viewpoints that count as more than one
+# Probability that a wrong place which fits from one viewpoint also fits from the next one; among
+# the wrong matches of two real logs the share was lower.
+REPEATED_WRONG = 0.1
+FALSE_AGREEMENT = 0.1  # expected number of accidental agreements among the pending closures
 
 
 def is_consistent(
-    live: OnlineSolver,
+    solver: OnlineSolver,
     nodes: Ints,
     deltas: Array,
     covs: Array,
     wrong: Array,
-    odds: Array | float = 0.0,
-    sight: Array | float = 0.0,
+    log_odds: Array | float = 0.0,
+    view_range: Array | float = 0.0,
 ) -> NDArray[np.bool_]:
-    """Which (k,) of the closures between poses (k, 2), none of them in a graph yet, may enter.
+    """Whether (k,) closures between poses (k, 2) that are not in the graph yet may be added.
 
-    ``deltas`` (k, 3) with ``covs`` (k, 3, 3) of their residuals; ``wrong`` (k,) is the log
-    density of wrong errors, ``odds`` (k,) the logarithm of what else speaks for each, ``sight``
-    (k,) [m] within which half of what each sees is. The graph is solved for it. Raises SolverError
-    as Live.
+    ``deltas`` (k, 3) with covariances ``covs`` (k, 3, 3) of their residuals; ``wrong`` (k,) is the
+    log density of the errors of wrong matches, ``log_odds`` (k,) further evidence for each, and
+    ``view_range`` (k,) [m] the median range of each scan. Solves the graph for its covariances.
+    Raises SolverError like OnlineSolver.
     """
-    graph, between = live.graph, _Between(live, np.unique(nodes))
+    graph, between = solver.graph, _RelativeCovariance(solver, np.unique(nodes))
     wrong = np.broadcast_to(wrong, len(nodes))
     i, j = nodes.T
     e = factors.relative_pose(graph.poses[i], graph.poses[j], deltas)[0]
     alone = evidence(e, between.covs(i, j) + covs, 1.0, wrong)
     agree = _agreement(graph, between, nodes, deltas, covs, wrong)
-    sight, places = np.broadcast_to(sight, len(nodes)), graph.poses[:, :2]
-    views = np.array([_views(places, j[row], sight[row]) for row in agree])
-    # likelier right than wrong, had half of them been wrong beforehand: of matches it is 1 %
-    return np.asarray(odds + alone - (views - 1) * math.log(ALIKE) > 0.0)
+    ranges, positions = np.broadcast_to(view_range, len(nodes)), graph.poses[:, :2]
+    views = np.array([_num_viewpoints(positions, j[row], ranges[row]) for row in agree])
+    # prior odds 1 : 1; of verified matches about 1 % are wrong
+    return np.asarray(log_odds + alone - (views - 1) * math.log(REPEATED_WRONG) > 0.0)
 
 
-class _Between:
-    """Covariances of where some poses of a graph are from one another."""
+class _RelativeCovariance:
+    """Covariances of the relative poses between some poses of a graph."""
 
-    def __init__(self, live: OnlineSolver, poses: Ints) -> None:
+    def __init__(self, solver: OnlineSolver, poses: Ints) -> None:
         n = len(poses)
-        self._joint = live.joint(poses).reshape(n, 3, n, 3).swapaxes(1, 2)
-        self._poses, self._at = live.graph.poses, poses
+        self._joint = solver.joint(poses).reshape(n, 3, n, 3).swapaxes(1, 2)
+        self._poses, self._indices = solver.graph.poses, poses
 
     def covs(self, i: Ints, j: Ints) -> Array:
-        """Covariances (k, 3, 3) of the poses of j (k,) from i (k,), in the axes of j."""
+        """Covariances (k, 3, 3) of the poses j (k,) relative to i (k,), in the axes of j."""
         X_i, X_j = self._poses[i], self._poses[j]
         _, A, B = factors.relative_pose(X_i, X_j, se2.between(X_i, X_j))
-        a, b = np.searchsorted(self._at, i), np.searchsorted(self._at, j)
+        a, b = np.searchsorted(self._indices, i), np.searchsorted(self._indices, j)
         mixed = A @ self._joint[a, b] @ np.swapaxes(B, 1, 2)
         out: Array = mixed + np.swapaxes(mixed, 1, 2)
         for J, k in ((A, a), (B, b)):
@@ -80,11 +80,16 @@ class _Between:
 
 
 def _agreement(
-    graph: Graph, between: _Between, nodes: Ints, deltas: Array, covs: Array, wrong: Array
+    graph: Graph,
+    between: _RelativeCovariance,
+    nodes: Ints,
+    deltas: Array,
+    covs: Array,
+    wrong: Array,
 ) -> NDArray[np.bool_]:
-    """Whether (k, k) closures are likelier right together than not, itself included.
+    """Pairwise consistency (k, k) of closures, true on the diagonal.
 
-    The error of b is that against the way over a, T_ib_ia z_a T_ja_jb.
+    The error of b is its difference from the path over a, T_ib_ia z_a T_ja_jb.
     """
     k = len(nodes)
     out = np.eye(k, dtype=np.bool_)
@@ -96,22 +101,22 @@ def _agreement(
     A, B = se2.adjoint(se2.inverse(T_j)), se2.adjoint(se2.inverse(rest))
     S = covs[b] + between.covs(j[a], j[b]) + A @ covs[a] @ np.swapaxes(A, 1, 2)
     S = S + B @ between.covs(i[b], i[a]) @ np.swapaxes(B, 1, 2)
-    likelier = np.maximum(wrong[a], wrong[b])  # in the smaller area, accidents are
-    out[a, b] = out[b, a] = evidence(e, S, 1.0, likelier) > math.log(k / RISK)
+    density = np.maximum(wrong[a], wrong[b])  # that of the smaller search area
+    out[a, b] = out[b, a] = evidence(e, S, 1.0, density) > math.log(k / FALSE_AGREEMENT)
     return out
 
 
-def _views(places: Array, poses: Ints, sight: Array) -> float:
-    """How many views of their own the poses (k,) are, in the order of driving.
+def _num_viewpoints(positions: Array, poses: Ints, ranges: Array) -> float:
+    """Number of independent viewpoints of the poses (k,), in the order of driving.
 
-    The places (n, 2) are those of all poses, ``sight`` (k,) [m] as above. Half of what one sees
-    lies behind as soon as one has gone as far as that is away: that is one view more. On the way
-    there, a view tells its share of it.
+    ``positions`` (n, 2) are those of all poses, ``ranges`` (k,) [m] the median ranges of the
+    scans. A viewpoint counts as a new one after a travel of the median range, and as a share of
+    one before.
     """
     poses, first = np.unique(poses, return_index=True)
-    count, last = 1.0, places[poses[0]]
-    for place, gap in zip(places[poses], sight[first].tolist(), strict=True):
-        gone = math.dist(place, last)
-        if gone >= APART:
-            count, last = count + min(gone / max(gap, APART), 1.0), place
+    count, last = 1.0, positions[poses[0]]
+    for position, median in zip(positions[poses], ranges[first].tolist(), strict=True):
+        travel = math.dist(position, last)
+        if travel >= MIN_BASELINE:
+            count, last = count + min(travel / max(median, MIN_BASELINE), 1.0), position
     return count

@@ -1,35 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The records of the loop closures that were tried, as the graph lets go of keyframes.
+"""Records of loop closures, with pose and edge indices that follow the graph's renumbering.
 
-Where they are in the graph changes with each keyframe that goes, a thousand records at a time: it
-lies in columns, and a record is written anew when somebody reads it.
+Each marginalized keyframe renumbers up to a thousand records, so the indices are stored in
+columns and a record is updated only when it is read.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.graph.model.factor_table import Column
 from rlml_slam.graph.model.graph import Renumbering
-from rlml_slam.slam.closures.loop_closure import Closure, Fate
+from rlml_slam.slam.closures.loop_closure import Closure, ClosureStatus, State
 
-RECORDS = 2000  # of closures; beyond, the oldest rejected ones go
+RECORDS = 2000  # kept at most; beyond, the oldest rejected closures are removed
 
 Ints = NDArray[np.int64]
 FROM, TO, EDGE, NUMBER = range(4)  # columns: i, j, edge, number
 
 
 class ClosureRecords(Sequence[Closure]):
-    """Closures in the order in which they were tried, by the numbers that the graph has now."""
+    """Closures in order of time, with the graph's current indices."""
 
     def __init__(self, closures: Iterable[Closure] = ()) -> None:
         self._records: list[Closure] = []
-        self._at = Column((4,), np.int64)
+        self._indices = Column((4,), np.int64)
         self.extend(closures)
 
     def __len__(self) -> int:
@@ -43,78 +43,80 @@ class ClosureRecords(Sequence[Closure]):
         if isinstance(k, slice):
             return [self[n] for n in range(*k.indices(len(self)))]
         c = self._records[k]
-        i, j, edge, _ = self._at.view[k].tolist()
+        i, j, edge, _ = self._indices.view[k].tolist()
         if (c.i, c.j, c.edge) != (i, j, edge):
             c = self._records[k] = replace(c, i=i, j=j, edge=edge)
         return c
 
     def extend(self, closures: Iterable[Closure]) -> None:
-        """Add what was tried."""
+        """Append closures."""
         new = list(closures)
         self._records += new
         rows = [(c.i, c.j, c.edge, c.number) for c in new]
-        self._at.append(np.array(rows, dtype=np.int64).reshape(-1, 4))
+        self._indices.append(np.array(rows, dtype=np.int64).reshape(-1, 4))
 
     def append(self, closure: Closure) -> None:
-        """Add one."""
+        """Append one closure."""
         self.extend([closure])
 
     @property
     def edges(self) -> Ints:
-        """Of those that were accepted."""
-        edge = self._at.view[:, EDGE]
+        """Edges of the accepted closures."""
+        edge = self._indices.view[:, EDGE]
         return np.asarray(edge[edge >= 0])
 
     @property
-    def fates(self) -> list[Fate]:
-        """What becomes of those that were accepted."""
-        accepted = np.flatnonzero(self._at.view[:, EDGE] >= 0).tolist()
-        return [self._records[k].fate for k in accepted]
+    def statuses(self) -> list[ClosureStatus]:
+        """Statuses of the accepted closures."""
+        accepted = np.flatnonzero(self._indices.view[:, EDGE] >= 0).tolist()
+        return [self._records[k].status for k in accepted]
 
     def accepted(self, since: int = 0) -> list[Closure]:
-        """Those that were accepted, from number ``since`` on."""
-        at = self._at.view
+        """Accepted closures, from number ``since`` on."""
+        at = self._indices.view
         wanted = (at[:, EDGE] >= 0) & (at[:, NUMBER] >= since)
         return [self[k] for k in np.flatnonzero(wanted).tolist()]
 
-    def failed(self) -> set[tuple[int, int]]:
-        """Keyframes of the rejected ones."""
-        at = self._at.view
+    def rejected_pairs(self) -> set[tuple[int, int]]:
+        """Keyframe pairs (i, j) of the rejected closures."""
+        at = self._indices.view
         return set(map(tuple, at[at[:, EDGE] < 0, :EDGE].tolist()))
 
-    def take_back(self, pairs: set[tuple[int, int]]) -> int:
-        """Forget rejected closures between keyframes that are tied after all; how many."""
-        rejected = np.flatnonzero(self._at.view[:, EDGE] < 0)
-        ends = map(tuple, self._at.view[rejected, :EDGE].tolist())
-        gone = [k for k, pair in zip(rejected.tolist(), ends, strict=True) if pair in pairs]
+    def remove_rejected(self, pairs: set[tuple[int, int]]) -> int:
+        """Remove rejected closures between keyframes that a later closure joins; their number."""
+        rejected = np.flatnonzero(self._indices.view[:, EDGE] < 0)
+        ends = map(tuple, self._indices.view[rejected, :EDGE].tolist())
+        removed = [k for k, pair in zip(rejected.tolist(), ends, strict=True) if pair in pairs]
         kept = np.ones(len(self), dtype=np.bool_)
-        kept[gone] = False
+        kept[removed] = False
         self._keep(kept)
-        return len(gone)
+        return len(removed)
 
     def renumber(
         self, new: Renumbering, edges: Mapping[int, int], poses: Mapping[int, int]
     ) -> None:
-        """The graph has let go of keyframes.
+        """Follow the removal of keyframes from the graph.
 
-        ``edges`` and ``poses`` map what went to what stands for it, by the numbers until now, -1
-        for nothing. Of several closures that one edge stands for, the newest has the record.
+        ``edges`` and ``poses`` map removed ones to their replacements (-1 for none), in the
+        numbers before the removal. Of several closures with one replacement edge, the newest
+        keeps its record.
         """
-        at = self._at.view
-        onto, instead = _onto(len(new.poses), poses), _onto(len(new.edges), edges)
+        at = self._indices.view
+        onto = _replacements(len(new.poses), poses)
+        instead = _replacements(len(new.edges), edges)
         i, j, edge = onto[at[:, FROM]], onto[at[:, TO]], at[:, EDGE].copy()
         accepted = edge >= 0
         edge[accepted] = instead[edge[accepted]]
         kept = np.where(accepted, (i != j) & (edge >= 0), (i == at[:, FROM]) & (j == at[:, TO]))
-        stands = kept & accepted
+        linked = kept & accepted
         at[:, FROM], at[:, TO] = new.poses[i], new.poses[j]
-        at[stands, EDGE] = new.edges[edge[stands]]
-        newest = np.flatnonzero(stands)[::-1]
+        at[linked, EDGE] = new.edges[edge[linked]]
+        newest = np.flatnonzero(linked)[::-1]
         _, first = np.unique(at[newest, EDGE], return_index=True)
-        stands[:] = False
-        stands[newest[first]] = True
-        kept &= stands | ~accepted
-        # only of a rejected one is the record all there is: of the others, an edge is in the graph
+        linked[:] = False
+        linked[newest[first]] = True
+        kept &= linked | ~accepted
+        # an accepted closure is kept as long as its edge is in the graph
         rejected = np.flatnonzero(kept & ~accepted)
         kept[rejected[: max(int(kept.sum()) - RECORDS, 0)]] = False
         self._keep(kept)
@@ -122,11 +124,40 @@ class ClosureRecords(Sequence[Closure]):
     def _keep(self, kept: NDArray[np.bool_]) -> None:
         if not kept.all():
             self._records = [self._records[k] for k in np.flatnonzero(kept).tolist()]
-            self._at.keep(kept)
+            self._indices.keep(kept)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All records as arrays of the map file."""
+        return {
+            'closure': np.array([(c.i, c.j, c.edge) for c in self], np.int64).reshape(-1, 3),
+            'closure_match': np.array(
+                [(*c.delta, c.score, c.overlap, c.second) for c in self]
+            ).reshape(-1, 6),
+            'closure_why': np.array([c.why for c in self], dtype=np.str_),
+            'closure_state': np.array(
+                [(c.number, c.status.state.value) for c in self], np.int64
+            ).reshape(-1, 2),
+            'closure_reason': np.array([c.status.reason for c in self], dtype=np.str_),
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> ClosureRecords:
+        """Records of a map file."""
+        rows = zip(
+            arrays['closure'].tolist(), arrays['closure_match'], arrays['closure_why'],
+            arrays['closure_state'].tolist(), arrays['closure_reason'], strict=True,
+        )  # fmt: skip
+        return cls(
+            Closure(
+                i, j, match[:3], float(match[3]), edge, str(why), float(match[4]),
+                float(match[5]), number, ClosureStatus(State(state), str(reason)),
+            )
+            for (i, j, edge), match, why, (number, state), reason in rows
+        )  # fmt: skip
 
 
-def _onto(num: int, of: Mapping[int, int]) -> Ints:
-    """What each of ``num`` goes to."""
+def _replacements(num: int, of: Mapping[int, int]) -> Ints:
+    """Index (num,) that stands for each one, its own where it stays."""
     out = np.arange(num)
     out[list(of)] = list(of.values())
     return out

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loop closures of a map as a table of comma-separated values, a row each."""
+"""Loop closures of a map as a table of comma-separated values, one row per closure."""
 
 from __future__ import annotations
 
@@ -18,44 +18,44 @@ COLUMNS = (
 
 
 def closure_table(closures: Iterable[Closure]) -> str:
-    """Those that were accepted; ``history`` is keyframe:weight of each change of the weight.
+    """Table of the accepted closures; ``history`` is keyframe:weight of each change of weight.
 
-    ``residual`` is the squared Mahalanobis norm, chi-square with 3 degrees of freedom if all is
-    well; ``score``, ``overlap`` and ``second`` are those of the match that it was accepted for.
+    ``residual`` is the squared Mahalanobis norm, chi-square distributed with 3 degrees of freedom
+    for correct closures; ``score``, ``overlap`` and ``second`` are those of the scan match.
     """
     out = io.StringIO()
     table = csv.writer(out, lineterminator='\n')
     table.writerow(COLUMNS)
     for c in closures:
         if c.accepted:
-            fate = c.fate
-            history = ' '.join(f'{n.keyframe}:{n.weight:.2f}' for n in fate.notes)
+            status = c.status
+            history = ' '.join(f'{n.keyframe}:{n.weight:.2f}' for n in status.history)
             table.writerow((
-                c.number, c.i, c.j, fate.state.name.lower(), _number(fate.residual),
+                c.number, c.i, c.j, status.state.name.lower(), _number(status.residual),
                 _number(weight(c)), f'{c.score:.3f}', _number(c.overlap), _number(c.second),
-                fate.reason or c.why, history,
+                status.reason or c.why, history,
             ))  # fmt: skip
     return out.getvalue()
 
 
 def weight(closure: Closure) -> float:
-    """What it counts now: 0 of one that is out of the map."""
-    return closure.fate.weight if closure.fate.state is State.ACTIVE else 0.0
+    """Robust weight in the graph; 0 for a disabled or revoked closure."""
+    return closure.status.weight if closure.status.state is State.ACTIVE else 0.0
 
 
-def fates(closures: Iterable[Closure]) -> dict[str, int]:
-    """How many are out of the map, by what they are called in diagnostics."""
-    states = Counter(c.fate.state for c in closures)
+def state_counts(closures: Iterable[Closure]) -> dict[str, int]:
+    """Numbers of disabled and revoked closures, by their names in diagnostics."""
+    states = Counter(c.status.state for c in closures)
     return {f'closures {s.name.lower()}': states[s] for s in (State.DISABLED, State.REVOKED)}
 
 
-def told(closure: Closure) -> str:
-    """Its state in one line for a person."""
-    fate = closure.fate
-    reason = f': {fate.reason}' if fate.reason else ''
+def describe(closure: Closure) -> str:
+    """State of a closure in one line of text."""
+    status = closure.status
+    reason = f': {status.reason}' if status.reason else ''
     return (
         f'loop closure {closure.number} (keyframes {closure.i} and {closure.j}) is '
-        f'{fate.state.name.lower()}{reason}'
+        f'{status.state.name.lower()}{reason}'
     )
 
 

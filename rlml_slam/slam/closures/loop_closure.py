@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The record of a loop closure: what was tried, why it was accepted, and what became of it."""
+"""Record of a loop closure: the match, why it was accepted or rejected, and its state since."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from typing import NamedTuple
 
 from rlml_slam.se2 import Array
 
-NOTES = 50  # changes of the weight of a closure that are remembered
+HISTORY_LENGTH = 50  # changes of weight that are kept per closure
 
 
 class State(Enum):
-    """What a closure counts: what it is worth, nothing for now, nothing for good."""
+    """Active; disabled until it agrees with the others again; revoked by the user for good."""
 
     ACTIVE = 0
     DISABLED = 1
     REVOKED = 2
 
 
-class Note(NamedTuple):
-    """When the newest keyframe was ``keyframe``: squared Mahalanobis norm and robust weight."""
+class WeightChange(NamedTuple):
+    """Squared Mahalanobis norm and robust weight when ``keyframe`` was the newest keyframe."""
 
     keyframe: int
     residual: float
@@ -31,33 +31,33 @@ class Note(NamedTuple):
 
 
 @dataclass
-class Fate:
-    """What becomes of a closure: state with reason, residual now, and its weight over time."""
+class ClosureStatus:
+    """Current state with its reason, current residual, and history of the weight."""
 
     state: State = State.ACTIVE
     reason: str = ''
     residual: float = math.nan
-    weight: float = math.nan  # the last one noted
-    notes: deque[Note] = field(default_factory=lambda: deque(maxlen=NOTES))
+    weight: float = math.nan  # the last one recorded
+    history: deque[WeightChange] = field(default_factory=lambda: deque(maxlen=HISTORY_LENGTH))
 
-    def note(self, keyframe: int, residual: float, weight: float) -> None:
-        """Remember a weight."""
-        self.notes.append(Note(keyframe, residual, weight))
+    def record(self, keyframe: int, residual: float, weight: float) -> None:
+        """Append a weight to the history."""
+        self.history.append(WeightChange(keyframe, residual, weight))
         self.weight = weight
 
-    def turn(self, state: State, reason: str) -> None:
-        """Go over to another state."""
+    def set_state(self, state: State, reason: str) -> None:
+        """Change the state."""
         self.state, self.reason = state, reason
 
 
 @dataclass(frozen=True)
 class Closure:
-    """A loop closure that was tried: poses ``i`` (submap's anchor) and ``j``, and the verdict.
+    """Loop closure candidate between poses ``i`` (submap's anchor) and ``j``, with its result.
 
-    ``edge`` is its index in ``graph.edges``, -1 where it was rejected; ``why`` says it in words.
-    ``score`` is the mean hit probability, ``second`` that of the second-best place per the best
-    one's (NaN where there is none), ``overlap`` the share of end points on walls. Those that were
-    accepted are numbered from 0; ``fate`` is what has become of it since.
+    ``edge`` is its index in ``graph.edges``, -1 where it was rejected; ``why`` gives the reason.
+    ``score`` is the mean hit probability, ``second`` the score of the second-best pose divided by
+    the best one's (NaN where there is none), ``overlap`` the share of end points on walls.
+    Accepted closures are numbered from 0; ``status`` is shared by all copies of a record.
     """
 
     i: int
@@ -69,9 +69,9 @@ class Closure:
     overlap: float = math.nan
     second: float = math.nan
     number: int = -1
-    fate: Fate = field(default_factory=Fate, compare=False)
+    status: ClosureStatus = field(default_factory=ClosureStatus, compare=False)
 
     @property
     def accepted(self) -> bool:
-        """Whether it entered the graph."""
+        """Whether it was added to the graph."""
         return self.edge >= 0

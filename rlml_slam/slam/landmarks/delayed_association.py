@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Matches that the front end left open, decided when later sightings tell."""
+"""Delayed association: matches that the front end left open, decided by later sightings."""
 
 from __future__ import annotations
 
@@ -11,21 +11,19 @@ from rlml_slam.se2 import Array
 from rlml_slam.slam.keyframes import Interval, Sighting
 from rlml_slam.slam.landmarks.reflector_graph import ReflectorGraph
 
-# The answers lie metres apart and are told by where a robot comes out of a blind stretch: nothing
-# finer than this may speak for one of them, nor anything surer of the wheels than twice their
-# sigma, for that is where they slip.
+# The hypotheses are metres apart, and are decided by the pose after a stretch without reflectors,
+# where wheels slip: sightings and motion are used with these larger covariances.
 SPREAD = 0.2  # [m] added to the noise of a sighting, per axis
-ALIKE = 0.3  # share of its variance that the detections of one keyframe have in common
-SLIP2 = 4.0  # variance of a motion, in those of the noise model
-DECIDED = 0.999  # probability of a match that joins two reflectors of the map
-LIKELY = 0.5  # the same when there will be no more evidence
+CORRELATED_SHARE = 0.3  # of the variance, among the detections of one keyframe
+SLIP2 = 4.0  # factor of the covariance of a motion
+DECIDED = 0.999  # probability of a match that merges two reflectors of the map
+LIKELY = 0.5  # the same at the end of a run
 
 
 class DelayedAssociation:
-    """Nothing, until a keyframe brings an unknown reflector; then hypotheses, until all is told.
+    """Hypotheses from the first new reflector until all new ones are decided.
 
-    They are seeded from the graph's own covariance, so that what it knows from scans and closures
-    counts, and cost nothing while no reflector is new.
+    They begin with the joint covariance of the graph, which contains scans and closures.
     """
 
     def __init__(self, params: Reflector, reflectors: ReflectorGraph) -> None:
@@ -35,11 +33,11 @@ class DelayedAssociation:
 
     @property
     def pending(self) -> frozenset[int]:
-        """Keys of reflectors that may turn out to be others."""
+        """Keys of reflectors that are not decided."""
         return frozenset() if self._hypotheses is None else self._hypotheses.pending
 
     def begins(self, interval: Interval) -> bool:
-        """Whether this interval brings the first question: the graph should be at its best."""
+        """Whether this interval has the first undecided reflector; the graph should be solved."""
         return (
             self._hypotheses is None
             and self._reflectors.found
@@ -52,20 +50,20 @@ class DelayedAssociation:
         )
 
     def begin(self, pose: int) -> None:
-        """Open the question at keyframe ``pose``, from what the graph knows."""
+        """Begin the hypotheses at keyframe ``pose``, from the belief of the graph."""
         belief = self._reflectors.belief(pose)
         self._hypotheses = MultiHypothesis(
             belief.T_map_base, belief.keys, belief.points, belief.cov, self._p.unmapped_density
         )
 
     def drop(self) -> None:
-        """The questions are answered by others: the map was laid anew."""
+        """Drop the hypotheses: a loop closure decided them."""
         self._hypotheses = None
 
-    def see(self, interval: Interval) -> None:
-        """The reflectors seen near the newest keyframe, before the graph has them.
+    def add(self, interval: Interval) -> None:
+        """Add the sightings near the newest keyframe, before the graph has them.
 
-        One that tells its id is no question: it counts where it is known, and is none's answer.
+        A reflector with an id is decided: it is used where the hypotheses contain it.
         """
         sights = []
         for key, groups in interval.sightings.items():
@@ -74,18 +72,18 @@ class DelayedAssociation:
             if self._hypotheses is None or seen < self._p.min_sightings:
                 continue
             if known in self._hypotheses or key not in interval.ids:
-                most = max(groups, key=lambda g: g.count)
-                sights.append(Sight(known, most.z, _noise(most)))
+                largest = max(groups, key=lambda g: g.count)
+                sights.append(Sight(known, largest.z, _sighting_cov(largest)))
         if self._hypotheses is not None:
             self._hypotheses.see(sights)
 
     def move(self, delta: Array, cov: Array) -> None:
-        """The motion (3,) to the next keyframe and its covariance (3, 3)."""
+        """Move by the motion (3,) to the next keyframe with covariance (3, 3)."""
         if self._hypotheses is not None:
             self._hypotheses.move(delta, SLIP2 * cov)
 
     def decide(self, final: bool = False) -> bool:
-        """Join in the graph what turned out to be one; whether anything was."""
+        """Merge the reflectors that are decided to be one; whether there were any."""
         if self._hypotheses is None:
             return False
         answers = self._hypotheses.answers(LIKELY if final else DECIDED)
@@ -101,8 +99,8 @@ def _count(groups: list[Sighting]) -> int:
     return sum(g.count for g in groups)
 
 
-def _noise(sighting: Sighting) -> Array:
-    """Covariance (2, 2) of where a sighting says that its reflector is."""
-    alike = 1.0 + ALIKE * (sighting.count - 1)
-    cov: Array = alike * np.linalg.inv(sighting.information) + SPREAD**2 * np.eye(2)
+def _sighting_cov(sighting: Sighting) -> Array:
+    """Covariance (2, 2) of a sighting whose detections are correlated."""
+    factor = 1.0 + CORRELATED_SHARE * (sighting.count - 1)
+    cov: Array = factor * np.linalg.inv(sighting.information) + SPREAD**2 * np.eye(2)
     return cov

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What has become of each reflector: there, new, moved, missing, or a ghost; as a table."""
+"""States of the reflectors (present, new, moved, missing, ghost), as a table."""
 
 from __future__ import annotations
 
@@ -20,17 +20,18 @@ COLUMNS = (
     'state', 'key', 'id', 'x_m', 'y_m', 'sightings', 'first_s', 'last_s', 'probability',
     'from_key', 'from_x_m', 'from_y_m', 'by_m',
 )  # fmt: skip
-FAR = 3.0  # [m] one that is missing and one that is new are one that was moved, if this near
-# [s] that both may seem to be there, for looks count by the keyframe they were near; and that the
-# missing one was there at least, longer than most who pass: then what is near was mapped
-TOGETHER, SETTLED = 10.0, 60.0
+MAX_MOVE = 3.0  # [m] up to which a missing and a new reflector are one that was moved
+# [s] by which their detection times may overlap, for these are rounded to keyframes; and the least
+# time that the missing one was present, so that its surroundings were mapped
+OVERLAP, MAPPED_TIME = 10.0, 60.0
+GHOST_DISTANCE = 0.5  # [m] ghosts closer together are one
 
 
 @dataclass
 class ReflectorState:
-    """One reflector at ``place`` (2,) of the map, seen between two stamps [ns].
+    """State of a reflector at ``place`` (2,) of the map, detected between two stamps [ns].
 
-    ``probability`` is that of being there now; ``origin`` is where one that was moved was before.
+    ``probability`` of being present now; ``origin`` is the previous state of a moved one.
     """
 
     state: str
@@ -45,44 +46,45 @@ class ReflectorState:
 
     @property
     def distance(self) -> float:
-        """How far it was moved [m], NaN where it was not."""
+        """Distance by which it was moved [m], else NaN."""
         return math.nan if self.origin is None else _gap(self, self.origin)
 
 
 def reflector_states(reflectors: ReflectorGraph, params: Reflector) -> list[ReflectorState]:
-    """All reflectors, those of the map first.
+    """States of all reflectors, those of the map first.
 
-    One that left the map is missing, or moved where a new one stands near or tells its id; what
-    came when an old one went is new there, whatever earlier keyframes tell. What was seen in one
-    pass alone is a ghost, and so is what was seen too seldom to enter the map.
+    One that was removed is missing, or moved where a new one is near or has its id. One that was
+    seen in one pass alone, or too seldom to be mapped, is a ghost.
     """
-    there = [_alive(m, reflectors.place(m)) for m in reflectors.alive()]
-    there.sort(key=lambda s: s.key)
-    left = _left(reflectors, params)
-    lost = [
-        s for s in left
-        if s.state == MISSING and all(_gap(s, t) > params.min_separation for t in there)
+    present = [_present(m, reflectors.place(m)) for m in reflectors.alive()]
+    present.sort(key=lambda s: s.key)
+    removed = _removed(reflectors, params)
+    missing = [
+        s for s in removed
+        if s.state == MISSING and all(_gap(s, t) > params.min_separation for t in present)
     ]  # fmt: skip
-    pairs = [(_gap(n, s), n, s) for n in there for s in lost if _came_after(n, s) and _same(n, s)]
+    pairs = [
+        (_gap(n, s), n, s) for n in present for s in missing if _came_after(n, s) and _same(n, s)
+    ]
     for _, new, old in sorted(pairs, key=lambda p: p[0]):
-        if new.origin is None and old in lost:
+        if new.origin is None and old in missing:
             new.state, new.origin = MOVED, old
-            lost.remove(old)
-    return there + lost + _grouped([s for s in left if s.state == GHOST])
+            missing.remove(old)
+    return present + missing + _grouped([s for s in removed if s.state == GHOST])
 
 
-def _alive(m: Landmark, place: Array) -> ReflectorState:
-    probability = 1.0 / (1.0 + math.exp(-m.life.odds))
-    state = NEW if m.life.is_new else PRESENT
+def _present(m: Landmark, place: Array) -> ReflectorState:
+    probability = 1.0 / (1.0 + math.exp(-m.history.odds))
+    state = NEW if m.history.is_new else PRESENT
     return ReflectorState(
-        state, m.key, m.id, place, m.count, m.life.first, m.life.last, probability
+        state, m.key, m.id, place, m.count, m.history.first, m.history.last, probability
     )
 
 
-def _left(reflectors: ReflectorGraph, params: Reflector) -> list[ReflectorState]:
-    """Those that are no longer in the map, the newest first."""
+def _removed(reflectors: ReflectorGraph, params: Reflector) -> list[ReflectorState]:
+    """Reflectors that were removed from the map, the newest first."""
     out = []
-    for key, id_, place, count, first, last, mapped in reflectors.gone.rows[::-1].tolist():
+    for key, id_, place, count, first, last, mapped in reflectors.removed.rows[::-1].tolist():
         passing = (last - first) * 1e-9 < params.candidate_timeout
         state = MISSING if mapped and not passing else GHOST
         out.append(ReflectorState(state, key, id_, np.array(place), count, first, last, 0.0))
@@ -90,22 +92,22 @@ def _left(reflectors: ReflectorGraph, params: Reflector) -> list[ReflectorState]
 
 
 def _came_after(new: ReflectorState, old: ReflectorState) -> bool:
-    """Whether one appeared where the other's surroundings were mapped."""
-    came_then = (old.last - new.first) * 1e-9 < TOGETHER
-    return new.state == NEW or (came_then and (old.last - old.first) * 1e-9 > SETTLED)
+    """Whether one appeared after the other, whose surroundings were mapped."""
+    came_then = (old.last - new.first) * 1e-9 < OVERLAP
+    return new.state == NEW or (came_then and (old.last - old.first) * 1e-9 > MAPPED_TIME)
 
 
 def _same(new: ReflectorState, old: ReflectorState) -> bool:
     if ANONYMOUS not in (new.id, old.id):
         return new.id == old.id
-    return _gap(new, old) < FAR
+    return _gap(new, old) < MAX_MOVE
 
 
 def _grouped(ghosts: Iterable[ReflectorState]) -> list[ReflectorState]:
-    """What was seen at one place again and again as one ghost."""
+    """Ghosts, those at one place as one."""
     out: list[ReflectorState] = []
     for g in ghosts:
-        known = next((o for o in out if _gap(o, g) < 0.5), None)
+        known = next((o for o in out if _gap(o, g) < GHOST_DISTANCE), None)
         if known is None:
             out.append(g)
             continue
@@ -119,7 +121,7 @@ def _gap(a: ReflectorState, b: ReflectorState) -> float:
 
 
 def state_table(states: Iterable[ReflectorState]) -> str:
-    """A row each, comma-separated."""
+    """Table of comma-separated values, one row per reflector."""
     rows = [','.join(COLUMNS)]
     for s in states:
         o = s.origin
@@ -131,8 +133,8 @@ def state_table(states: Iterable[ReflectorState]) -> str:
     return '\n'.join(rows) + '\n'
 
 
-def told(s: ReflectorState) -> str:
-    """One that is not simply there, in a line for a person."""
+def describe(s: ReflectorState) -> str:
+    """A new, moved, missing or ghost reflector in one line of text."""
     name = f'reflector {s.key}' + ('' if s.id == ANONYMOUS else f' (id {s.id})')
     at = f'at {s.place[0]:.2f}, {s.place[1]:.2f}'
     if s.origin is not None:

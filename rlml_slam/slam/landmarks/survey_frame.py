@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Surveyed reflectors in the graph: they define the frame of the map, and hold it there.
+"""Alignment of the graph with a survey, whose frame becomes that of the map.
 
-Once the reflectors tell where the map lies in the survey, the whole graph is put there, and each
-reflector that is one of the survey gets its surveyed place as a prior. The first keyframe is the
-gauge until then. A reflector that the sightings see elsewhere loses its prior again: it was moved.
+When the reflectors match the survey at exactly one pose, the whole graph is moved there, and each
+surveyed reflector gets a prior at its surveyed position. Until then, the first keyframe is the
+gauge. A reflector whose sightings contradict its prior was moved: the prior is disabled.
 """
 
 from __future__ import annotations
@@ -19,70 +19,70 @@ from rlml_slam.params import Parameters
 from rlml_slam.slam.landmarks.reflector_graph import ReflectorGraph
 from rlml_slam.types import ANONYMOUS
 
-GROWTH = 1.1  # the constellation is looked at again when it has grown by this, or by one
+GROWTH = 1.1  # the constellation is matched again when it has grown by this factor
 
 
 class SurveyFrame:
-    """Ties the reflectors of a graph to a survey; ``why`` says in words how far that has come."""
+    """Aligns the reflectors of a graph with a survey; ``why`` describes the state in words."""
 
     def __init__(
-        self, params: Parameters, live: OnlineSolver, reflectors: ReflectorGraph, survey: Survey
+        self, params: Parameters, solver: OnlineSolver, reflectors: ReflectorGraph, survey: Survey
     ) -> None:
         self.survey = survey
         self.found = False
         self.why = 'no reflectors yet'
         self._sigma = params.back_end.survey_sigma
         self._limit = gate(params.reflector.new_gate)
-        self._live = live
-        self._graph = live.graph
+        self._solver = solver
+        self._graph = solver.graph
         self._reflectors = reflectors
-        self._asked: frozenset[int] = frozenset()
-        self._refused: set[int] = set()
+        self._matched: frozenset[int] = frozenset()  # keys at the last match
+        self._rejected: set[int] = set()
 
     def update(self) -> bool:
-        """Use what the reflectors tell now; whether the graph has changed and is to be solved."""
-        if self.found and self._refuse_worst():
+        """Match the current reflectors; whether the graph has changed and has to be solved."""
+        if self.found and self._reject_worst():
             return True
         keys = self._reflectors.keys()
-        new = keys - self._asked
-        if not new or (not self.found and len(keys) < GROWTH * len(self._asked)):
+        new = keys - self._matched
+        if not new or (not self.found and len(keys) < GROWTH * len(self._matched)):
             return False
-        self._asked = keys
-        return self._tie() if self.found else self._enter()
+        self._matched = keys
+        return self._add_priors() if self.found else self._align()
 
-    def _enter(self) -> bool:
-        """Put the graph where the survey says, if it does."""
+    def _align(self) -> bool:
+        """Move the graph to the frame of the survey, if the constellation fits at one pose."""
         placed = place(self._reflectors.reflectors(), self.survey, self._sigma)
         self.why = placed.why
         if placed.T_survey_map is None:
             return False
         self._graph.move(placed.T_survey_map)
-        self._live.start_over()
-        self._reflectors.forget_views()
+        self._solver.start_over()
+        self._reflectors.clear_views()
         self.found = True
-        return self._tie()
+        return self._add_priors()
 
-    def _tie(self) -> bool:
-        """Give the reflectors that are of the survey its places; whether any was new."""
+    def _add_priors(self) -> bool:
+        """Add priors at the surveyed positions; whether any is new."""
         known = self._reflectors.reflectors()
         rows = self._reflectors.surveyed()
         information = np.eye(2) / self._sigma**2
         new = 0
         for i, k in pairs_at(known, self.survey, np.zeros(3), self._sigma).tolist():
             key = int(known.keys[i])
-            if key in rows or k in rows.values() or key in self._refused:
+            if key in rows or k in rows.values() or key in self._rejected:
                 continue
-            index = self._reflectors.survey(key, k, int(self.survey.ids[k]))
+            index = self._reflectors.set_surveyed(key, k, int(self.survey.ids[k]))
             self._graph.add_landmark_prior(index, self.survey.points[k], information)
             new += 1
-        self.hold()
+        self.update_gauge()
         self.why = f'{len(rows) + new} of {len(self.survey.points)} surveyed reflectors'
         return new > 0
 
-    def _refuse_worst(self) -> bool:
-        """Take the prior from the reflector that is farthest from its place, if it was moved.
+    def _reject_worst(self) -> bool:
+        """Disable the prior with the largest residual, if it is outside the gate.
 
-        One at a time: it pulls its neighbours away as well.
+        One at a time: a wrong prior pulls its neighbours away as well.
         """
         priors = self._graph.landmark_priors
         left = np.flatnonzero(priors.enabled)
@@ -95,11 +95,11 @@ class SurveyFrame:
         priors.enabled[worst] = False
         index = int(priors.nodes[worst, 0])
         key = self._reflectors.key_of(index)
-        self._refused.add(key)
-        self._reflectors.survey(key, -1, ANONYMOUS)
+        self._rejected.add(key)
+        self._reflectors.set_surveyed(key, -1, ANONYMOUS)
         return True
 
-    def hold(self) -> None:
-        """The first keyframe is the gauge where too few reflectors are."""
+    def update_gauge(self) -> None:
+        """Fix the first keyframe where too few reflectors have priors."""
         tied = int(self._graph.landmark_priors.enabled.sum())
         self._graph.fixed_poses[0] = tied < MIN_MATCHES

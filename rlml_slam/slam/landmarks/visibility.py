@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which reflectors of the map should be in view: reflectors that are gone, or a detector that is.
+"""Visibility of mapped reflectors: which of them the detector should see from a pose.
 
-A reflector is expected only where the scan itself says that nothing stands before it: a beam in
-its direction came back from where it stands, or from behind. Without such a beam nothing is said.
+A reflector is visible only where the scan itself shows a free line of sight: a beam in its
+direction ended at it, or behind it. Without such a beam it is not expected.
 """
 
 from __future__ import annotations
@@ -16,33 +16,33 @@ from rlml_slam import se2
 from rlml_slam.compiled import kernel
 from rlml_slam.se2 import Array
 
-BEAM = 0.02  # [rad] a beam this near passes a reflector or hits it: half a coarse scanner's step
-DEPTH = 0.3  # [m] before its place, a beam that ends hits something else, with the pose's error
-SHARE = 0.9  # of the farthest range at which one was seen: there, one may be seen or not
+BEAM = 0.02  # [rad] between a beam and a reflector that it may hit: half a coarse scanner's step
+DEPTH = 0.3  # [m] a beam that ends this far before a reflector is blocked, with the pose's error
+SHARE = 0.9  # of the largest range at which one was seen: beyond, it may be missed
 
 
 def expected(
-    pose: Array, reflectors: Array, points: Array, origin: Array, reach: float
+    pose: Array, reflectors: Array, points: Array, origin: Array, max_range: float
 ) -> NDArray[np.bool_]:
     """Whether each of ``reflectors`` (m, 2) should be seen from ``pose`` (3,), as booleans (m,).
 
     ``points`` (n, 2) are the end points of a scan from ``origin`` (2,), both in the base frame;
-    ``reach`` [m] is the farthest range at which a reflector was seen so far.
+    ``max_range`` [m] is the largest range at which a reflector was seen so far.
     """
     place = se2.transform(se2.inverse(pose), reflectors) - origin
-    out: NDArray[np.bool_] = _passed(place, points, origin, SHARE * reach)
+    out: NDArray[np.bool_] = _is_visible(place, points, origin, SHARE * max_range)
     return out
 
 
 @kernel
-def _passed(place: Array, points: Array, origin: Array, reach: float) -> NDArray[np.bool_]:
-    """Whether beams towards each place (m, 2), seen from the laser, end there or behind."""
+def _is_visible(place: Array, points: Array, origin: Array, max_range: float) -> NDArray[np.bool_]:
+    """Whether the beams towards each place (m, 2) in the laser frame end at it or behind."""
     out = np.zeros(len(place), dtype=np.bool_)
     x, y = points[:, 0] - origin[0], points[:, 1] - origin[1]
-    ends = np.empty(len(points))  # along the way to the place; Inf of beams that go elsewhere
+    ends = np.empty(len(points))  # along the line of sight; inf for other beams
     for k in range(len(place)):
         far = math.hypot(place[k, 0], place[k, 1])
-        if not DEPTH < far < reach:
+        if not DEPTH < far < max_range:
             continue
         ux, uy = place[k, 0] / far, place[k, 1] / far
         for n in range(len(points)):

@@ -108,11 +108,11 @@ class Slam(SynchronizedSystem):
         )
         if frames:
             self.back_end.reset()
-            self.back_end.is_told = True
+            self.back_end.associations_are_final = True
             for frame in frames:
                 self.back_end.add(frame)
             self.back_end.finish()
-            self.back_end.is_told = False
+            self.back_end.associations_are_final = False
 
     def process(self, observations: Iterable[Observation]) -> list[Frame]:
         """What the sequencer made of the inputs."""
@@ -173,7 +173,7 @@ class Slam(SynchronizedSystem):
         if update is None:
             return False
         self.updates.append(update)
-        self.front_end.forget(update.gone)
+        self.front_end.forget(update.removed)
         if update.optimized:
             self.front_end.correct(update.T_map_local, update.known)
         return update.optimized

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A whole map as a file: keyframes, scans, submaps, graph, reflectors, parameters, products.
+"""Map files: keyframes, scans, submaps, graph, reflectors, parameters and the grid.
 
-What maps/container.py writes, by name; n keyframes, m landmarks, lengths in metres and radians:
+Names of the arrays in the container (maps/map_container.py), for n keyframes and m landmarks, in
+metres and radians:
 
     pose (n, 3), pose_fixed (n,), landmark (m, 2), landmark_fixed (m,)     the estimate
     edge_…, sighted_…, pose_prior_…, landmark_prior_… with nodes, measured,
-        information, kinds (graph.table.FactorKind), enabled               the factors
-    key_stamp [ns], key_local, key_cov, key_scan_stamp, key_looked, key_origin, key_points (n,)
-        -1 where there is no scan, else how many of ``points`` (p, 2) are its  keyframes and scans
+        information, kinds (graph.model.factor_table.FactorKind), enabled               the factors
+    key_stamp [ns], key_local, key_cov, key_scan_stamp, key_detector_ran, key_jumped, key_origin,
+        key_points (n,) number of its ``points`` (p, 2), -1 without a scan    keyframes and scans
     submap_…                        the grids that scans are matched against, cells in one row
-    reflector_…, sighting           reflectors by key; `reflector_gone` have left the map;
+    reflector_…, sighting           reflectors by key; `reflector_removed` left the map;
                                     `reflector_map` and `reflector_cov` are what a robot
                                     localizes with
     survey_ids, survey_points, survey_diameters     the survey whose frame the map has, if any
@@ -38,6 +39,7 @@ from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.maps.survey import Survey
 from rlml_slam.params import Parameters
+from rlml_slam.slam.back_end import saved_state
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.closures.loop_closure import Closure
 from rlml_slam.slam.keyframes import Keyframe
@@ -51,19 +53,19 @@ Arrays = Mapping[str, NDArray[Any]]
 
 
 def parameters_of(content: Content) -> Parameters:
-    """Those that a map was made with; what this program does not know is left out."""
-    told = content.description['parameters']
+    """Parameters that a map was made with; unknown ones are left out."""
+    saved = content.description['parameters']
     groups: dict[str, Any] = {}
     for group in dataclasses.fields(Parameters):
         kind: Any = type(group.default)
         known = {f.name for f in dataclasses.fields(kind)}
-        values = told.get(group.name, {})
+        values = saved.get(group.name, {})
         groups[group.name] = kind(**{k: v for k, v in values.items() if k in known})
     return Parameters(**groups)
 
 
 def tables(graph: Graph) -> dict[str, FactorTable]:
-    """The tables of a graph, as they are called in the file."""
+    """The tables of a graph, by their names in the file."""
     return {
         'edge': graph.edges, 'sighted': graph.sightings,
         'pose_prior': graph.pose_priors, 'landmark_prior': graph.landmark_priors,
@@ -71,15 +73,14 @@ def tables(graph: Graph) -> dict[str, FactorTable]:
 
 
 def content_of(back_end: BackEnd, params: Parameters, grid: OccupancyGrid | None) -> Content:
-    """The map as it is now. Raises MapError if there is none."""
+    """The current map. Raises MapError if there is none."""
     if not back_end.keyframes:
         raise MapError('there is no map yet')
     graph, found = back_end.graph, back_end.reflectors()
     arrays: dict[str, NDArray[Any]] = {
         'pose': graph.poses, 'pose_fixed': graph.fixed_poses,
         'landmark': graph.landmarks, 'landmark_fixed': graph.fixed_landmarks,
-        **arrays_of(back_end.keyframes), **back_end.scans.arrays(),
-        **back_end.reflector_graph.arrays(), **back_end.path.arrays(),
+        **arrays_of(back_end.keyframes), **saved_state.arrays_of(back_end),
         'reflector_map': found.points, 'reflector_cov': found.cov,
         **{f'reflector_map_{name}': getattr(found, name) for name in MADE},
     }  # fmt: skip
@@ -104,12 +105,12 @@ def content_of(back_end: BackEnd, params: Parameters, grid: OccupancyGrid | None
 
 
 def arrays_of(keys: list[Keyframe]) -> dict[str, NDArray[Any]]:
-    """The keyframes and their scans, as the file has them."""
+    """Keyframes and their scans as arrays of the file."""
     points = [k.points for k in keys if k.points is not None]
     return {
         'key_stamp': np.array([k.stamp for k in keys], dtype=np.int64),
         'key_scan_stamp': np.array([k.scan_stamp for k in keys], dtype=np.int64),
-        'key_looked': np.array([k.looked for k in keys]),
+        'key_detector_ran': np.array([k.detector_ran for k in keys]),
         'key_jumped': np.array([k.jumped for k in keys]),
         'key_local': np.array([k.T_local for k in keys]),
         'key_cov': np.array([k.cov_local for k in keys]),
@@ -120,21 +121,23 @@ def arrays_of(keys: list[Keyframe]) -> dict[str, NDArray[Any]]:
 
 
 def save(path: str | Path, back_end: BackEnd, params: Parameters) -> Path:
-    """Write the map as it is now; the one before stays beside it. Raises MapError."""
+    """Write the current map; the previous file stays beside it. Raises MapError."""
     return map_container.write(path, content_of(back_end, params, back_end.occupancy_grid()))
 
 
 def load(path: str | Path) -> Content:
-    """A file that is whole and of this kind; MapError or FileFormatError says what is wrong."""
+    """Read and check a file. Raises MapError or FileFormatError."""
     content = map_container.read(path)
     kind, version = (content.description.get(k) for k in ('format', 'version'))
     if kind != FORMAT or version != VERSION:
-        raise FileFormatError(f'{path}: {kind} {version}, this program reads {FORMAT} {VERSION}')
+        raise FileFormatError(
+            f'{path}: format {kind} {version}, but this program reads {FORMAT} {VERSION}'
+        )
     return content
 
 
 def saved_map(content: Content) -> SavedMap:
-    """What a robot localizes in."""
+    """Reflectors and grid for localization."""
     a, d = content.arrays, content.description
     reflectors = Reflectors(
         a['reflector_map_keys'], a['reflector_map'], a['reflector_cov'], a['reflector_map_ids'],
@@ -155,22 +158,23 @@ def survey_of(content: Content) -> Survey | None:
 
 
 def restore(content: Content, back_end: BackEnd) -> None:
-    """Let an empty back end go on with the map.
+    """Continue the map with an empty back end.
 
-    Raises FileFormatError if its parts disagree, MapError if it has another survey's frame.
+    Raises FileFormatError if its parts are inconsistent, MapError if it has the frame of another
+    survey.
     """
     a = content.arrays
     try:
         fill(back_end.graph, a)
-        back_end.start_from(_keyframes(a), a, survey_of(content))
+        saved_state.restore(back_end, _keyframes(a), a, survey_of(content))
     except (KeyError, IndexError, ValueError, SolverError) as e:
-        raise FileFormatError(f'the parts of the map do not fit together: {e}') from e
+        raise FileFormatError(f'the parts of the map are inconsistent: {e}') from e
 
 
 def revoked(content: Content, number: int) -> tuple[Content, Closure]:
-    """A map without one of its loop closures, solved anew, and what became of that.
+    """A map without one of its loop closures, solved again, and the record of the closure.
 
-    Raises SolverError if there is no such one.
+    Raises SolverError if there is none of this number.
     """
     params = parameters_of(content)
     back_end = BackEnd(params)
@@ -183,9 +187,9 @@ def revoked(content: Content, number: int) -> tuple[Content, Closure]:
 
 
 def fill(graph: Graph, a: Arrays) -> None:
-    """The saved nodes and factors into an empty graph."""
+    """Add the saved nodes and factors to an empty graph."""
     graph.add_poses(a['pose'])
-    graph.poses[:] = a['pose']  # to the last bit, which wrapping an angle again may change
+    graph.poses[:] = a['pose']  # bit-identical: wrapping an angle again may change it
     graph.fixed_poses[:] = a['pose_fixed']
     graph.add_landmarks(a['landmark'])
     graph.fixed_landmarks[:] = a['landmark_fixed']
@@ -210,13 +214,11 @@ def _keyframes(a: Arrays) -> list[Keyframe]:
     for k, (_, count, end, stamp, T_local, cov, origin, scan_stamp) in enumerate(rows):
         points = a['points'][end - count : end].copy() if count >= 0 else None
         place = origin.copy() if count >= 0 else None
-        # files of older versions lack them
-        looked, jumped = (
-            bool(a[name][k]) if name in a else False for name in ('key_looked', 'key_jumped')
-        )
+        detector_ran, jumped = bool(a['key_detector_ran'][k]), bool(a['key_jumped'][k])
         out.append(
             Keyframe(
-                k, stamp, T_local.copy(), cov.copy(), points, place, scan_stamp, looked, jumped
+                k, stamp, T_local.copy(), cov.copy(), points, place, scan_stamp, detector_ran,
+                jumped,
             )
-        )
+        )  # fmt: skip
     return out

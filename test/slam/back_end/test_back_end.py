@@ -20,17 +20,15 @@ from made_worlds import (
 )
 
 from rlml_slam import se2
-from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.factors import relative_information
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import BackEnd as BackEndParameters
 from rlml_slam.params import LoopClosure, Node, Parameters
 from rlml_slam.slam.back_end.back_end import BackEnd
-from rlml_slam.slam.back_end.scan_graph import ScanGraph
 from rlml_slam.slam.closures.closure_candidates import candidates
-from rlml_slam.slam.closures.closure_matching import Matcher
-from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap
+from rlml_slam.slam.closures.closure_matching import ClosureMatcher
+from rlml_slam.slam.closures.keyframe_submap import TURN, KeyframeSubmap, edge_of_match
 from rlml_slam.slam.keyframes import Interval, Keyframe, Sighting
 from rlml_slam.types import ANONYMOUS, EdgeKind, Frame, Motion, Observation, Status
 
@@ -309,8 +307,8 @@ def test_one_outlier_of_a_known_reflector_does_not_bend_the_map():
 def test_belief_is_the_newest_keyframe_and_the_map_with_joint_covariance():
     back_end, _ = run(frames_along(CURVE, scan=False, rng=np.random.default_rng(7)))
     for _ in range(5):  # the linear models are those of the optimum then, not of near it
-        back_end.live.start_over()
-        back_end.live.solve()
+        back_end.solver.start_over()
+        back_end.solver.solve()
     belief, found = back_end.belief(), back_end.reflectors()
     last = back_end.keyframes[-1]
     np.testing.assert_array_equal(belief.T_map_base, back_end.graph.poses[last.index])
@@ -359,8 +357,8 @@ def test_loop_closure_closes_a_drifted_loop(enabled):
     distance, turn = errors(back_end.trajectory()[1], LAP)
     # the record of one that waited and entered later stands for both
     last = {(c.i, c.j): c for c in closures}
-    assert {(c.i, c.j): c for c in back_end.scans.closures} == last
-    assert len(back_end.scans.closures) == len(last)
+    assert {(c.i, c.j): c for c in back_end.loop_closer.records} == last
+    assert len(back_end.loop_closer.records) == len(last)
     if not enabled:
         assert closures == []
         assert distance[-1] > 0.5 * before
@@ -449,26 +447,23 @@ def test_loop_is_closed_only_by_a_scan_that_holds_its_place(open_):
     m.submap.complete()
     (candidate,) = candidates(graph, keys[1], [m], LoopClosure())
     seen = se2.transform(se2.inverse(pose), walls)
-    found = Matcher(Parameters()).match(candidate, keys[1], seen).result
+    found = ClosureMatcher(Parameters()).match(candidate, keys[1], seen).result
     if open_:
-        assert found.why == 'the scan leaves a direction open'
+        assert found.why == 'the scan does not constrain one direction'
     else:
         at = se2.compose(m.T_anchor_grid, found.T_grid_key)
         np.testing.assert_allclose(at, pose, atol=0.03)
 
 
 def test_edge_of_a_scan_that_leaves_a_direction_open_enters_the_graph():
-    graph = Graph()
-    scans = ScanGraph(Parameters(), OnlineSolver(graph))
-    keys = [
-        Keyframe(graph.add_pose(pose), FIRST, pose, EYE, None, None, FIRST)
-        for pose in (np.zeros(3), np.array([1.0, 0.0, 0.2]))
-    ]
-    submap = KeyframeSubmap(keys[0], Submap())
+    graph, floor = Graph(), np.array(Parameters().back_end.scan_edge_variance_floor)
+    for pose in (np.zeros(3), np.array([1.0, 0.0, 0.2])):
+        graph.add_pose(pose)
     rng = np.random.default_rng(0)
     for k in range(300):
         # a corridor in any direction: nothing is known along it, much across it
         axis = rng.standard_normal(3)
         information = 10.0 ** rng.uniform(0.0, 7.0) * np.outer(axis, axis)
-        delta = rng.uniform(-3.0, 3.0, 3)
-        assert scans._edge(EdgeKind.SCAN, submap, keys[1], delta, information) == k
+        T_grid_key = rng.uniform(-3.0, 3.0, 3)
+        delta, weak = edge_of_match(TURN, T_grid_key, information, floor)
+        assert graph.add_edge(EdgeKind.SCAN, 0, 1, delta, weak) == k

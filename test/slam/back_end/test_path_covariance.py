@@ -16,7 +16,11 @@ from rlml_slam.graph.batch.marginals import Marginals
 from rlml_slam.graph.batch.solver import optimize
 from rlml_slam.graph.model.factors import relative_information
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.slam.back_end.path_covariance import PathCovariance, held, intersection
+from rlml_slam.slam.back_end.path_covariance import (
+    PathCovariance,
+    intersection,
+    is_constrained_by_reflectors,
+)
 from rlml_slam.slam.closures.closure_records import ClosureRecords
 from rlml_slam.slam.closures.loop_closure import Closure
 from rlml_slam.slam.front_end.joint_state import JointState
@@ -83,7 +87,9 @@ def test_other_end_of_a_closure_is_known_as_a_graph_of_the_closure_alone_knows_i
         graph.add_poses([i.T_local, j.T_local])
         graph.add_pose_prior(0, i.T_local, np.linalg.inv(i.cov_local))
         way = PathCovariance()
-        way.close(ClosureRecords([closure(graph, 0, 0, 1, delta, cov)]), [i, j], graph.edges)
+        way.add_closures(
+            ClosureRecords([closure(graph, 0, 0, 1, delta, cov)]), [i, j], graph.edges
+        )
         expected = Marginals(graph).poses([1])[0]
         assert_allclose(turned(way.cov(j), j.T_local[2]), expected, rtol=1e-6, atol=1e-12)
 
@@ -91,7 +97,7 @@ def test_other_end_of_a_closure_is_known_as_a_graph_of_the_closure_alone_knows_i
 def test_nothing_gets_less_sure_by_a_closure_and_what_was_driven_before_it_gets_surer():
     keys = chain(STEPS)
     graph, way, before = graph_of(keys), PathCovariance(), PathCovariance()
-    way.close(
+    way.add_closures(
         ClosureRecords([closure(graph, 0, 2, 28, [0.0, 0.0, np.pi], MATCH)]), keys, graph.edges
     )
     for key in keys:
@@ -105,16 +111,16 @@ def test_closures_that_are_none_leave_nothing_behind():
     keys = chain(STEPS)
     graph, way = graph_of(keys), PathCovariance()
     closures = [closure(graph, n, 2 + n, 28 - n, [0.0, 0.0, np.pi], MATCH) for n in range(3)]
-    way.close(ClosureRecords(closures), keys, graph.edges)
+    way.add_closures(ClosureRecords(closures), keys, graph.edges)
     surer = way.cov(keys[-1])
     graph.edges.enabled[closures[0].edge] = False
-    way.forget()
-    way.close(ClosureRecords(closures), keys, graph.edges)
+    way.remove_closures()
+    way.add_closures(ClosureRecords(closures), keys, graph.edges)
     assert np.linalg.det(way.cov(keys[-1])) > np.linalg.det(surer)
     for c in closures:
         graph.edges.enabled[c.edge] = False
-    way.forget()
-    way.close(ClosureRecords(closures), keys, graph.edges)
+    way.remove_closures()
+    way.add_closures(ClosureRecords(closures), keys, graph.edges)
     assert_allclose(way.cov(keys[-1]), PathCovariance().cov(keys[-1]), atol=1e-15)
 
 
@@ -124,10 +130,10 @@ def test_place_found_anew_counts_for_what_comes_after_it_alone():
     before = way.cov(keys[14])
     for key in keys[15:]:
         key.cov_local = found + key.cov_local - keys[15].cov_local
-    way.begin(keys[15])
+    way.start(keys[15])
     assert_allclose(way.cov(keys[14]), before, atol=1e-15)
     assert_allclose(way.cov(keys[15]), found, atol=1e-12)
-    way.forget()
+    way.remove_closures()
     assert_allclose(way.cov(keys[15]), found, atol=1e-12)
 
 
@@ -135,12 +141,12 @@ def test_letting_go_of_keyframes_changes_nothing_for_those_that_stay():
     rng = np.random.default_rng(3)
     keys = chain(8 * STEPS)
     graph, way = graph_of(keys), PathCovariance()
-    way.begin(keys[40])
+    way.start(keys[40])
     pairs = [np.sort(rng.choice(len(keys), 2, replace=False)) for _ in range(150)]
     pairs.sort(key=lambda pair: pair[1])
     delta = [se2.between(keys[i].T_local, keys[j].T_local) for i, j in pairs]
     closures = [closure(graph, n, *pairs[n], delta[n], MATCH) for n in range(150)]
-    way.close(ClosureRecords(closures), keys, graph.edges)
+    way.add_closures(ClosureRecords(closures), keys, graph.edges)
     kept = [key for key in keys if key.index % 25 == 0]
     before = [way.cov(key) for key in kept]
     way.keep(kept)
@@ -148,9 +154,9 @@ def test_letting_go_of_keyframes_changes_nothing_for_those_that_stay():
         np.testing.assert_array_equal(way.cov(key), cov)
     # two between each two that stay, and what began there
     assert len(way._stamps) <= 2 * len(kept) + 1
-    way.forget()
+    way.remove_closures()
     again = PathCovariance()
-    again.begin(keys[40])
+    again.start(keys[40])
     for key in kept:
         np.testing.assert_array_equal(way.cov(key), again.cov(key))
 
@@ -164,15 +170,15 @@ def test_two_reflectors_hold_a_pose_to_those_that_saw_them_and_one_does_not():
         graph.add_sighting(pose, landmark, [1.0, 2.0], np.eye(2))
     for landmark in (near, far):
         graph.add_sighting(4, landmark, [1.0, 2.0], np.eye(2))
-    assert not held(graph.sightings, 1, 0)
-    assert not held(graph.sightings, 3, 1)  # ``far`` is new since then
-    assert held(graph.sightings, 3, 2)
-    assert held(graph.sightings, 3, 3)
+    assert not is_constrained_by_reflectors(graph.sightings, 1, 0)
+    assert not is_constrained_by_reflectors(graph.sightings, 3, 1)  # ``far`` is new since then
+    assert is_constrained_by_reflectors(graph.sightings, 3, 2)
+    assert is_constrained_by_reflectors(graph.sightings, 3, 3)
     graph.add_sighting(2, near, [1.0, 2.0], np.eye(2))
-    assert not held(graph.sightings, 2, 2)  # which saw ``far`` first
-    assert held(graph.sightings, 4, 3)
+    assert not is_constrained_by_reflectors(graph.sightings, 2, 2)  # which saw ``far`` first
+    assert is_constrained_by_reflectors(graph.sightings, 4, 3)
     graph.sightings.enabled[graph.sightings.nodes[:, 0] == 4] = False
-    assert not held(graph.sightings, 4, 3)
+    assert not is_constrained_by_reflectors(graph.sightings, 4, 3)
 
 
 def test_intersection_is_no_surer_than_what_was_fused_whatever_the_two_have_in_common():
@@ -211,7 +217,7 @@ def test_wheels_that_err_for_long_are_in_the_covariance_after_a_loop(honest):
         optimize(graph)
         cov = Marginals(graph).poses([len(steps)])[0]
         if honest:
-            way.close(ClosureRecords([found]), keys, graph.edges)
+            way.add_closures(ClosureRecords([found]), keys, graph.edges)
             cov = either(cov, turned(way.cov(keys[-1]), graph.poses[-1, 2]))
         e = graph.poses[-1] - poses[-1]
         e[2] = se2.wrap(e[2])

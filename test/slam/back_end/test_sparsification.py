@@ -16,8 +16,8 @@ from rlml_slam.params import BackEnd as BackEndParameters
 from rlml_slam.params import LoopClosure, Node, Parameters
 from rlml_slam.slam.back_end import sparsification
 from rlml_slam.slam.back_end.back_end import BackEnd
-from rlml_slam.slam.back_end.sparsification import EDGES, SPARE, remaining
-from rlml_slam.slam.back_end.trajectory import Path
+from rlml_slam.slam.back_end.sparsification import BATCH, EDGES, remaining
+from rlml_slam.slam.back_end.trajectory import FrameTrajectory
 from rlml_slam.slam.front_end.front_end import FrontEnd
 from rlml_slam.slam.keyframes import Keyframe
 
@@ -94,21 +94,21 @@ def test_what_closures_leave_behind_does_not_grow_with_the_laps():
         if update is not None and update.optimized:
             fresh = set()
         # none is let go of by an estimate that it is not in yet
-        enabled, closures = back_end.graph.edges.enabled, back_end.scans.closures
+        enabled, closures = back_end.graph.edges.enabled, back_end.loop_closer.records
         assert fresh <= {c.number for c in closures if c.accepted and enabled[c.edge]}
         if (k + 1) % (len(observed) // 4) == 0:
             keys.append(len(back_end.keyframes))
             rows.append(len(back_end.graph.edges))
-            records.append(sum(c.accepted for c in back_end.scans.closures))
-            tried.append(back_end.scans.tried[True])
+            records.append(sum(c.accepted for c in back_end.loop_closer.records))
+            tried.append(back_end.loop_closer.tried[True])
     assert tried[-1] > 2 * tried[1]  # loops are closed all the time
     recent = 10 + 20  # keyframes that were not judged yet, with their edges of each sort
-    assert rows[-1] <= EDGES * keys[-1] + SPARE + 4 * recent
+    assert rows[-1] <= EDGES * keys[-1] + BATCH + 4 * recent
     assert records[-1] <= rows[-1]
     e = back_end.graph.edges
-    recorded = {c.edge for c in back_end.scans.closures if c.accepted}
+    recorded = {c.edge for c in back_end.loop_closer.records if c.accepted}
     assert set(np.flatnonzero(~e.enabled)) <= recorded
-    accepted = [c.edge for c in back_end.scans.closures if c.accepted]
+    accepted = [c.edge for c in back_end.loop_closer.records if c.accepted]
     assert len(accepted) == len(set(accepted))
 
 
@@ -128,9 +128,9 @@ def test_nothing_that_is_kept_grows_with_the_laps():
             graph, way = back_end.graph, back_end.path_covariance
             sizes.append(
                 (len(back_end.keyframes), len(graph.edges), len(graph.sightings),
-                 len(back_end.scans.closures), len(way._stamps), len(pickle.dumps(back_end)))
+                 len(back_end.loop_closer.records), len(way._stamps), len(pickle.dumps(back_end)))
             )  # fmt: skip
-    assert back_end.scans.tried[True] > 20
+    assert back_end.loop_closer.tried[True] > 20
     early, late = np.array(sizes[-8:-4]), np.array(sizes[-4:])
     # edges come up to their limit by and by, and what is pruned then comes and goes by a third
     # from lap to lap: late laps together tell a growth
@@ -167,7 +167,7 @@ def test_indices_point_at_what_they_did(runs):
     _, few, _, _, _ = runs
     graph = few.graph
     assert [k.index for k in few.keyframes] == list(range(len(few.keyframes)))
-    for c in few.scans.closures:
+    for c in few.loop_closer.records:
         if c.accepted:
             assert set(graph.edges.nodes[c.edge]) == {c.i, c.j}
     r = graph.residuals()
@@ -190,7 +190,7 @@ def test_place_shows_its_newest_scans():
 
 
 def test_path_is_thinned_beyond_its_limit():
-    path = Path(1000)
+    path = FrameTrajectory(1000)
     for k in range(3000):
         if k and k % 10 == 0:
             path.begin_keyframe(np.array([0.5, 0.0, 0.0]))
@@ -204,7 +204,7 @@ def test_path_is_thinned_beyond_its_limit():
 
 def test_frames_of_a_keyframe_that_goes_stay_where_they_are():
     rng = np.random.default_rng(2)
-    path, keys, local = Path(1000), [], np.zeros(3)
+    path, keys, local = FrameTrajectory(1000), [], np.zeros(3)
     for k in range(6):
         if k:
             motion = rng.uniform(-0.5, 0.5, 3)
@@ -230,7 +230,7 @@ def test_frames_of_a_keyframe_that_goes_stay_where_they_are():
 def test_path_is_the_same_however_late_anyone_asks_for_it(limit):
     """Frames hang on keyframes that have gone, one after the other, until they are looked for."""
     rng = np.random.default_rng(5)
-    lazy, eager = Path(limit), Path(limit)
+    lazy, eager = FrameTrajectory(limit), FrameTrajectory(limit)
     keys, local = np.zeros((0, 3)), np.zeros(3)
     for k in range(40):
         if k:
@@ -274,7 +274,7 @@ def test_estimate_is_that_of_the_batch_solver_all_along_a_drive(seed):
         loop_closure=LoopClosure(max_distance=4.0, keyframe_interval=1),
     )
     front_end, back_end = FrontEnd(parameters), BackEnd(parameters)
-    graph, live = back_end.graph, back_end.live
+    graph, live = back_end.graph, back_end.solver
     solved = sparsified = 0
     for o in observed:
         num = len(back_end.keyframes)
@@ -297,7 +297,7 @@ def test_estimate_is_that_of_the_batch_solver_all_along_a_drive(seed):
         solved += 1
     assert solved > 10
     assert sparsified > 3
-    assert any(c.accepted for c in back_end.scans.closures)
+    assert any(c.accepted for c in back_end.loop_closer.records)
 
 
 def test_jump_is_not_forgotten_with_the_keyframe_that_it_led_to():
@@ -333,7 +333,7 @@ def test_keyframe_that_cannot_be_let_go_of_stays_with_all_it_tells(monkeypatch, 
     here = {key.stamp for key in few.keyframes}
     assert len(few.graph.poses) == len(few.keyframes)
     # each is judged once, and those that are left are all there
-    assert few.sparsifier._judged <= len(few.keyframes)
+    assert few.sparsifier._num_checked <= len(few.keyframes)
     if share == 1.0:
         assert here == {key.stamp for key in all_.keyframes}
     else:

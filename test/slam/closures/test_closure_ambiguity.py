@@ -9,9 +9,9 @@ import pytest
 from rlml_slam import se2
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.matching.scans.submap import Submap
-from rlml_slam.slam.closures.closure_ambiguity import is_distinct
+from rlml_slam.slam.closures.closure_ambiguity import reject_ambiguous
 from rlml_slam.slam.closures.closure_candidates import Candidate
-from rlml_slam.slam.closures.closure_matching import SECOND, Match, Tried
+from rlml_slam.slam.closures.closure_matching import AMBIGUOUS, Match, SearchResult
 from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap
 from rlml_slam.slam.closures.loop_closure import Closure
 from rlml_slam.slam.keyframes import Keyframe
@@ -42,19 +42,19 @@ def tried_alike(rival, at, score=SCORE):
     maps = [KeyframeSubmap(key, Submap(), 1, T_anchor_grid=np.zeros(3)) for key in keys[:KEY]]
     maps[OLD].submap.insert(WALLS, np.zeros(2))
     maps[OLD].submap.complete()
-    found = Match(maps[OLD], keys[KEY], WRONG, np.eye(3), SCORE, 1.0, np.nan, 36.0, sight=2.0)
+    found = Match(maps[OLD], keys[KEY], WRONG, np.eye(3), SCORE, 1.0, np.nan, 36.0, view_range=2.0)
     expected = Candidate(maps[OLD], np.array(PLACES[KEY]), 12.0, 1.5)
-    fits = Tried(expected, found, WRONG[None])
-    doubt = Closure(rival, KEY, np.zeros(3), score, -1, SECOND)
+    fits = SearchResult(expected, found, WRONG[None])
+    doubt = Closure(rival, KEY, np.zeros(3), score, -1, AMBIGUOUS)
     place = se2.between(graph.poses[rival], np.array(at))
-    others = Tried(Candidate(maps[rival], np.zeros(3), 12.0, 1.5), doubt, place[None])
-    out = is_distinct(graph, keys[KEY], WALLS, [fits, others], SHARE)
+    others = SearchResult(Candidate(maps[rival], np.zeros(3), 12.0, 1.5), doubt, place[None])
+    out = reject_ambiguous(graph, keys[KEY], WALLS, [fits, others], SHARE)
     assert out[1] is doubt
     return out[0]
 
 
 def test_place_alike_beside_the_submap_puts_a_match_in_doubt():
-    assert tried_alike(BESIDE, (12.5, 0.0, 0.0)).why == SECOND
+    assert tried_alike(BESIDE, (12.5, 0.0, 0.0)).why == AMBIGUOUS
 
 
 @pytest.mark.parametrize(

@@ -62,7 +62,7 @@ def test_window_has_an_end():
     graph, keys = way(1.0, 0.1)
     (c,) = candidates(graph, keys[39], submaps(keys, 30), LoopClosure(max_distance=9.5))
     assert (c.window, c.angle) == (P.max_search_window, P.max_search_angle)
-    assert c.searched > 16.0 * P.searched
+    assert c.search_area > 16.0 * P.searched
 
 
 def test_submap_beyond_the_plain_distance_is_tried_where_drift_reaches_it():

@@ -12,7 +12,7 @@ from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.graph.robust.inlier_evidence import uniform
 from rlml_slam.graph.robust.spanning_forest import SpanningForest
-from rlml_slam.slam.closures.closure_consistency import _Between, is_consistent
+from rlml_slam.slam.closures.closure_consistency import _RelativeCovariance, is_consistent
 from rlml_slam.types import EdgeKind
 
 SIGMA = np.array([0.02, 0.02, 0.005])
@@ -40,13 +40,13 @@ def graph():
     return out
 
 
-def tried(graph, ends, shift=(0.0, 0.0, 0.0), sight=0.0):
+def tried(graph, ends, shift=(0.0, 0.0, 0.0), view_range=0.0):
     """Whether closures (i, j) may enter which say that the true places are off by a shift."""
     nodes = np.array(ends)
     off = se2.compose(np.asarray(shift, dtype=np.float64), true(nodes[:, 1]))
     deltas = se2.between(true(nodes[:, 0]), off)
     covs = np.broadcast_to(COV, (len(nodes), 3, 3))
-    return is_consistent(OnlineSolver(graph), nodes, deltas, covs, WRONG, sight=sight)
+    return is_consistent(OnlineSolver(graph), nodes, deltas, covs, WRONG, view_range=view_range)
 
 
 def sure(graph):
@@ -65,7 +65,7 @@ def sure(graph):
 
 def test_covariance_of_where_a_pose_is_adds_up_along_a_chain(graph):
     i, j = np.array([3, 90, 7, 0]), np.array([100, 20, 8, 159])
-    covs = _Between(OnlineSolver(graph), np.unique([i, j])).covs(i, j)
+    covs = _RelativeCovariance(OnlineSolver(graph), np.unique([i, j])).covs(i, j)
     chain = SpanningForest(graph, np.arange(len(graph.edges))).motion(i, j)[1]
     assert_allclose(covs, chain, rtol=1e-6, atol=1e-12)
 
@@ -111,8 +111,8 @@ def test_views_of_the_same_walls_count_as_one(graph):
     """In a long corridor one sees the same for longer than between desks."""
     far, sharp = (2.0, 0.0, 0.0), sure(graph)
     ends = [(k, k + LAP) for k in range(5, 70, 5)]
-    assert tried(sharp, ends, far, sight=1.0).all()
-    assert not tried(sharp, ends, far, sight=5.0).any()
+    assert tried(sharp, ends, far, view_range=1.0).all()
+    assert not tried(sharp, ends, far, view_range=5.0).any()
 
 
 def test_wrong_ones_that_disagree_help_no_one(graph):

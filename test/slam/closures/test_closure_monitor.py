@@ -18,12 +18,12 @@ from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.graph import Graph, Renumbering
 from rlml_slam.graph.model.robust_loss import Loss, Losses, LossKind
 from rlml_slam.params import Parameters
-from rlml_slam.slam.back_end.scan_graph import ScanGraph
 from rlml_slam.slam.closures import closure_records
 from rlml_slam.slam.closures.closure_monitor import ClosureMonitor
 from rlml_slam.slam.closures.closure_records import ClosureRecords
-from rlml_slam.slam.closures.closure_table import closure_table, told, weight
-from rlml_slam.slam.closures.loop_closure import NOTES, Closure, State
+from rlml_slam.slam.closures.closure_table import closure_table, describe, weight
+from rlml_slam.slam.closures.loop_closer import LoopCloser
+from rlml_slam.slam.closures.loop_closure import HISTORY_LENGTH, Closure, State
 from rlml_slam.types import EdgeKind
 
 SIGMA = np.array([0.02, 0.02, 0.005])
@@ -37,7 +37,8 @@ class Drive:
         self.graph = Graph(Losses(closure=Loss(LossKind.HUBER, 2.0)))
         self.closures = ClosureRecords()
         self.rng = np.random.default_rng(0)
-        self.watch = ClosureMonitor(Parameters(), OnlineSolver(self.graph))
+        self.solver = OnlineSolver(self.graph)
+        self.monitor = ClosureMonitor(Parameters(), self.graph)
 
     def true(self, k):
         phi = 2.0 * np.pi * np.asarray(k) / PER_LAP
@@ -65,7 +66,11 @@ class Drive:
 
     def solve(self, final=False):
         optimize(self.graph)
-        return self.watch.review(self.closures, final)
+        if not self.monitor.needs_selection(self.closures, final):
+            return ()
+        enabled = self.monitor.select(self.closures)
+        self.solver.solve_all()
+        return self.monitor.update_states(self.closures, enabled)
 
 
 @pytest.fixture
@@ -78,35 +83,35 @@ def drive():
 def test_record_of_a_closure_stays_as_long_as_its_edge(monkeypatch):
     """Without it, nobody would know that the closure was revoked, and it would come back."""
     monkeypatch.setattr(closure_records, 'RECORDS', 4)
-    scans = ScanGraph(Parameters(), OnlineSolver(Graph()))
+    closer = LoopCloser(Parameters(), OnlineSolver(Graph()))
     edges = [0, -1, -1, 1, -1, 2, -1, 3]
-    scans.closures = ClosureRecords(
+    closer.records = ClosureRecords(
         Closure(k, k + 9, np.zeros(3), 0.7, e, '') for k, e in enumerate(edges)
     )
     same = [np.arange(n) for n in (20, 0, 4, 0, 0, 0)]
-    scans.renumber(Renumbering(*same), {}, {})
-    assert [c.i for c in scans.closures] == [0, 3, 5, 7]
+    closer.renumber(Renumbering(*same), {}, {}, [])
+    assert [c.i for c in closer.records] == [0, 3, 5, 7]
     monkeypatch.setattr(closure_records, 'RECORDS', 3)
-    scans.renumber(Renumbering(*same), {}, {})
-    assert len(scans.closures) == 4
+    closer.renumber(Renumbering(*same), {}, {}, [])
+    assert len(closer.records) == 4
     monkeypatch.setattr(closure_records, 'RECORDS', 6)
-    scans.closures = ClosureRecords(
+    closer.records = ClosureRecords(
         Closure(k, k + 9, np.zeros(3), 0.7, e, '') for k, e in enumerate(edges)
     )
-    scans.renumber(Renumbering(*same), {}, {})
-    assert [c.i for c in scans.closures] == [0, 3, 4, 5, 6, 7]  # the oldest went
+    closer.renumber(Renumbering(*same), {}, {}, [])
+    assert [c.i for c in closer.records] == [0, 3, 4, 5, 6, 7]  # the oldest went
 
 
 def test_right_closures_are_noted_once_and_stay(drive):
     assert drive.solve() == drive.solve() == ()
     for c in drive.closures:
-        assert c.fate.state is State.ACTIVE
-        assert len(c.fate.notes) == 1  # a weight that does not change is not noted again
-        assert c.fate.notes[0].keyframe == 3 * PER_LAP - 1
-        assert 0.0 <= c.fate.residual < 30.0
-        assert 0.0 < c.fate.weight <= 1.0
+        assert c.status.state is State.ACTIVE
+        assert len(c.status.history) == 1  # a weight that does not change is not noted again
+        assert c.status.history[0].keyframe == 3 * PER_LAP - 1
+        assert 0.0 <= c.status.residual < 30.0
+        assert 0.0 < c.status.weight <= 1.0
     s = drive.graph.residuals().edges[[c.edge for c in drive.closures]]
-    assert_allclose([c.fate.residual for c in drive.closures], s)
+    assert_allclose([c.status.residual for c in drive.closures], s)
 
 
 def test_wrong_closure_is_disabled_told_and_not_smeared_over_the_map(drive):
@@ -114,13 +119,13 @@ def test_wrong_closure_is_disabled_told_and_not_smeared_over_the_map(drive):
     before = drive.graph.poses.copy()
     wrong = drive.close(10, 70, np.zeros(3))
     assert drive.solve() == (wrong,)
-    assert wrong.fate.state is State.DISABLED
-    assert weight(wrong) == 0.0 == wrong.fate.notes[-1].weight
+    assert wrong.status.state is State.DISABLED
+    assert weight(wrong) == 0.0 == wrong.status.history[-1].weight
     assert not drive.graph.edges.enabled[wrong.edge]
-    assert all(c.fate.state is State.ACTIVE for c in drive.closures if c is not wrong)
+    assert all(c.status.state is State.ACTIVE for c in drive.closures if c is not wrong)
     assert_allclose(drive.graph.poses, before, atol=1e-3)
-    assert 'loop closure' in told(wrong)
-    assert 'disabled: contradicts' in told(wrong)
+    assert 'loop closure' in describe(wrong)
+    assert 'disabled: inconsistent' in describe(wrong)
 
 
 def test_doubts_are_put_off_until_the_graph_has_grown_or_ends(drive):
@@ -128,7 +133,7 @@ def test_doubts_are_put_off_until_the_graph_has_grown_or_ends(drive):
     assert len(drive.solve()) == 1
     later = drive.close(15, 75, np.zeros(3))
     assert drive.solve() == ()
-    assert later.fate.state is State.ACTIVE
+    assert later.status.state is State.ACTIVE
     drive.drive(3 * PER_LAP // 2)
     assert drive.solve() == (later,)
     last = drive.close(5, 100, np.zeros(3))
@@ -139,34 +144,34 @@ def test_doubts_are_put_off_until_the_graph_has_grown_or_ends(drive):
 def test_a_disabled_closure_comes_back_when_it_is_judged_right(drive):
     right = drive.closures[3]
     drive.graph.edges.enabled[right.edge] = False
-    right.fate.turn(State.DISABLED, 'as if it had been wrong')
+    right.status.set_state(State.DISABLED, 'as if it had been wrong')
     wrong = drive.close(10, 70, np.zeros(3))
     assert set(map(id, drive.solve())) == {id(right), id(wrong)}
-    assert right.fate.state is State.ACTIVE
+    assert right.status.state is State.ACTIVE
     assert drive.graph.edges.enabled[right.edge]
-    assert right.fate.reason == 'agrees again'
+    assert right.status.reason == 'consistent again'
 
 
 def test_a_revoked_closure_stays_out(drive):
     drive.solve()
-    revoked = drive.watch.revoke(drive.closures, 2)
+    revoked = drive.monitor.revoke(drive.closures, 2)
     drive.close(10, 70, np.zeros(3))
     drive.solve(final=True)
-    assert revoked.fate.state is State.REVOKED
+    assert revoked.status.state is State.REVOKED
     assert not drive.graph.edges.enabled[revoked.edge]
-    with pytest.raises(SolverError, match='loop closure 2 is revoked already'):
-        drive.watch.revoke(drive.closures, 2)
+    with pytest.raises(SolverError, match='loop closure 2 is already revoked'):
+        drive.monitor.revoke(drive.closures, 2)
     with pytest.raises(SolverError, match='there is no loop closure 999'):
-        drive.watch.revoke(drive.closures, 999)
+        drive.monitor.revoke(drive.closures, 999)
 
 
 def test_notes_are_bounded_and_survive_new_numbers(drive):
     closure = drive.closures[0]
     moved = replace(closure, i=1, j=2, edge=3)
-    for k in range(2 * NOTES):
-        closure.fate.note(k, 1.0, 0.5)
-    assert len(moved.fate.notes) == NOTES
-    assert moved.fate.notes[-1].keyframe == 2 * NOTES - 1
+    for k in range(2 * HISTORY_LENGTH):
+        closure.status.record(k, 1.0, 0.5)
+    assert len(moved.status.history) == HISTORY_LENGTH
+    assert moved.status.history[-1].keyframe == 2 * HISTORY_LENGTH - 1
 
 
 def test_table_is_read_by_the_command(drive, tmp_path, capsys):
@@ -179,7 +184,7 @@ def test_table_is_read_by_the_command(drive, tmp_path, capsys):
     assert main(['closures', str(tmp_path)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1] == f'{len(rows)} loop closures: {len(rows) - 1} active, 1 disabled, 0 revoked'
-    assert 'contradicts the other closures' in '\n'.join(lines)
+    assert 'inconsistent with the other closures' in '\n'.join(lines)
     assert main(['closures', str(tmp_path), '--all']) == 0
     assert len(capsys.readouterr().out.splitlines()) == len(rows) + 2
 

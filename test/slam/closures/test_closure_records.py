@@ -49,7 +49,7 @@ def by_hand(closures, new, edges, poses, most):
 
 
 def same(a: Closure, b: Closure) -> bool:
-    return (a.i, a.j, a.edge, a.number) == (b.i, b.j, b.edge, b.number) and a.fate is b.fate
+    return (a.i, a.j, a.edge, a.number) == (b.i, b.j, b.edge, b.number) and a.status is b.status
 
 
 @pytest.mark.parametrize('most', [2000, 30])
@@ -76,9 +76,9 @@ def test_records_follow_the_graph(seed, most, monkeypatch):
         records.renumber(new, edges, poses)
         num_poses, num_edges = len(stay), len(left)
         assert records.edges.tolist() == [c.edge for c in expected if c.accepted]
-        assert records.failed() == {(c.i, c.j) for c in expected if not c.accepted}
-        for fate, c in zip(records.fates, [c for c in expected if c.accepted], strict=True):
-            assert fate is c.fate
+        assert records.rejected_pairs() == {(c.i, c.j) for c in expected if not c.accepted}
+        for status, c in zip(records.statuses, [c for c in expected if c.accepted], strict=True):
+            assert status is c.status
         late = [c for c in expected if c.accepted and c.number >= 20]
         assert all(map(same, records.accepted(20), late))
         assert len(records.accepted(20)) == len(late)
@@ -92,18 +92,18 @@ def test_a_pair_that_is_tied_after_all_has_not_failed():
     records = ClosureRecords(tried(np.random.default_rng(1), 40))
     before, pair = list(records), next(c for c in records if not c.accepted)
     gone = sum(not c.accepted and (c.i, c.j) == (pair.i, pair.j) for c in before)
-    assert records.take_back({(pair.i, pair.j)}) == gone
-    assert (pair.i, pair.j) not in records.failed()
+    assert records.remove_rejected({(pair.i, pair.j)}) == gone
+    assert (pair.i, pair.j) not in records.rejected_pairs()
     assert len(records) == len(before) - gone
-    assert records.take_back(set()) == 0
+    assert records.remove_rejected(set()) == 0
 
 
 def test_a_copy_has_the_same_records():
     records = ClosureRecords(tried(np.random.default_rng(2), 20))
-    records[3].fate.turn(State.DISABLED, 'for a test')
+    records[3].status.set_state(State.DISABLED, 'for a test')
     other = pickle.loads(pickle.dumps(records))
     other.append(tried(np.random.default_rng(3), 1)[0])
     assert len(other) == 21
     assert len(records) == 20
     assert [(c.i, c.j, c.edge) for c in other][:20] == [(c.i, c.j, c.edge) for c in records]
-    assert other[3].fate.state is State.DISABLED
+    assert other[3].status.state is State.DISABLED

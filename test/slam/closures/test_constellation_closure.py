@@ -62,7 +62,7 @@ PATH = drive(*LAP, (1.0, 0.0, 12.0))
 def test_loop_of_metres_of_drift_is_closed_by_reflectors_without_ids(seed):
     back_end = mapped(POSTS, PATH, Parameters(), seed)
     assert len(back_end.reflectors()) == len(POSTS)
-    closed = [c for c in back_end.scans.closures if c.accepted]
+    closed = [c for c in back_end.loop_closer.records if c.accepted]
     assert closed
     assert all('reflectors' in c.why for c in closed)
     # the end of the drive lies where it does, seen from its beginning
@@ -87,7 +87,7 @@ def test_posts_of_another_place_are_not_taken_for_known_ones():
     posts = np.vstack([POSTS, there])
     back_end = mapped(posts, path, Parameters())
     assert len(back_end.reflectors()) == 14
-    assert not any(c.accepted for c in back_end.scans.closures)
+    assert not any(c.accepted for c in back_end.loop_closer.records)
 
 
 def test_what_could_not_be_searched_is_counted_and_closes_nothing(monkeypatch):
@@ -96,8 +96,8 @@ def test_what_could_not_be_searched_is_counted_and_closes_nothing(monkeypatch):
 
     monkeypatch.setattr(constellation_closure, 'locate', never)
     back_end = mapped(POSTS, PATH, Parameters())
-    assert back_end.constellations.not_searched > 0
-    assert not any(c.accepted for c in back_end.scans.closures)
+    assert back_end.constellation_search.not_searched > 0
+    assert not any(c.accepted for c in back_end.loop_closer.records)
 
 
 def test_racks_that_are_all_alike_are_not_one():
@@ -113,7 +113,7 @@ def test_racks_that_are_all_alike_are_not_one():
         for o in observations(world, path, scan=False, rng=np.random.default_rng(3))
     ]
     back_end = whole(observed, Parameters())
-    proposed = [c for c in back_end.scans.closures if 'reflectors' in c.why]
+    proposed = [c for c in back_end.loop_closer.records if 'reflectors' in c.why]
     assert proposed
     assert not any(c.accepted for c in proposed)
     assert len(back_end.reflectors()) == len(posts)

@@ -16,7 +16,7 @@ from rlml_slam.params import Parameters
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.keyframes import Interval, Sighting
 from rlml_slam.slam.landmarks.landmark import Landmark
-from rlml_slam.slam.landmarks.landmark_persistence import HIDDEN, WHILE, LandmarkPersistence
+from rlml_slam.slam.landmarks.landmark_persistence import HIDDEN, HIDDEN_TIME, LandmarkPersistence
 from rlml_slam.slam.landmarks.reflector_graph import ReflectorGraph
 from rlml_slam.slam.landmarks.reflector_states import reflector_states, state_table
 from rlml_slam.slam.offline.slam import Slam
@@ -100,17 +100,17 @@ def test_what_came_when_a_settled_one_went_was_moved(changed, there, state):
     """Even where no keyframe is left that stood there before."""
     reflectors = changed[0].back_end.reflector_graph
     (moved,) = by_state(changed[0].back_end)['moved']
-    is_new = {m.key: m.life.is_new for m in reflectors.alive()}
-    first = reflectors.gone.rows['first'].copy()
+    is_new = {m.key: m.history.is_new for m in reflectors.alive()}
+    first = reflectors.removed.rows['first'].copy()
     try:
-        reflectors.gone.rows['first'] = reflectors.gone.rows['last'] - int(there * 1e9)
+        reflectors.removed.rows['first'] = reflectors.removed.rows['last'] - int(there * 1e9)
         for m in reflectors.alive():
-            m.life.is_new = False
+            m.history.is_new = False
         found = {s.key: s.state for s in changed[0].back_end.reflector_states()}
     finally:
-        reflectors.gone.rows['first'] = first
+        reflectors.removed.rows['first'] = first
         for m in reflectors.alive():
-            m.life.is_new = is_new[m.key]
+            m.history.is_new = is_new[m.key]
     assert found[moved.key] == state
     assert 'new' not in found.values()
 
@@ -194,29 +194,29 @@ def test_odds_follow_bayes():
     m, pose = Landmark(0), np.zeros(3)
     empty = PARAMS.reflector.unmapped_density * math.pi * PARAMS.reflector.min_separation**2
     m.views[0, 0] = (2, 1)
-    assert not persistence._weigh(m, False, pose, SECOND)
+    assert not persistence._update_odds(m, False, pose, SECOND)
     first = (1 - 3 / 5) / (1 - empty)  # (1 + 2) of (2 + 3)
-    assert m.life.odds == pytest.approx(math.log(HIDDEN + (1 - HIDDEN) * first), rel=1e-12)
+    assert m.history.odds == pytest.approx(math.log(HIDDEN + (1 - HIDDEN) * first), rel=1e-12)
     # from the same spot, the same miss tells nothing more
-    before = m.life.odds
-    persistence._weigh(m, False, np.array([0.2, 0.0, 0.0]), SECOND)
-    assert m.life.odds == before
+    before = m.history.odds
+    persistence._update_odds(m, False, np.array([0.2, 0.0, 0.0]), SECOND)
+    assert m.history.odds == before
     # a moment later they have a common cause now and then
-    persistence._weigh(m, False, np.array([0.7, 0.0, 0.0]), 2 * SECOND)
+    persistence._update_odds(m, False, np.array([0.7, 0.0, 0.0]), 2 * SECOND)
     both = first * 0.5 / (1 - empty)
-    assert m.life.odds == pytest.approx(math.log(HIDDEN + (1 - HIDDEN) * both), rel=1e-12)
+    assert m.history.odds == pytest.approx(math.log(HIDDEN + (1 - HIDDEN) * both), rel=1e-12)
     # much later they have not
-    before = m.life.odds
-    persistence._weigh(m, False, np.array([1.7, 0.0, 0.0]), SECOND + WHILE)
+    before = m.history.odds
+    persistence._update_odds(m, False, np.array([1.7, 0.0, 0.0]), SECOND + HIDDEN_TIME)
     once = HIDDEN + (1 - HIDDEN) * 0.5 / (1 - empty)
-    assert m.life.odds == pytest.approx(before + math.log(once), rel=1e-12)
-    before = m.life.odds
-    persistence._weigh(m, True, pose, SECOND + WHILE)
-    assert m.life.odds == pytest.approx(before + math.log(3 / 6 / empty), rel=1e-12)
+    assert m.history.odds == pytest.approx(before + math.log(once), rel=1e-12)
+    before = m.history.odds
+    persistence._update_odds(m, True, pose, SECOND + HIDDEN_TIME)
+    assert m.history.odds == pytest.approx(before + math.log(3 / 6 / empty), rel=1e-12)
     for k in range(20):
-        persistence._weigh(m, True, np.array([1.0 * k, 0.0, 0.0]), SECOND)
+        persistence._update_odds(m, True, np.array([1.0 * k, 0.0, 0.0]), SECOND)
     gone = PARAMS.reflector.persistence_threshold
-    assert m.life.odds == pytest.approx(math.log((1 - gone) / gone), rel=1e-12)
+    assert m.history.odds == pytest.approx(math.log((1 - gone) / gone), rel=1e-12)
 
 
 def test_no_single_while_ends_a_reflector():
@@ -228,11 +228,13 @@ def test_no_single_while_ends_a_reflector():
     m = Landmark(0)
     for k in range(100):
         m.views[2 * k, 0] = (1000, 0)
-    m.life.odds = math.log(
+    m.history.odds = math.log(
         (1 - PARAMS.reflector.persistence_threshold) / PARAMS.reflector.persistence_threshold
     )
     given_up = [
-        persistence._weigh(m, False, np.array([1.0 * k, 0.0, 0.0]), SECOND + k * WHILE // 20)
+        persistence._update_odds(
+            m, False, np.array([1.0 * k, 0.0, 0.0]), SECOND + k * HIDDEN_TIME // 20
+        )
         for k in range(100)
     ]
     assert not any(given_up[:80])
@@ -245,7 +247,7 @@ def test_candidates_do_not_pile_up():
     graph.add_pose([1.0, 0.0, 0.0])
     reflectors = ReflectorGraph(PARAMS.reflector, OnlineSolver(graph))
     interval, sighting = Interval(np.zeros(3)), Sighting()
-    interval.first_look = interval.last_look = SECOND
+    interval.first_stamp = interval.last_stamp = SECOND
     sighting.add(np.array([0.5, 0.5]), 1e-4 * np.eye(2))
     interval.sightings[7] = [sighting]
     reflectors.add(0, interval)

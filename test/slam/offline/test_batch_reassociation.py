@@ -188,7 +188,7 @@ def test_what_was_told_apart_the_graph_does_not_take_for_one_again(gap, seed, si
     assert off.min(axis=1).max() < 0.03
     assert found.sightings.min() > 200
     assert slam.back_end.graph.chi2() < 1e-6
-    assert not slam.back_end.is_told
+    assert not slam.back_end.associations_are_final
 
 
 def test_a_person_who_stands_is_not_taken_for_many():

@@ -66,7 +66,7 @@ def test_map_is_read_as_it_was_saved(mapped, saved):
     np.testing.assert_array_equal(b.reflectors().keys, a.reflectors().keys)
     np.testing.assert_array_equal(b.occupancy_grid().cells, a.occupancy_grid().cells)
     assert [k.stamp for k in b.keyframes] == [k.stamp for k in a.keyframes]
-    assert b.scans.num_submaps == a.scans.num_submaps
+    assert b.scan_graph.num_submaps == a.scan_graph.num_submaps
     # saved once more, only what belongs to the session that ended is another
     twice = map_file.content_of(b, PARAMS, b.occupancy_grid())
     assert json.loads(json.dumps(twice.description)) == content.description
@@ -104,7 +104,7 @@ def test_saved_map_keeps_its_sightings_whatever_comes_after(saved):
     """A session that sees fewer reflectors does not thin what the one before saw."""
     again = BackEnd(PARAMS)
     map_file.restore(map_file.load(saved), again)
-    again.live.solve()
+    again.solver.solve()
     before = int(again.graph.sightings.enabled.sum())
     for key in again.keyframes:
         again.reflector_graph.thin(key.index)
@@ -165,7 +165,7 @@ def test_other_and_inconsistent_files_are_refused(saved, tmp_path):
         ('pose', np.full_like(content.arrays['pose'], np.nan)),
     ):
         broken = Content({**content.arrays, name: bad}, content.description)
-        with pytest.raises(FileFormatError, match='do not fit together'):
+        with pytest.raises(FileFormatError, match='are inconsistent'):
             map_file.restore(broken, BackEnd(PARAMS))
     without = {k: v for k, v in content.arrays.items() if k != 'submap_cells'}
     with pytest.raises(FileFormatError, match='submap_cells'):
@@ -193,8 +193,8 @@ def test_closure_is_revoked_in_a_saved_map(mapped, tmp_path, capsys):
     i, j = 1, len(graph.poses) - 2
     delta = se2.compose(se2.between(graph.poses[i], graph.poses[j]), (0.3, 0.0, 0.0))  # wrong
     edge = graph.add_edge(EdgeKind.CLOSURE, i, j, delta, 1e8 * np.eye(3))
-    number = 1 + max((c.number for c in back_end.scans.closures), default=-1)
-    back_end.scans.closures.append(Closure(i, j, delta, 0.7, edge, 'fits', number=number))
+    number = 1 + max((c.number for c in back_end.loop_closer.records), default=-1)
+    back_end.loop_closer.records.append(Closure(i, j, delta, 0.7, edge, 'fits', number=number))
     right = graph.poses.copy()
     optimize(graph, PARAMS.solver)
     assert np.abs(graph.poses - right).max() > 0.01

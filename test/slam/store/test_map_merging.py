@@ -17,7 +17,7 @@ from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.back_end.trajectory import poses_of
 from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.store import map_file
-from rlml_slam.slam.store.map_merging import APART, merge_maps
+from rlml_slam.slam.store.map_merging import UNMATCHED_SHARE, merge_maps
 from rlml_slam.types import Detections, Odometry, Scan, Verdict
 
 PARAMS = Parameters(back_end=replace(Parameters().back_end, submap_size=10))
@@ -94,7 +94,7 @@ def test_merged_map_is_saved_and_gone_on_with(merged, tmp_path):
     again = BackEnd(PARAMS)
     map_file.restore(map_file.load(path), again)
     assert again.graph.chi2() == merged.back_end.graph.chi2()
-    numbers = [c.number for c in again.scans.closures if c.accepted]
+    numbers = [c.number for c in again.loop_closer.records if c.accepted]
     assert len(set(numbers)) == len(numbers)
     slam = Slam(PARAMS)
     slam.continue_map(map_file.load(path))
@@ -115,11 +115,11 @@ def test_maps_of_which_nothing_tells_how_they_lie_are_refused(two, tmp_path, cap
         replace(ROOM, reflectors=np.random.default_rng(2).uniform(-2.0, 3.0, (5, 2))),
     ):
         other = map_file.content_of(mapped(world, AGAIN, 3), PARAMS, None)
-        with pytest.raises(MapError, match='do not tell how the maps lie'):
+        with pytest.raises(MapError, match='do not match at exactly one pose'):
             merge_maps(two[0], other, PARAMS)
     # twice the same square could be turned four ways
     twin = map_file.content_of(mapped(replace(ROOM, reflectors=square), CURVE, 4), PARAMS, None)
-    with pytest.raises(MapError, match='do not tell'):
+    with pytest.raises(MapError, match='do not match'):
         merge_maps(twin, twin, PARAMS)
 
 
@@ -136,9 +136,9 @@ def test_map_without_a_scan_is_merged_with_one_of_scans(two, is_first):
 
 
 def test_map_of_an_older_program_is_refused(two):
-    older = {k: v for k, v in two[1].arrays.items() if k != 'reflector_gone'}
+    older = {k: v for k, v in two[1].arrays.items() if k != 'reflector_removed'}
     for pair in ((two[0], two[1]._replace(arrays=older)), (two[1]._replace(arrays=older),) * 2):
-        with pytest.raises(MapError, match='older program'):
+        with pytest.raises(MapError, match='is incomplete'):
             merge_maps(*pair, PARAMS)
 
 
@@ -164,7 +164,9 @@ def test_maps_that_overlap_by_a_few_reflectors_are_placed_by_these(shared, told)
     seen = se2.transform(se2.inverse(START), second) + 0.01 * rng.standard_normal(second.shape)
     first = np.vstack([west, both])
     cov = [np.tile(1e-4 * np.eye(2), (len(p), 1, 1)) for p in (seen, first)]
-    stars = locate(seen, cov[0], first, cov[1], replace(Relocalization(), false_share=APART))
+    stars = locate(
+        seen, cov[0], first, cov[1], replace(Relocalization(), false_share=UNMATCHED_SHARE)
+    )
     assert (stars.verdict is Verdict.UNIQUE) == told, stars.why
     if told:
         np.testing.assert_allclose(stars.candidates[0].pose, START, atol=0.03)

@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loop closing: search, verification and monitoring of closures, behind one class.
+
+A closure that the scan match proposes passes four checks, each in a file of its own:
+
+1. verification of the match: score, ambiguity ratio, degeneracy (closure_matching.py);
+2. no better placed match in another submap (closure_ambiguity.py);
+3. consistency with the graph, alone or with other closures (closure_consistency.py);
+4. monitoring after each solve: inconsistent ones are disabled (closure_monitor.py).
+
+In the graph it has a robust loss besides. Rejected closures are recorded, those that lack support
+stay pending.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam import se2
+from rlml_slam.estimation.correction import turned
+from rlml_slam.graph.incremental.online_solver import OnlineSolver
+from rlml_slam.graph.model.graph import Renumbering
+from rlml_slam.graph.robust.inlier_evidence import uniform
+from rlml_slam.matching.scans.submap import Submap
+from rlml_slam.params import Parameters
+from rlml_slam.se2 import Array
+from rlml_slam.slam.closures.closure_ambiguity import reject_ambiguous
+from rlml_slam.slam.closures.closure_candidates import Candidate, candidates
+from rlml_slam.slam.closures.closure_consistency import is_consistent
+from rlml_slam.slam.closures.closure_matching import UNDECIDED, ClosureMatcher, Match
+from rlml_slam.slam.closures.closure_monitor import ClosureMonitor
+from rlml_slam.slam.closures.closure_records import ClosureRecords
+from rlml_slam.slam.closures.constellation_closure import ConstellationMatch
+from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap, edge_of_match
+from rlml_slam.slam.closures.loop_closure import Closure
+from rlml_slam.slam.keyframes import Keyframe
+from rlml_slam.types import EdgeKind
+
+MAX_PENDING = 60  # pending closures, the newest
+PENDING = 'pending: needs consistent closures from other viewpoints'
+BY_REFLECTORS = 'proposed by reflectors: '
+SAME_POSE_GATE = 16.3  # 99.9 % of chi-square with 3 degrees of freedom
+CONFIRMATION_WINDOW = 1.0, 0.2  # [m], [rad] around a pose proposed by reflectors
+
+
+class LoopCloser:
+    """All loop closures of a graph; the only entry to their verification.
+
+    ``records`` has the closures between keyframes of the graph; ``tried`` counts all accepted
+    (True) and rejected (False) ones; ``changed`` if one was added since the last solve.
+    """
+
+    def __init__(self, params: Parameters, solver: OnlineSolver) -> None:
+        self._p = params
+        self._solver = solver
+        self._graph = solver.graph
+        self._matcher = ClosureMatcher(params)
+        self._monitor = ClosureMonitor(params, solver.graph)
+        self._pending: list[Match] = []
+        self._reflector_pairs: list[tuple[int, int]] = []
+        self._rejected: set[tuple[int, int]] = set()  # keyframe pairs of rejected closures
+        self._num_scans = 0
+        self._num_accepted = 0
+        self._num_solved = 0  # closures below this number are in the estimate
+        self.records = ClosureRecords()
+        self.tried = {True: 0, False: 0}
+        self.changed = False
+
+    # --- proposals -----------------------------------------------------------------------------
+
+    def search(
+        self, key: Keyframe, points: Array, submaps: Sequence[KeyframeSubmap]
+    ) -> tuple[Closure, ...]:
+        """Closures of every n-th keyframe with ``points`` (n, 2), n the keyframe interval."""
+        p = self._p.loop_closure
+        self._num_scans += 1
+        if not p.enabled or self._num_scans % p.keyframe_interval:
+            return ()
+        return self.match(key, points, submaps)
+
+    def match(
+        self, key: Keyframe, points: Array, submaps: Sequence[KeyframeSubmap]
+    ) -> tuple[Closure, ...]:
+        """Closures of a keyframe with ``points`` (n, 2) and the finished ``submaps`` near it."""
+        near = candidates(self._graph, key, submaps, self._p.loop_closure)
+        results = [self._matcher.match(candidate, key, points) for candidate in near]
+        ratio = self._p.loop_closure.ambiguity_ratio
+        return self._add(reject_ambiguous(self._graph, key, points, results, ratio))
+
+    def confirm(
+        self, proposed: ConstellationMatch, points: Array | None, submaps: Sequence[KeyframeSubmap]
+    ) -> tuple[Closure, ...]:
+        """Closure proposed by reflectors, unless the scan ``points`` (n, 2) contradicts it."""
+        key = proposed.key
+        anchor = KeyframeSubmap(proposed.anchor, Submap(self._p.submap), T_anchor_grid=np.zeros(3))
+        information = np.asarray(np.linalg.inv(proposed.cov), dtype=np.float64)
+        result: Match | Closure = Match(
+            anchor, key, proposed.T_anchor_key, information, proposed.share, math.nan, math.nan,
+            proposed.search_area, proposed.log_odds, BY_REFLECTORS, proposed.reflector_pairs,
+        )  # fmt: skip
+        # it replaces earlier proposals with the same reflectors
+        new = {b for _, b in proposed.reflector_pairs}
+        self._pending = [
+            w for w in self._pending if new.isdisjoint(b for _, b in w.reflector_pairs)
+        ]
+        if points is not None:
+            result = self._confirmed(proposed, result, points, submaps)
+        return self._add([result])
+
+    def _confirmed(
+        self,
+        proposed: ConstellationMatch,
+        result: Match | Closure,
+        points: Array,
+        submaps: Sequence[KeyframeSubmap],
+    ) -> Match | Closure:
+        """Scan match at the proposed pose, or a rejection; ``result`` where none is possible."""
+        key, T_map_key, poses = proposed.key, proposed.T_map_key, self._graph.poses
+        # the newest submaps surround the robot wherever it is
+        newest = 2 * self._p.back_end.submap_size
+        old = [m for m in submaps if m.anchor.index + newest <= key.index]
+        gaps = [
+            math.dist(se2.transform(m.grid_pose(poses), m.centre[None])[0], T_map_key[:2])
+            for m in old
+        ]
+        if not gaps or min(gaps) >= self._p.loop_closure.max_distance:
+            return result
+        m = old[int(np.argmin(gaps))]
+        grid = m.grid_pose(poses)
+        candidate = Candidate(m, se2.between(grid, T_map_key), *CONFIRMATION_WINDOW)
+        found = self._matcher.match(candidate, key, points).result
+        if isinstance(found, Closure):
+            if found.why in UNDECIDED:
+                return result
+            return replace(found, why=BY_REFLECTORS + found.why)
+        off = se2.between(T_map_key, se2.compose(grid, found.T_grid_key))
+        cov = turned(proposed.cov, -proposed.T_anchor_key[2])
+        if off @ np.linalg.solve(cov, off) > SAME_POSE_GATE:
+            return found.closure(BY_REFLECTORS + 'the scan fits at another pose')
+        return replace(
+            found, search_area=proposed.search_area, log_odds=proposed.log_odds,
+            source=BY_REFLECTORS, reflector_pairs=proposed.reflector_pairs,
+        )  # fmt: skip
+
+    # --- verification --------------------------------------------------------------------------
+
+    def _add(self, results: Sequence[Match | Closure]) -> tuple[Closure, ...]:
+        """Add the consistent matches to the graph, and record all results."""
+        matches = [r for r in results if isinstance(r, Match)]
+        out = [r for r in results if isinstance(r, Closure)]
+        if matches:
+            out += self._add_consistent(matches)
+        self.records.extend(out)
+        for closure in out:
+            self.tried[closure.accepted] += 1
+        self._rejected.update((c.i, c.j) for c in out if not c.accepted)
+        return tuple(out)
+
+    def _add_consistent(self, new: Sequence[Match]) -> list[Closure]:
+        """Add the consistent ones of the ``new`` and the pending matches; keep the others."""
+        matches, num_pending = [*self._pending, *new], len(self._pending)
+        deltas, informations = edge_of_match(
+            np.array([c.m.T_anchor_grid for c in matches]),
+            np.array([c.T_grid_key for c in matches]),
+            np.array([c.information for c in matches]),
+            np.array(self._p.loop_closure.variance_floor),
+        )
+        consistent = is_consistent(
+            self._solver,
+            np.array([(c.m.anchor.index, c.key.index) for c in matches], dtype=np.int64),
+            deltas,
+            np.asarray(np.linalg.inv(informations), dtype=np.float64),
+            uniform(np.array([c.search_area for c in matches])),
+            np.array([c.log_odds for c in matches]),
+            np.array([c.view_range for c in matches]),
+        )
+        out = []
+        for n, (c, is_added) in enumerate(zip(matches, consistent.tolist(), strict=True)):
+            if is_added:
+                why = 'consistent' if n >= num_pending else 'consistent with later closures'
+                out.append(c.closure(c.source + why, self._add_edge(c), self._num_accepted))
+                self._num_accepted += 1
+                self._reflector_pairs += c.reflector_pairs
+            elif n >= num_pending:
+                out.append(c.closure(c.source + PENDING))
+        accepted = {(c.i, c.j) for c in out if c.accepted} & self._rejected
+        if accepted:
+            self.tried[False] -= self.records.remove_rejected(accepted)
+            self._rejected -= accepted
+        left = [c for c, added in zip(matches, consistent.tolist(), strict=True) if not added]
+        self._pending = left[-MAX_PENDING:]
+        return out
+
+    def _add_edge(self, c: Match) -> int:
+        floor = np.array(self._p.loop_closure.variance_floor)
+        delta, information = edge_of_match(c.m.T_anchor_grid, c.T_grid_key, c.information, floor)
+        self.changed = True
+        i, j = c.m.anchor.index, c.key.index
+        return self._graph.add_edge(EdgeKind.CLOSURE, i, j, delta, information)
+
+    def take_reflector_pairs(self) -> list[tuple[int, int]]:
+        """Keys of reflectors joined by the closures that were added since the last call."""
+        pairs, self._reflector_pairs = self._reflector_pairs, []
+        return pairs
+
+    # --- monitoring ----------------------------------------------------------------------------
+
+    def needs_selection(self, final: bool = False) -> bool:
+        """After a solve: whether a closure looks wrong, so that all have to be checked."""
+        return self._monitor.needs_selection(self.records, final)
+
+    def select(self) -> dict[int, bool]:
+        """Enable the consistent closures and disable the others; the graph is to be solved."""
+        return self._monitor.select(self.records)
+
+    def update_states(self, enabled: Mapping[int, bool]) -> tuple[Closure, ...]:
+        """States after that solve; the closures that were disabled or enabled again."""
+        return self._monitor.update_states(self.records, enabled)
+
+    def revoke(self, number: int) -> Closure:
+        """Disable a closure for good; raises SolverError if there is none of this number."""
+        return self._monitor.revoke(self.records, number)
+
+    # --- bookkeeping ---------------------------------------------------------------------------
+
+    def mark_solved(self) -> None:
+        """The estimate contains all closures of the graph."""
+        self.changed, self._num_solved = False, self._num_accepted
+
+    def unsolved_edges(self) -> list[int]:
+        """Edges of the closures that were added since the last solve."""
+        return [c.edge for c in self.records.accepted(self._num_solved)]
+
+    def renumber(
+        self,
+        new: Renumbering,
+        edges: Mapping[int, int],
+        poses: Mapping[int, int],
+        submaps: Sequence[KeyframeSubmap],
+    ) -> None:
+        """Follow the removal of keyframes, as ClosureRecords.renumber."""
+        self._pending = [
+            c
+            for c in self._pending
+            if c.key.index not in poses
+            and (c.m in submaps if c.m.size else c.m.anchor.index not in poses)
+        ]
+        self.records.renumber(new, edges, poses)
+        self._rejected = self.records.rejected_pairs()
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All closures, to be saved."""
+        tried = np.array([self.tried[False], self.tried[True]], dtype=np.int64)
+        return {**self.records.arrays(), 'closures_tried': tried}
+
+    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Continue with the closures of a saved map."""
+        self.records = ClosureRecords.from_arrays(arrays)
+        self._rejected = self.records.rejected_pairs()
+        self._num_accepted = max((c.number for c in self.records), default=-1) + 1
+        self._num_solved = self._num_accepted
+        rejected, accepted = arrays['closures_tried'].tolist()
+        self.tried = {True: accepted, False: rejected}
