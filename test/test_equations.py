@@ -39,7 +39,7 @@ def test_every_reference_to_an_equation_resolves():
 
 
 def test_equations_name_code_that_exists():
-    files = set(re.findall(r'`(rlml_slam/[\w/]+\.py)`', PAGE))
+    files = set(re.findall(r'`(rlml_(?:slam|lab)/[\w/]+\.py)`', PAGE))
     assert len(files) > 30
     assert not [f for f in files if not (ROOT / f).is_file()]
 
