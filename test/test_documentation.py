@@ -135,6 +135,14 @@ def test_named_parameters_exist(page):
         assert not named - PARAMETERS - OTHERS, f'{code}: no such parameter'
 
 
+def test_renamed_parameters_of_the_changelog_exist():
+    rows = re.findall(r'^\| `([a-z_.0-9]+)` \| `([a-z_.0-9]+)` \|$', text(TOP[2]), re.MULTILINE)
+    renamed = [(old, new) for old, new in rows if '/' not in old]
+    assert len(renamed) > 50
+    assert not [new for _, new in renamed if new not in PARAMETERS]
+    assert not [old for old, _ in renamed if old in PARAMETERS]
+
+
 def rows_of(table):
     for name, entry in table.items():
         for sub in entry.commands if isinstance(entry, Group) else ('',):
