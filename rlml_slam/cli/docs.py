@@ -57,7 +57,7 @@ def _read(path: Path) -> str:
 
 
 def filled(texts: Mapping[Path, str]) -> dict[Path, str]:
-    """The texts with every table between its marks made anew.
+    """The texts with every table between its marks made from the code.
 
     FileFormatError where the marks of a table are not there exactly once among them all.
     """
