@@ -43,7 +43,7 @@ class BagInputs:
     def __iter__(self) -> Iterator[tuple[int, str, Any]]:
         stream_of = {topic: stream for stream, topic in self.topics.items()}
         stream_of |= dict.fromkeys(self.more_scans, 'scan')
-        for time, topic, message in self._bag.messages(stream_of, whole=False):
+        for time, topic, message in self._bag.messages(stream_of):
             yield time, stream_of[topic], message
 
     def _scans(self, name: str) -> str:

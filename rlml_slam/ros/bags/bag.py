@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import struct
 import tempfile
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
@@ -31,7 +30,6 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rlml_slam.errors import BagError
 from rlml_slam.params import Node
 from rlml_slam.ros.bags.bag_recovery import BagRecovery
-from rlml_slam.ros.codecs.fast_decode import READERS
 from rlml_slam.ros.codecs.message_types import bag_types
 from rlml_slam.ros.sensor_input import PLACED, STREAMS, USED_BY, topics_of
 
@@ -112,13 +110,10 @@ class BagReader:
             return any(q.durability == Durability.TRANSIENT_LOCAL for q in offered)
         return False
 
-    def messages(
-        self, topics: Collection[str] | None = None, whole: bool = True
-    ) -> Iterator[tuple[int, str, Any]]:
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[int, str, Any]]:
         """Yield (log time [ns], topic, message) in log time order.
 
-        Where they need not be ``whole``, messages have the fields at least that ros/convert.py
-        reads. Raises BagError where the bag is damaged, after all that came before the damage.
+        Raises BagError where the bag is damaged, after all that came before the damage.
         """
         for time, connection, raw in self._raw(topics):
             types = self._typestore(connection)
@@ -126,24 +121,12 @@ class BagReader:
                 self.skipped[connection.topic] += 1
                 continue
             try:
-                message = None if whole else self._brief(connection, raw)
-                if message is None:
-                    read = types.deserialize_ros1 if self.is_ros1 else types.deserialize_cdr
-                    message = read(raw, connection.msgtype)
+                read = types.deserialize_ros1 if self.is_ros1 else types.deserialize_cdr
+                message = read(raw, connection.msgtype)
             except Exception:  # a broken payload: whatever the generated code stumbles over
                 self.skipped[connection.topic] += 1
                 continue
             yield time, connection.topic, message
-
-    def _brief(self, connection: Any, raw: bytes) -> Any:
-        """The message as far as it is needed, None where only the library can read it."""
-        read = READERS.get(connection.msgtype)
-        if read is None or self.is_ros1 or not self._is_todays(connection):
-            return None
-        try:
-            return read(raw)
-        except (ValueError, struct.error):
-            return None
 
     def serialized(
         self, topics: Collection[str] | None = None
