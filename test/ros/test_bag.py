@@ -15,6 +15,7 @@ from rlml_slam.ros.codecs import decode, encode
 from rlml_slam.ros.codecs.message_types import make_bag
 from rlml_slam.types import Imu
 
+ROOT = Path(__file__).resolve().parents[2]
 SHARED = Path(__file__).resolve().parents[3] / 'shared' / 'data'
 SECOND = 1_000_000_000
 STORAGES = ['mcap', 'sqlite3']
@@ -190,6 +191,19 @@ def test_sqlite_cut_off_is_refused_in_one_line(tmp_path):
     with pytest.raises(BagError, match=r'cut\.db3: not a readable bag: .*malformed') as error:
         BagReader(cut)
     assert '\n' not in str(error.value)
+
+
+def test_sqlite_of_large_messages_cut_off_gives_what_came_before(tmp_path):
+    """Large messages lie on pages of their own, which read as NULL where they are cut off."""
+    folder = ROOT / 'bags' / 'hall'
+    whole, _ = readable(folder)
+    data = (folder / 'hall.db3').read_bytes()
+    cut = tmp_path / 'hall.db3'
+    cut.write_bytes(data[: int(0.6 * len(data))])
+    got, damage = readable(cut)
+    assert 'malformed' in damage
+    assert len(got) > 0.5 * len(whole)
+    assert set(got) <= set(whole)
 
 
 def test_scratched_sqlite_gives_what_comes_before_the_scratch(tmp_path):

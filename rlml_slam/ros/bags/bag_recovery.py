@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a broken recording still holds: bags without index, without metadata, cut off or scratched.
+"""Recovery of broken bags: without index, without metadata, cut off, or with damaged chunks.
 
-A recorder that lost its power leaves such files. They are read from the front, record by record,
-to the first damage; their messages come in the order of the file.
+A recorder that lost its power leaves such files, and the library rosbags refuses all of them. They
+are read from the front, record by record, to the first damage; their messages come in the order of
+the file. The one use is ``BagRecovery(path)`` in bag.py, in place of the library's reader.
 """
 
 from __future__ import annotations
@@ -44,9 +45,9 @@ class Truncated(Exception):
 
 
 class BagRecovery:
-    """Looks like a reader of rosbags; ``damage`` says in one line what is wrong.
+    """A reader with the interface of rosbags; ``damage`` says in one line what is wrong.
 
-    Raises ValueError if nothing at all can be read.
+    Raises ValueError if no message can be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -261,12 +262,16 @@ def _sqlite(file: Path, first: int, owner: Any) -> Iterator[Found]:
                     form = _FORMATS.get(encoding, MessageDefinitionFormat.NONE)
                     definitions[name] = MessageDefinition(form, text)
             none = MessageDefinition(MessageDefinitionFormat.NONE, '')
-            for number, topic, kind in base.execute('SELECT id, name, type FROM topics'):
+            # the rows of a page that is cut off read as NULL
+            for number, topic, kind in base.execute(
+                'SELECT id, name, type FROM topics WHERE name NOT NULL AND type NOT NULL'
+            ):
                 ext = ConnectionExtRosbag2('cdr', [])
                 definition = definitions.get(kind, none)
                 yield Connection(first + number, topic, kind, definition, '', 0, ext, owner)
             for number, time, data in base.execute(
-                'SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY id'
+                'SELECT topic_id, timestamp, data FROM messages NOT INDEXED '
+                'WHERE topic_id + timestamp NOT NULL AND data NOT NULL ORDER BY id'
             ):
                 yield first + number, time, data
         except sqlite3.DatabaseError as e:
