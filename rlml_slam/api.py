@@ -34,7 +34,7 @@ from rlml_slam.report.outputs import write_outputs
 from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.se2 import Array
-from rlml_slam.sensing.synchronization.synchronizer import Inputs
+from rlml_slam.sensing.synchronization.input_counts import InputCounts
 from rlml_slam.slam.offline.slam import Slam as System
 from rlml_slam.slam.store import map_file
 from rlml_slam.types import Detections, Frame, Imu, Odometry, Reflectors, Scan
@@ -80,7 +80,7 @@ class Bag:
         self.truth: Trajectory | None = found.trajectory if found is not None else None
 
     def __iter__(self) -> Iterator[Measurement]:
-        counts = Inputs()
+        counts = InputCounts()
         with BagReader(self.path) as bag:
             inputs = BagInputs(bag, self.parameters)
             feed = SensorInput(self.parameters, _Measurements(), counts)

@@ -13,7 +13,7 @@ from rlml_slam.ros.codecs.decode import frame
 from rlml_slam.ros.tf import Extrinsics
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.mirror import mirrored_detections, mirrored_scan
-from rlml_slam.sensing.synchronization.synchronizer import Inputs
+from rlml_slam.sensing.synchronization.input_counts import InputCounts
 from rlml_slam.types import Detections, Imu, Odometry, Scan
 
 Out = TypeVar('Out')
@@ -76,7 +76,7 @@ class SensorInput(Generic[Out]):
     counted in ``inputs``; only a clock that jumped back raises InputError.
     """
 
-    def __init__(self, params: Parameters, target: Target[Out], inputs: Inputs) -> None:
+    def __init__(self, params: Parameters, target: Target[Out], inputs: InputCounts) -> None:
         self._p = params
         self._target = target
         self._inputs = inputs

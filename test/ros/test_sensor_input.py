@@ -14,7 +14,7 @@ from rlml_slam.ros.codecs.decode import Transform
 from rlml_slam.ros.codecs.message_types import make_bag
 from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.sensing.deskew import project
-from rlml_slam.sensing.synchronization.synchronizer import Inputs
+from rlml_slam.sensing.synchronization.input_counts import InputCounts
 from rlml_slam.types import Detections, Scan
 
 PLACE = np.array([0.4, -0.1, 0.7])
@@ -63,7 +63,7 @@ def in_base(points):
 def feed(request):
     by_tf = request.param == 'tf'
     node = Node() if by_tf else Node(laser_upside_down=True, laser_pose=tuple(PLACE))
-    feed = SensorInput(Parameters(node=node), Target(), Inputs())
+    feed = SensorInput(Parameters(node=node), Target(), InputCounts())
     if by_tf:
         feed.extrinsics.add([Transform('base_link', 'laser', *upside_down())])
     return feed
@@ -102,7 +102,7 @@ def test_reflectors_of_a_laser_upside_down_are_on_its_other_side(feed):
 
 
 def test_sensor_in_the_base_frame_does_not_hang():
-    feed = SensorInput(Parameters(node=Node(laser_upside_down=True)), Target(), Inputs())
+    feed = SensorInput(Parameters(node=Node(laser_upside_down=True)), Target(), InputCounts())
     feed.add('scan', encode.laser_scan(make_bag, replace(SCAN, frame_id='base_link')))
     assert feed._target.given[0].angle_min == SCAN.angle_min
 
@@ -110,7 +110,7 @@ def test_sensor_in_the_base_frame_does_not_hang():
 def test_farthest_range_of_inf_makes_no_range_of_inf():
     ranges = SCAN.ranges.copy()
     ranges[3] = np.inf
-    feed = SensorInput(Parameters(), Target(), Inputs())
+    feed = SensorInput(Parameters(), Target(), InputCounts())
     feed.add('scan', encode.laser_scan(make_bag, replace(SCAN, range_max=np.inf, ranges=ranges)))
     (scan,) = feed._target.given
     assert np.isfinite(scan.range_max)

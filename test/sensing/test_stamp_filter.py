@@ -8,8 +8,9 @@ import pytest
 
 from rlml_slam import se2
 from rlml_slam.params import Node, Parameters
+from rlml_slam.sensing.synchronization.observation_assembly import widened
 from rlml_slam.sensing.synchronization.stamp_filter import ENOUGH, WINDOW, StampFilter
-from rlml_slam.sensing.synchronization.synchronizer import Synchronizer, widened
+from rlml_slam.sensing.synchronization.synchronizer import Synchronizer
 from rlml_slam.types import ANONYMOUS, Detections, Motion, Odometry
 
 MS = 1_000_000
@@ -20,7 +21,7 @@ TWIST = np.array([1.0, 0.0, 0.3])
 
 def told(stamps):
     clock = StampFilter()
-    return np.array([clock.steady(int(s)) for s in stamps])
+    return np.array([clock.filtered(int(s)) for s in stamps])
 
 
 def ticks(period, n):
@@ -47,7 +48,7 @@ def test_the_error_that_is_left_is_told(seed):
     stamps = jittered(true, np.random.default_rng(seed))
     clock, error, sigma = StampFilter(), [], []
     for t, s in zip(true, stamps, strict=True):
-        error.append(clock.steady(int(s)) - t)
+        error.append(clock.filtered(int(s)) - t)
         sigma.append(clock.sigma)
     normalised = (np.array(error) / np.maximum(sigma, 1.0))[ENOUGH:]
     assert 0.6 < normalised.std() < 1.5
@@ -83,7 +84,7 @@ def test_exact_stamps_of_messages_that_overtake_one_another_stay():
     late = np.argsort(true + rng.uniform(0.0, 80.0 * MS, len(true)), kind='stable')
     clock = StampFilter()
     for stamp in true[late]:
-        assert clock.steady(int(stamp)) == stamp
+        assert clock.filtered(int(stamp)) == stamp
         assert clock.sigma == 0.0
 
 
@@ -117,8 +118,8 @@ def test_jump_of_the_clock_begins_another_line():
 def test_the_same_stamp_is_told_the_same_again():
     clock = StampFilter()
     for s in jittered(ticks(100, 100), np.random.default_rng(3)):
-        first = clock.steady(int(s))
-        assert clock.steady(int(s)) == first
+        first = clock.filtered(int(s))
+        assert clock.filtered(int(s)) == first
 
 
 def observed(steady):

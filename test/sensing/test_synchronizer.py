@@ -10,7 +10,9 @@ from rlml_slam.errors import InputError
 from rlml_slam.motion import SECOND, MotionBuffer
 from rlml_slam.params import Node, Parameters
 from rlml_slam.sensing.detection_frames import SIGMA
-from rlml_slam.sensing.synchronization.synchronizer import PAIRING, PERSISTENT, Synchronizer
+from rlml_slam.sensing.synchronization.stamp_check import PERSISTENT
+from rlml_slam.sensing.synchronization.synchronizer import Synchronizer
+from rlml_slam.sensing.synchronization.waiting_queue import PAIRING
 from rlml_slam.types import Detections, Imu, Odometry, Scan
 
 MS = SECOND // 1000

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Takes the jitter out of the stamps of a sensor that measures at a steady rate.
+"""Removes the jitter of the stamps of a sensor that has a constant rate.
 
-A stamp that a driver takes when the data have come jitters by what the transport does, at the
-robot's speed some centimetres. The sensor itself is steady: its true times lie on a straight line
-over the number of the message, and a line through the last WINDOW stamps tells the newest one with
-an error of 2 / sqrt(WINDOW) of the jitter; ``sigma`` is the error that is left.
+A driver that stamps data on arrival has the jitter of the transport, which is some centimetres at
+the speed of the robot. The true times of a sensor with a constant rate are linear in the number of
+the message. The line through the last WINDOW stamps gives the newest time with an error of
+2 / sqrt(WINDOW) of the jitter; ``sigma`` is the error that remains.
 
-Whether a sensor is steady is asked of the stamps. White jitter makes the variance of the intervals
-twice that about the line; where the intervals themselves vary, times wander off any line, and the
-variance about it is a multiple of that of the intervals. And jitter as long as the period makes
-stamps overtake one another: where they never do, messages come in bursts. Exact stamps overtake
-one another where messages do, and are even once they are sorted. Such stamps stay.
+The stamps show whether the rate is constant. White jitter gives intervals with twice the variance
+of the stamps about the line; if the intervals themselves vary, times drift from any line, and the
+variance about it is a multiple of that of the intervals. Jitter as long as the period makes stamps
+overtake one another; if they never do, messages arrive in bursts. Exact stamps of messages that
+overtake one another are equidistant when sorted. All such stamps stay unchanged.
 """
 
 from __future__ import annotations
@@ -52,28 +52,27 @@ class StampFilter:
     """The line through the newest stamps of one sensor, in whole nanoseconds."""
 
     def __init__(self) -> None:
-        # [ns] of the stamp told last, where jitter shows, and the part of it that is of this
-        # stamp alone
+        # [ns] error of the last stamp, 0 without jitter, and its white part
         self.sigma = self.white = 0.0
         self._restart()
-        self._told: tuple[int, int] | None = None
+        self._newest: tuple[int, int] | None = None  # last stamp, and the filtered one
 
     def _restart(self) -> None:
         self._stamps: deque[tuple[int, int]] = deque()  # number of the message, stamp
         self._now: Line | None = None  # the line through them
         self._first = 0
         self._is_steady = False
-        self._lost = 0  # messages thought lost before the newest
+        self._lost = 0  # messages that seem lost before the newest
         # sums over the window of 1, k, k^2, s, k s, s^2, k being the number, s the stamp since
         # the first; and over its steps of n^2, n d, d^2
         self._sums = (0, 0, 0, 0, 0, 0)
         self._steps = (0, 0, 0)
         self._overtakes = 0
 
-    def steady(self, stamp: int) -> int:
-        """The stamp [ns] less its jitter, if the sensor is steady; the same for the same one."""
-        if self._told is not None and stamp == self._told[0]:
-            return self._told[1]
+    def filtered(self, stamp: int) -> int:
+        """The stamp [ns] without jitter, if the rate is constant; may be repeated for a stamp."""
+        if self._newest is not None and stamp == self._newest[0]:
+            return self._newest[1]
         number = 0
         if self._stamps:
             number = self._stamps[-1][0] + 1
@@ -91,22 +90,22 @@ class StampFilter:
         self.white = self.sigma
         if line is not None and self._is_steady and self.sigma:
             if self._lost:
-                # whether one was lost, or this one is late, the next will tell
+                # a message was lost, or this one is late: the next stamp decides
                 self.sigma = self.white = 0.5 * line.period
             else:
                 out = self._first + round(line.start + line.period * number)
                 self.sigma *= 2.0 / math.sqrt(len(self._stamps))
                 self.white = 0.0
-        self._told = (stamp, out)
+        self._newest = (stamp, out)
         return out
 
     def _numbered(self, stamp: int, number: int, line: Line) -> int:
         """The number of a stamp: that of the next message, or of a later one where some are lost.
 
-        A stamp that is off a steady line, or far from its end, begins another one.
+        A stamp that is not on the line of a constant rate, or far from its end, starts a new line.
         """
-        # One lost message that nobody noticed bends the line: its end and the jitter about it must
-        # not hide all others. What the intervals and the newest stamps tell is not bent.
+        # A lost message that was not detected bends the line: its end and the jitter about it must
+        # not hide further ones. The intervals and the newest stamps are not affected.
         sigma = max(line.sigma / max(math.sqrt(2.0 * line.ratio), 1.0), SMALL)
         ahead = self._off(line, number, stamp)
         if not self._is_steady:
@@ -138,7 +137,7 @@ class StampFilter:
         self._append(number, newest[1])
 
     def _is_jitter(self, line: Line) -> bool:
-        """Whether the stamps may be those of a steady sensor and white jitter."""
+        """Whether the stamps may be those of a constant rate with white jitter."""
         if line.ratio >= UNSTEADY or (line.sigma > SMALL and self._is_exact()):
             return False
         # two neighbours' jitter differs by a normal deviate of sqrt(2) sigma
@@ -147,7 +146,7 @@ class StampFilter:
         return self._overtakes >= OVERTAKES * expected - 1.0
 
     def _is_exact(self) -> bool:
-        """Whether the stamps are even; messages were lost, or came in another order."""
+        """Whether the sorted stamps are equidistant: messages were lost or changed their order."""
         steps = np.diff(np.sort([stamp for _, stamp in self._stamps]))
         # some are still to come, so that a step may be of several periods
         periods = steps / max(float(np.median(steps)), 1.0)
@@ -185,7 +184,7 @@ class StampFilter:
         self._steps = (nn + sign * m * m, nd + sign * m * d, dd + sign * d * d)
 
     def _line(self) -> Line | None:
-        """The line through the window, None through too few or those of a clock that stands."""
+        """The line through the window; None with too few stamps, or if the clock stands still."""
         n, k, kk, s, ks, ss = self._sums
         if n < FEW:
             return None

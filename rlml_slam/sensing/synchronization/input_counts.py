@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Counts of accepted and rejected inputs, by stream, for reports and /diagnostics."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+
+@dataclass
+class InputCounts:
+    """Inputs by stream: used, late, duplicate, future, invalid, waited_out.
+
+    Of the used ones, ``no_returns`` are scans without a valid beam. ``repeated`` ones are old
+    scans of a robot that has moved since; they are not used.
+    """
+
+    counts: dict[str, Counter[str]] = field(default_factory=dict)
+    last_error: str = ''
+    first_errors: dict[str, str] = field(default_factory=dict)
+
+    def count(self, stream: str, what: str, error: str = '') -> None:
+        """Count one input of ``stream``; ``error`` is the message for the log."""
+        if stream not in self.counts:
+            self.counts[stream] = Counter()
+        self.counts[stream][what] += 1
+        if error:
+            self.last_error = error
+            self.first_errors.setdefault(stream, error)
+
+    def totals(self) -> dict[str, dict[str, int]]:
+        """Plain dictionaries, sorted, for reports."""
+        return {k: dict(sorted(v.items())) for k, v in sorted(self.counts.items())}

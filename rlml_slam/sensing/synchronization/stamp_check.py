@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Clocks of the inputs: which stamps to believe.
+
+A message whose stamp is far ahead of all others is held back: if it were believed, all later
+messages would be late. It is rejected if the other streams go on as before, and accepted if more
+messages follow it: then time really jumped ahead. Messages that are far behind are late if they
+are few; if all messages in a row are behind, the newest stamp was wrong or the clock was set back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TypeAlias
+
+from rlml_slam.errors import InputError
+from rlml_slam.motion import SECOND
+from rlml_slam.sensing.synchronization.input_counts import InputCounts
+from rlml_slam.types import Detections, Imu, Odometry, Scan
+
+Message: TypeAlias = Odometry | Imu | Scan | Detections
+
+MAX_AHEAD = SECOND  # [ns] a stamp farther ahead of all others is suspicious; sensors lag by less
+CONFIRM = 3  # messages that confirm, or refute, a suspicious stamp
+PERSISTENT = 10  # messages in a row that are behind: fewer are late, more are of a new clock
+
+
+class StampCheck:
+    """Newest stamps of the streams; rejects invalid, duplicate, late and future messages.
+
+    ``newest`` is the newest accepted stamp of all streams, ``first`` the first one. Sources are
+    the sensors of a stream, such as several lidars.
+    """
+
+    def __init__(self, inputs: InputCounts) -> None:
+        self._inputs = inputs
+        self.newest = -(2**62)
+        self.first: int | None = None
+        self._newest_of: dict[str, int] = {}  # by stream
+        self._newest_of_source: dict[tuple[str, str], int] = {}
+        self._step: dict[str, int] = {}  # by stream: between its last two stamps
+        self._num_behind = 0  # messages in a row that are far behind
+        self._held: list[tuple[str, Message]] = []  # messages that are far ahead
+        self._num_passed = 0  # messages since the newest of these that were not
+
+    def newest_of(self, stream: str) -> int | None:
+        """Newest stamp of a stream, None before the first."""
+        return self._newest_of.get(stream)
+
+    @property
+    def is_starting(self) -> bool:
+        """Whether less than a second has been received."""
+        return self.first is not None and self.newest - self.first < SECOND
+
+    @property
+    def has_held(self) -> bool:
+        """Whether messages are held back."""
+        return bool(self._held)
+
+    def holds(self, stream: str, message: Message) -> bool:
+        """Hold a message back if its stamp is too far ahead; whether it is."""
+        stamp = message.stamp
+        ahead = stamp - self.newest
+        if self.first is not None and ahead > MAX_AHEAD + 3 * self._step.get(stream, 0):
+            self._held.append((stream, message))
+            self._num_passed = 0
+            return True
+        if self._held and stamp > self._newest_of.get(stream, stamp):
+            self._num_passed += 1
+        return False
+
+    def release_held(self, least: int) -> Iterator[tuple[str, Message]]:
+        """Held messages to accept now, once ``least`` of them or the other streams decide.
+
+        If the other streams went on, those are accepted that these have caught up with, each one
+        after the one before was added; the rest is rejected.
+        """
+        others_went_on = self._num_passed >= CONFIRM
+        if not self._held or (len(self._held) < least and not others_went_on):
+            return
+        held, self._held, self._num_passed = self._held, [], 0
+        if not others_went_on:
+            self.newest = max(self.newest, held[0][1].stamp)
+        for stream, message in held:
+            if not others_went_on or self._is_reached(stream, message):
+                yield stream, message
+
+    def _is_reached(self, stream: str, message: Message) -> bool:
+        ahead = message.stamp - self.newest
+        if ahead <= MAX_AHEAD:
+            return True
+        error = f'{stream} at {message.stamp} ns is {ahead / SECOND:.1f} s ahead of all '
+        self._inputs.count(stream, 'future', error + 'other stamps: rejected')
+        return False
+
+    def accept(self, stream: str, stamp: int, limit: int | None, source: str = '') -> bool:
+        """Accept a stamp if it is after ``limit`` [ns]; else count it as late."""
+        newest = self._newest_of.get(stream)
+        if limit is not None and stamp <= limit:
+            self._inputs.count(stream, 'late', f'{stream} at {stamp} ns is late')
+            return False
+        newest_of_source = self._newest_of_source.get((stream, source), stamp)
+        self._step[stream] = 0 if newest is None else max(stamp - newest, 0)
+        self._newest_of[stream] = stamp if newest is None else max(newest, stamp)
+        self._newest_of_source[stream, source] = max(newest_of_source, stamp)
+        self.newest = max(self.newest, stamp)
+        if self.first is None:
+            self.first = stamp
+        return True
+
+    def is_duplicate(self, stream: str, stamp: int, source: str) -> bool:
+        """Whether the stamp is the newest of its source already; counts it."""
+        if stamp != self._newest_of_source.get((stream, source)):
+            return False
+        self._inputs.count(stream, 'duplicate')
+        return True
+
+    def wrong_after(self, stream: str, stamp: int, last_used: int | None) -> int | None:
+        """Time [ns] after which stamps were wrong, if too many messages are far behind; or None.
+
+        InputError if such stamps were used already (``last_used``): the clock was set back.
+        """
+        behind = self.newest - stamp
+        if self.first is None or behind <= MAX_AHEAD:
+            self._num_behind = 0
+            return None
+        self._num_behind += 1
+        if self._num_behind < PERSISTENT:
+            return None
+        self._num_behind = 0
+        if last_used is not None and last_used - stamp > MAX_AHEAD:
+            raise InputError(f'the clock of {stream} jumped back by {behind / SECOND:.1f} s')
+        return stamp + MAX_AHEAD
+
+    def forget_after(self, stamp: int) -> None:
+        """Drop the stamps after ``stamp`` [ns], which were wrong."""
+        for stream in [s for s, newest in self._newest_of.items() if newest > stamp]:
+            error = f'{stream} at {self._newest_of.pop(stream)} ns is far ahead of all other '
+            self._inputs.count(stream, 'future', error + 'stamps: rejected')
+        self._newest_of_source = {k: s for k, s in self._newest_of_source.items() if s <= stamp}
+        self.newest = max(self._newest_of.values(), default=stamp)
