@@ -58,6 +58,20 @@ def rotation(theta: ArrayLike) -> Array:
     return R
 
 
+def rotation3(theta: float) -> Array:
+    """R(theta) (3, 3) on poses and twists: rotates (x, y), keeps the heading."""
+    R = np.eye(3)
+    R[:2, :2] = rotation(theta)
+    return R
+
+
+def rotate_cov(cov: Array, theta: float) -> Array:
+    """R cov R^T of a pose (3, 3): ``cov`` is in axes rotated by ``theta`` in the parent frame."""
+    R = rotation3(theta)
+    out: Array = R @ cov @ R.T
+    return out
+
+
 def compose(T_a_b: ArrayLike, T_b_c: ArrayLike) -> Array:
     """T_a_c = T_a_b T_b_c."""
     a, b = np.asarray(T_a_b, dtype=np.float64), np.asarray(T_b_c, dtype=np.float64)

@@ -20,15 +20,15 @@ from rlml_slam.ekf.extraction import Measured, measure
 from rlml_slam.ekf.filter import Filter
 from rlml_slam.ekf.likelihood import ALIKE
 from rlml_slam.ekf.matching import Matcher
-from rlml_slam.estimation.health import Evidence, HealthMonitor
-from rlml_slam.estimation.kidnapping_detection import consents
+from rlml_slam.estimation.health import HealthInputs, HealthMonitor, ScanEvidence
+from rlml_slam.estimation.kidnapping_detection import agree_with_map
 from rlml_slam.estimation.landmark_models import POINT, line_model
 from rlml_slam.estimation.smoother import Smoothed, Start, smooth
 from rlml_slam.maps.occupancy import OccupancyGrid, render
 from rlml_slam.params import EkfParameters
 from rlml_slam.se2 import Array
-from rlml_slam.slam.front_end.grid_localization import Fix
-from rlml_slam.slam.front_end.map_confirmation import START_SIGMA, MapConfirmation
+from rlml_slam.slam.front_end.grid_localization import GridMatch
+from rlml_slam.slam.front_end.map_localization import MapConfirmation
 from rlml_slam.slam.landmarks.delayed_association import SLIP2
 from rlml_slam.types import Frame, Observation, Reflectors, Status
 
@@ -81,7 +81,7 @@ class Estimator:
         A start pose with no covariance is only assumed, and has that of a person's guess.
         """
         if not self.filter.pose_cov.any():
-            self.reset(self.filter.pose, np.diag(START_SIGMA**2))
+            self.reset(self.filter.pose, np.diag(np.array(self._p.node.map_start_sigma) ** 2))
         self.confirmation.begin()
         self._mapping = False
         self._keeps_steps = False  # the map is not of this drive
@@ -160,16 +160,19 @@ class Estimator:
         n, used = len(statuses), int((statuses == Status.USED).sum())
         gone = float(np.hypot(*observation.motion.delta[:2]))
         in_map = self.confirmation
-        in_map.judge(observation.stamp, gone, n, used, consents(n, used), Fix(math.nan))
-        health = self.health.judge(
+        agree = agree_with_map(n, used)
+        in_map.check(observation.stamp, gone, n, used, agree, GridMatch(math.nan))
+        health = self.health.evaluate(
             observation.stamp,
-            Evidence(),
-            odometry=observation.motion.known,
-            detections=None if seen is None else n,
-            used=used,
-            cov=cov,
-            unconfirmed=in_map.reason,
-            lost=in_map.is_lost,
+            HealthInputs(
+                scan=ScanEvidence(),
+                has_odometry=observation.motion.known,
+                detections=None if seen is None else n,
+                matched=used,
+                cov_map=cov,
+                unconfirmed=in_map.reason,
+                is_lost=in_map.is_lost,
+            ),
         )
         return Frame(
             stamp=observation.stamp,

@@ -73,21 +73,10 @@ def _since(
     """Pose (3,) and covariance (3, 3) in the map, from those of the reference ``then``."""
     way = pose[:2] - then[:2]
     grown = positive(cov - carried(cov_then, way))
-    T_map_base, turned = se2.compose_belief(T_map_local, pose, grown)
+    T_map_base, grown = se2.compose_belief(T_map_local, pose, grown)
     c, s = math.cos(T_map_local[2]), math.sin(T_map_local[2])
     there = np.array([c * way[0] - s * way[1], s * way[0] + c * way[1]])
-    return T_map_base, carried(cov_map, there) + turned
-
-
-def turned(cov: Array, angle: float) -> Array:
-    """Covariance (3, 3) of a pose in the axes of the parent frame: R cov R^T.
-
-    ``cov`` is in axes that are rotated by ``angle`` [rad] in the parent frame.
-    """
-    R = np.eye(3)
-    R[:2, :2] = se2.rotation(angle)
-    out: Array = R @ cov @ R.T
-    return out
+    return T_map_base, carried(cov_map, there) + grown
 
 
 def either(P: Array, Q: Array) -> Array:

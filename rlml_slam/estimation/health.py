@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OK, DEGRADED or LOST, with the reasons: what a vehicle controller has to know."""
+"""Health of the estimate: OK, DEGRADED or LOST with the reasons, for the vehicle controller."""
 
 from __future__ import annotations
 
@@ -10,128 +10,146 @@ from rlml_slam.params import HealthLimits
 from rlml_slam.se2 import Array
 from rlml_slam.types import Health, Level
 
-FEW = 3  # expected reflectors below this may be missed by chance, or stand behind glass
+FEW = 3  # fewer expected reflectors may all be missed by chance, or stand behind glass
+NEVER = -(2**62)  # [ns]
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """What the scan said in one step.
+class ScanEvidence:
+    """Result of the scan update of one step.
 
-    ``misfit``: it fits far worse than scans did lately. ``weak`` is the direction [deg, 0..180) of
-    the map in which the scan leaves the position open, None where there is none.
+    ``misfit``: the score is far below the usual one. ``open_direction`` [deg, 0..180) of the map
+    is the one in which the scan does not observe the position, None if it observes all.
     """
 
-    scan: bool = False
+    has_scan: bool = False
     used: bool = False
     misfit: bool = False
-    beams: int = 0
     score: float = float('nan')
-    weak: float | None = None
-    prior_weight: float = 1.0
+    open_direction: float | None = None
     iterations: int = 0
 
 
+@dataclass(frozen=True)
+class HealthInputs:
+    """What one step says about the health of the estimate.
+
+    ``detections``: their number, None if no detector has run; ``matched`` of them updated the
+    estimate. ``cov_map`` (3, 3) is that of the pose. ``unconfirmed``: why the saved map does not
+    confirm the pose, empty if it does; ``is_lost``: for too long. ``contradicted``: scan or
+    reflectors have contradicted the map for too long. ``seen`` of the ``expected`` reflectors in
+    view were detected.
+    """
+
+    scan: ScanEvidence
+    has_odometry: bool
+    detections: int | None
+    matched: int
+    cov_map: Array
+    unconfirmed: str = ''
+    is_lost: bool = False
+    contradicted: bool = False
+    expected: int = 0
+    seen: int = 0
+
+
 class HealthMonitor:
-    """Remembers since when each input has been failing."""
+    """Evaluates the health; stores the stamp [ns] at which each input was good last."""
 
     def __init__(self, limits: HealthLimits) -> None:
         self._limits = limits
-        self._held_by_reflectors = -(2**62)
-        self._held_by_scan = -(2**62)
-        self._odometry_seen = -(2**62)
-        self._reflectors_matched = -(2**62)
-        self._scan_fits = -(2**62)
-        self._reflectors_there = -(2**62)
+        self._odometry = NEVER
+        self._reflectors_matched = NEVER
+        self._reflectors_seen = NEVER
+        self._scan_matched = NEVER
+        self._held_by_reflectors = NEVER
+        self._held_by_scan = NEVER
         self._first: int | None = None
 
-    def judge(
-        self,
-        stamp: int,
-        evidence: Evidence,
-        odometry: bool,
-        detections: int | None,
-        used: int,
-        cov: Array,
-        unconfirmed: str = '',
-        lost: bool = False,
-        contradicted: bool = False,
-        expected: int = 0,
-        seen: int = 0,
-    ) -> Health:
-        """Health at ``stamp`` [ns]; ``detections`` is None where none were looked for.
-
-        ``unconfirmed``: why the map that it localizes in does not agree with the pose, empty where
-        it does; ``lost``: for too long; ``contradicted``: all that was seen for a while
-        contradicts the map; ``seen``: so many of the ``expected`` reflectors of the map were.
-        """
-        reasons = [unconfirmed] if unconfirmed else []
+    def evaluate(self, stamp: int, step: HealthInputs) -> Health:
+        """Health at ``stamp`` [ns], after the first step."""
+        reasons = [step.unconfirmed] if step.unconfirmed else []
         if self._first is None:
             self._first = stamp
             return Health(Level.DEGRADED if reasons else Level.OK, tuple(reasons))
-        if contradicted:
-            lost = True
-            reasons.append('what is seen contradicts the map: was the robot carried away?')
-        patience = int(self._limits.input_timeout * 1e9)
-
-        def failing(since: int) -> bool:
-            return stamp - max(since, self._first or stamp) > patience
-
-        if odometry:
-            self._odometry_seen = stamp
-        if failing(self._odometry_seen):
-            reasons.append('no odometry')
-        if used >= 2:
-            self._held_by_reflectors = stamp
-        if used > 0 or not detections:
-            self._reflectors_matched = stamp
-        unmatched = failing(self._reflectors_matched)
-        if unmatched:
-            reasons.append(f'none of {detections} detected reflectors matches the map')
-        if expected < FEW or 2 * seen > expected:
-            self._reflectors_there = stamp
-        if failing(self._reflectors_there):
-            reasons.append(f'saw {seen} of {expected} expected reflectors')
-        if evidence.used or not evidence.scan:
-            self._scan_fits = stamp
-        misfit = failing(self._scan_fits)
-        if misfit:
-            reasons.append(f'scan fits the submap by {evidence.score:.2f} only')
-        weak = evidence.weak
-        if evidence.used and weak is None:
-            self._held_by_scan = stamp
-        held = max(self._held_by_scan, self._held_by_reflectors)
-        if failing(held):
-            if weak is not None:
-                reasons.append(f'nothing holds the position along {weak:.0f} deg of the map')
-            elif not misfit:
-                reasons.append('position is held by odometry alone')
-        sigma = math.sqrt(ends_of(cov[:2, :2])[1])
+        if step.contradicted:
+            reasons.append(
+                'scan and reflectors contradict the map: the robot may have been moved; '
+                'waiting for relocalization'
+            )
+        self._note(stamp, step)
+        unmatched = self._fails(self._reflectors_matched, stamp)
+        misfit = self._fails(self._scan_matched, stamp)
+        reasons += self._input_reasons(stamp, step, unmatched, misfit)
+        sigma = math.sqrt(eigenvalues_2x2(step.cov_map[:2, :2])[1])
         if sigma > self._limits.sigma_degraded:
-            reasons.append(f'position uncertain by {sigma:.2f} m (1 sigma)')
-        if sigma > self._limits.sigma_lost or (misfit and (unmatched or not used)):
-            lost = True
-        if lost:
+            reasons.append(f'position sigma is {sigma:.2f} m')
+        is_lost = step.is_lost or step.contradicted or sigma > self._limits.sigma_lost
+        if is_lost or (misfit and (unmatched or not step.matched)):
             return Health(Level.LOST, tuple(reasons))
         return Health(Level.DEGRADED if reasons else Level.OK, tuple(reasons))
 
+    def _note(self, stamp: int, step: HealthInputs) -> None:
+        """Store the stamp of each input that is good in this step."""
+        if step.has_odometry:
+            self._odometry = stamp
+        if step.matched >= 2:
+            self._held_by_reflectors = stamp
+        if step.matched > 0 or not step.detections:
+            self._reflectors_matched = stamp
+        if step.expected < FEW or 2 * step.seen > step.expected:
+            self._reflectors_seen = stamp
+        if step.scan.used or not step.scan.has_scan:
+            self._scan_matched = stamp
+        if step.scan.used and step.scan.open_direction is None:
+            self._held_by_scan = stamp
 
-def weak_direction(information: Array, heading: float, weak_sigma: float) -> float | None:
-    """Direction [deg, 0..180) in which the position has a larger sigma, if there is one.
+    def _fails(self, last_good: int, stamp: int) -> bool:
+        """Whether an input has not been good for longer than ``input_timeout``."""
+        since = max(last_good, self._first or stamp)
+        return stamp - since > int(self._limits.input_timeout * 1e9)
 
-    ``information`` (3, 3) of a pose is in axes that are turned by ``heading`` [rad].
+    def _input_reasons(
+        self, stamp: int, step: HealthInputs, unmatched: bool, misfit: bool
+    ) -> list[str]:
+        reasons = []
+        if self._fails(self._odometry, stamp):
+            reasons.append('no odometry')
+        if unmatched:
+            reasons.append(f'none of {step.detections} detected reflectors matches the map')
+        if self._fails(self._reflectors_seen, stamp):
+            reasons.append(f'only {step.seen} of {step.expected} expected reflectors detected')
+        if misfit:
+            reasons.append(f'scan does not match the submap: score {step.scan.score:.2f}')
+        open_direction = step.scan.open_direction
+        if self._fails(max(self._held_by_scan, self._held_by_reflectors), stamp):
+            if open_direction is not None:
+                reasons.append(
+                    f'position along {open_direction:.0f} deg of the map is from odometry alone: '
+                    'the scan does not observe it'
+                )
+            elif not misfit:
+                reasons.append('position is from odometry alone')
+        return reasons
+
+
+def open_direction(information: Array, heading: float, max_sigma: float) -> float | None:
+    """Direction [deg, 0..180) in which the position sigma exceeds ``max_sigma``, None if none.
+
+    ``information`` (3, 3) of a pose is in axes that are rotated by ``heading`` [rad].
     """
     (xx, xy, xt), (_, yy, yt), (_, _, tt) = information.tolist()
-    # marginal of the position: the heading is estimated along with it
+    # Schur complement: marginal information of the position, the heading being estimated too
     tt = max(tt, 1e-12)
     a, b, d = xx - xt * xt / tt, xy - xt * yt / tt, yy - yt * yt / tt
-    if 0.5 * (a + d) - math.hypot(0.5 * (a - d), b) >= weak_sigma**-2:
+    if 0.5 * (a + d) - math.hypot(0.5 * (a - d), b) >= max_sigma**-2:
         return None
-    # the axis of the smaller eigenvalue, from the double angle of the larger one's
-    weak = 0.5 * math.atan2(2.0 * b, a - d) + 0.5 * math.pi
-    return math.degrees(weak + heading) % 180.0
+    # axis of the smaller eigenvalue: normal to that of the larger, which is at half of this angle
+    axis = 0.5 * math.atan2(2.0 * b, a - d) + 0.5 * math.pi
+    return math.degrees(axis + heading) % 180.0
 
 
-def ends_of(A: Array) -> tuple[float, float]:
+def eigenvalues_2x2(A: Array) -> tuple[float, float]:
     """The smaller and the larger eigenvalue of a symmetric matrix (2, 2)."""
     (a, b), (_, d) = A.tolist()
     mean, half = 0.5 * (a + d), math.hypot(0.5 * (a - d), b)

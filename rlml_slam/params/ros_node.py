@@ -49,6 +49,13 @@ class Node(Group, prefix=''):
     map_start_pose: tuple[float, ...] = param(
         (0.0, 0.0, 0.0), 'start pose in the saved map', 'm, m, rad'
     )
+    map_start_sigma: tuple[float, ...] = param(
+        (0.5, 0.5, 0.26),
+        'error of map_start_pose in a saved map, 1 sigma; as a pose set in RViz',
+        'm, m, rad',
+        0.0,
+        100.0,
+    )
     restore_pose: bool = param(
         True,
         'start in a saved map at the last pose of the robot, if scan and reflectors match there',

@@ -208,11 +208,16 @@ def test_start_that_nothing_confirms_is_degraded_and_then_lost():
     for k in range(1, 80):
         frame = look(estimator, k, np.zeros(3), seen=False)
         levels.append(frame.health.level)
-        assert frame.health.reasons[0] == 'nothing has matched the saved map yet'
+        assert (
+            frame.health.reasons[0]
+            == 'start pose not confirmed: nothing has matched the saved map yet'
+        )
         assert frame.unconfirmed
     assert levels == [Level.DEGRADED] * 51 + [Level.LOST] * 28
 
 
 def test_without_the_map_to_localize_in_nothing_is_sure():
     estimator = Estimator(EkfParameters(node=Node(mode='localization')))
-    assert look(estimator, 1, np.zeros(3)).health.reasons == ('no map to localize in has come',)
+    assert look(estimator, 1, np.zeros(3)).health.reasons == (
+        'no map has been loaded for localization',
+    )

@@ -229,7 +229,7 @@ def test_robot_that_drives_out_of_its_map_is_degraded_and_goes_on():
     assert set(levels[5:150]) == {Level.OK}
     assert levels[-1] is Level.DEGRADED
     (reason,) = frames[-1].health.reasons
-    assert re.fullmatch(r'the saved map has not confirmed the pose for 1\d m', reason)
+    assert re.fullmatch(r'no match with the saved map for 1\d m', reason)
     assert Level.LOST not in levels
     assert distance.max() < 0.1
 
@@ -250,7 +250,7 @@ def test_map_of_a_hall_that_was_rebuilt_is_no_place_to_be_sure_of():
 def test_without_the_map_to_localize_in_nothing_is_sure():
     slam = Slam(Parameters(node=Node(mode='localization')))
     frames, _ = run(observations(ROOM, LOOP[:70], rng=np.random.default_rng(4)), slam)
-    assert {f.health.reasons[0] for f in frames} == {'no map to localize in has come'}
+    assert {f.health.reasons[0] for f in frames} == {'no map has been loaded for localization'}
     levels, t = np.array([f.health.level for f in frames]), seconds(frames, ())
     assert (levels == np.where(t > 5.0, Level.LOST, Level.DEGRADED)).all()
     assert all(f.unconfirmed for f in frames)
@@ -262,12 +262,12 @@ def test_without_the_map_to_localize_in_nothing_is_sure():
 
 def test_scan_misfits_only_against_what_is_usual():
     doubt = KidnappingDetection(HealthLimits(contradiction_ratio=0.6))
-    assert not doubt.misfits(0.0, 90)
+    assert not doubt.is_misfit(0.0, 90)
     for score in (0.5, 0.6, 0.7, 0.6, 0.6):
         doubt.learn(score)
-    assert doubt.misfits(0.35, 90)
-    assert not doubt.misfits(0.37, 90)
-    assert not doubt.misfits(0.0, 2)
+    assert doubt.is_misfit(0.35, 90)
+    assert not doubt.is_misfit(0.37, 90)
+    assert not doubt.is_misfit(0.0, 2)
 
 
 @pytest.mark.parametrize(
@@ -284,16 +284,16 @@ def test_scan_misfits_only_against_what_is_usual():
 )
 def test_either_sense_overrules_the_other(frame, contradicts):
     doubt = KidnappingDetection(HealthLimits())
-    doubt.judge(FIRST, False, True, 4, 4, False)
-    assert doubt.judge(FIRST + STEP, *frame, False) is contradicts
+    doubt.check(FIRST, False, True, 4, 4, False)
+    assert doubt.check(FIRST + STEP, *frame, False) is contradicts
     assert (doubt.since == FIRST + STEP) is contradicts
 
 
 def test_new_reflectors_contradict_only_where_known_ones_were_seen_just_before():
     doubt = KidnappingDetection(HealthLimits())
-    doubt.judge(FIRST, False, True, 4, 4, False)
-    assert not doubt.judge(FIRST + 6 * STEP, False, False, 5, 0, False)
-    assert doubt.judge(FIRST + 7 * STEP, False, False, 5, 0, True)
+    doubt.check(FIRST, False, True, 4, 4, False)
+    assert not doubt.check(FIRST + 6 * STEP, False, False, 5, 0, False)
+    assert doubt.check(FIRST + 7 * STEP, False, False, 5, 0, True)
 
 
 def test_recovery_leaves_a_robot_alone_that_is_not_lost():

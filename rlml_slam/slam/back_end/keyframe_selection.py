@@ -9,7 +9,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from rlml_slam import params, se2
-from rlml_slam.estimation.correction import turned
 from rlml_slam.maps.occupancy import OccupancyGrid, render
 from rlml_slam.se2 import Array
 from rlml_slam.slam.keyframes import Interval, Keyframe
@@ -45,7 +44,7 @@ def odometry_edge(
     if p.edge_covariance == 'sum':
         # eq. 14 as printed, in the axes of the last keyframe
         both = last.cov_local + frame.cov_local
-        return delta, turned(both, -last.T_local[2]) + 1e-9 * np.eye(3)
+        return delta, se2.rotate_cov(both, -last.T_local[2]) + 1e-9 * np.eye(3)
     return delta, since.cov + np.diag(np.array(p.edge_variance_floor))
 
 

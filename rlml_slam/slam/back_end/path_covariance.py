@@ -21,13 +21,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rlml_slam import se2
 from rlml_slam.estimation.correction import (
     Correction,
     ReferencePose,
     carried,
     either,
     positive,
-    turned,
 )
 from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.factor_table import FactorTable
@@ -62,7 +62,7 @@ class PathCovariance:
             lever = later.pose[:2] - key.T_local[:2]
             growth = positive(later.cov_local - carried(key.cov_local, lever))
             cov = intersection(cov, carried(later.cov_map + growth, -lever))
-        return turned(cov, -key.T_local[2])
+        return se2.rotate_cov(cov, -key.T_local[2])
 
     @property
     def newest(self) -> int:
@@ -72,7 +72,7 @@ class PathCovariance:
     def start(self, key: Keyframe) -> None:
         """Start at a keyframe after a jump, with the covariance of its relocalization."""
         self._starts.append(key.stamp)
-        self._enter(key, turned(key.cov_local, -key.T_local[2]))
+        self._enter(key, se2.rotate_cov(key.cov_local, -key.T_local[2]))
 
     def add_closures(
         self, closures: ClosureRecords, keys: Sequence[Keyframe], edges: FactorTable
@@ -82,7 +82,7 @@ class PathCovariance:
         for c in sorted(new, key=lambda c: c.number):
             self._num_closures = c.number + 1
             T = edges.measured[c.edge]
-            cov = turned(carried(self.cov(keys[c.i]), T[:2]), -T[2])
+            cov = se2.rotate_cov(carried(self.cov(keys[c.i]), T[:2]), -T[2])
             cov += np.linalg.inv(edges.information[c.edge])
             self._enter(keys[c.j], intersection(self.cov(keys[c.j]), cov))
 
@@ -105,7 +105,7 @@ class PathCovariance:
         self._known = [self._known[k] for k in kept]
 
     def _enter(self, key: Keyframe, cov: Array) -> None:
-        known = ReferencePose(key.T_local, key.cov_local, turned(cov, key.T_local[2]))
+        known = ReferencePose(key.T_local, key.cov_local, se2.rotate_cov(cov, key.T_local[2]))
         k = bisect_right(self._stamps, key.stamp)
         self._stamps.insert(k, key.stamp)
         self._known.insert(k, known)
@@ -142,7 +142,7 @@ def newest_covariance(
         bound.add_closures(closures, keys, solver.graph.edges)
         if not _is_constrained(solver.graph, bound, closures, keys, before):
             heading = float(T_map_local[2] + before.T_local[2])
-            cov = either(cov, turned(bound.cov(before), heading))
+            cov = either(cov, se2.rotate_cov(bound.cov(before), heading))
     since = Correction(T_map_local, ReferencePose(before.T_local, before.cov_local, cov))
     _, cov_map = since.apply(last.T_local, last.cov_local)
     return ReferencePose(last.T_local, last.cov_local, cov_map)

@@ -8,7 +8,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from rlml_slam.estimation.correction import turned
+from rlml_slam import se2
 from rlml_slam.maps.survey import Survey
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.keyframes import Interval, Keyframe
@@ -39,7 +39,7 @@ def restore(
             back_end.path_covariance.start(key)
     last = keys[-1]
     T_map = back_end.graph.poses[last.index].copy()
-    last.cov_local = turned(last.cov_local, float(T_map[2] - last.T_local[2]))
+    last.cov_local = se2.rotate_cov(last.cov_local, float(T_map[2] - last.T_local[2]))
     last.T_local = T_map
     back_end.keyframes = keys
     back_end.scan_graph.restore(arrays, keys)

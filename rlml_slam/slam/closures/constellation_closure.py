@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from rlml_slam import se2
-from rlml_slam.estimation.correction import turned
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.matching.reflectors.constellation import Candidate, locate
 from rlml_slam.params import Parameters
@@ -128,6 +127,7 @@ class ConstellationSearch:
         log_odds = min(-math.log(max(chance, 1e-300)), repeated)
         return ConstellationMatch(
             keys[anchor], keys[-1], found.pose, se2.between(poses[anchor], found.pose),
-            turned(found.cov, -poses[anchor, 2]) + np.diag(SIGMA**2), pairs, len(hits) / len(new),
+            se2.rotate_cov(found.cov, -poses[anchor, 2]) + np.diag(SIGMA**2), pairs,
+            len(hits) / len(new),
             float(extent.prod()), log_odds,
         )  # fmt: skip

@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.estimation.correction import turned
 from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.graph import Renumbering
 from rlml_slam.graph.robust.inlier_evidence import uniform
@@ -140,7 +139,7 @@ class LoopCloser:
                 return result
             return replace(found, why=BY_REFLECTORS + found.why)
         off = se2.between(T_map_key, se2.compose(grid, found.T_grid_key))
-        cov = turned(proposed.cov, -proposed.T_anchor_key[2])
+        cov = se2.rotate_cov(proposed.cov, -proposed.T_anchor_key[2])
         if off @ np.linalg.solve(cov, off) > SAME_POSE_GATE:
             return found.closure(BY_REFLECTORS + 'the scan fits at another pose')
         return replace(

@@ -52,7 +52,7 @@ class ConstantVelocity:
         self._way = coast(state, elapsed, sigma, p.constant_velocity_time, jitter, motion)
         state.P[BIAS, BIAS] += p.imu_bias_walk**2 * dt
 
-    def found(self, state: JointState, motion: Motion) -> Motion:
+    def estimated(self, state: JointState, motion: Motion) -> Motion:
         """The motion since before :meth:`predict`, by all that was measured since.
 
         To the graph it is what odometry is else: it holds keyframes together where their scans

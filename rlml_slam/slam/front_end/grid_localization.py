@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fixes of the pose in the grid of a saved map: the scan term of eq. 2 with a map that is frozen.
+"""Scan matching against the grid of a saved map: the scan term of eq. 2 with a fixed map.
 
-Between two fixes the scans hold the pose relative to the front end's own submaps, so one fix per
-keyframe's distance says all: nearer ones would see the same errors of the same walls again.
+Between two matches, the front end's own submaps hold the pose. One match per keyframe distance is
+enough: closer ones would have the same errors of the same walls.
 """
 
 from __future__ import annotations
@@ -22,45 +22,46 @@ from rlml_slam.se2 import Array
 from rlml_slam.slam.front_end.joint_state import JointState
 from rlml_slam.slam.relocalization.scan_relocalization import possible, submap_of
 
-OUTLIER = 0.9999  # probability of the gate of a fix against the prior
-FEW = 4  # every so many-th beam of a scan that does not fit is followed through the grid
+GATE_PROBABILITY = 0.9999  # of the gate of a match against the prior
+BEAM_STEP = 4  # of a scan that does not match, every n-th beam is traced through the grid
 POSE = np.arange(3)
 
 
 @dataclass(frozen=True)
-class Fix:
-    """One match against the grid: its score, whether it moved the pose and held all of it.
+class GridMatch:
+    """Result of a match with the grid; ``score`` is NaN if there was none.
 
-    It ``contradicts`` where the scan does not fit what the grid knows there.
+    ``used``: it updated the pose; ``is_complete``: in every direction. ``contradicts``: the scan
+    does not fit the known part of the grid.
     """
 
     score: float
     used: bool = False
-    held: bool = False
+    is_complete: bool = False
     contradicts: bool = False
 
 
 class GridLocalizer:
-    """The grid; ``fix`` updates a state with a scan where the robot has moved on."""
+    """Matches scans with a grid."""
 
     def __init__(self, grid: OccupancyGrid, params: Parameters) -> None:
         self._p = params
         self._submap = submap_of(grid, params.submap)
         self._floor = np.zeros((3, 3))
         self._floor[[0, 1, 2], [0, 1, 2]] = params.submap.grid_bias_variance
-        self._gate = [gate(OUTLIER, dof) for dof in (1, 2, 3)]
+        self._gate = [gate(GATE_PROBABILITY, dof) for dof in (1, 2, 3)]
         self._last: Array | None = None
 
     def is_due(self, pose: Array) -> bool:
-        """Whether the pose (3,) is as far from the last fix as a keyframe from the last."""
+        """Whether the pose (3,) is at least a keyframe distance from the last match."""
         if self._last is None:
             return True
         step, p = se2.between(self._last, pose), self._p.back_end
         far = math.hypot(step[0], step[1]) >= p.minimum_travel_distance
         return far or abs(float(step[2])) >= p.minimum_travel_heading
 
-    def fix(self, state: JointState, points: Array) -> Fix:
-        """Match end points (n, 2), base frame, and update the state if they fit there."""
+    def update(self, state: JointState, points: Array) -> GridMatch:
+        """Match end points (n, 2), base frame, and update the state if the match is accepted."""
         p = self._p.scan_match
         points = voxel_filter.thin(points, p.voxel_size, p.max_points)
         prior, cov = state.pose, state.pose_cov
@@ -71,9 +72,9 @@ class GridLocalizer:
             found = searched if searched.score > found.score else found
         if found.score < p.min_score:
             may_be = possible(
-                self._submap, points[::FEW], found.pose, found.score, p.search_threshold
+                self._submap, points[::BEAM_STEP], found.pose, found.score, p.search_threshold
             )
-            return Fix(found.score, contradicts=may_be < p.min_score)
+            return GridMatch(found.score, contradicts=may_be < p.min_score)
         information = scan_information.information(self._submap, points, found.pose, p)
         # the error of the map at this place, which more beams do not lower
         information = np.asarray(
@@ -87,8 +88,8 @@ class GridLocalizer:
         v = root @ offset
         d2 = float(v @ np.linalg.solve(root @ cov @ root.T + np.eye(len(v)), v))
         if not len(v) or d2 > self._gate[len(v) - 1]:
-            return Fix(found.score)
+            return GridMatch(found.score)
         state.apply(POSE, root, np.eye(len(v)), v)
         self._last = state.pose
         weakest = self._p.health.degeneracy_sigma**-2
-        return Fix(found.score, True, len(v) == 3 and float(values[0]) >= weakest)
+        return GridMatch(found.score, True, len(v) == 3 and float(values[0]) >= weakest)

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reflectors out of reach, left out of the joint state without losing anything.
+"""Reflectors out of range, removed from the joint state without loss of information.
 
-An update costs the square of what is in the state. Nothing that is measured while they are out of
-reach is of the distant reflectors b themselves: given the state s of the moment at which they were
-left out, they are independent of all of it. So p(b | s) of that moment stays as it is,
+An update costs the square of the size of the state. While reflectors b are out of range, no
+measurement is of them: given the state s at which they were removed, they are independent of
+all later measurements. So the conditional density p(b | s) stays,
 
     b = b_0 + W (s - s_0) + noise of covariance C,  W = P_bs P_ss^-1,  C = P_bb - W P_sb,
 
-and s stays in the state: the reflectors in reach are there anyway, of what moves (pose, bias,
-velocity, anchors) a clone is. Putting them back gives what the whole state would have, to the
-accuracy of W, as the compressed filter of Guivant and Nebot (2001) does.
+and s stays in the state: its reflectors are there anyway, and of what changes (pose, bias,
+velocity, anchors) a clone is. Restoring b gives the estimate of the full state, to the accuracy of
+W, as the compressed filter of Guivant and Nebot (2001).
 """
 
 from __future__ import annotations
@@ -26,13 +26,12 @@ from rlml_slam.slam.front_end.joint_state import LANDMARKS, JointState
 from rlml_slam.slam.front_end.map_window import MARGIN
 from rlml_slam.types import ANONYMOUS
 
-FEW = 10  # reflectors, for which it is not worth the while
-# Parts of the variance below this are of what is known exactly, such as a clone of a clone
-SINGULAR = 1e-12
+MIN_INACTIVE = 10  # removing fewer reflectors saves less time than it takes
+SINGULAR = 1e-12  # relative eigenvalue of an exact dependence, such as a clone of a clone
 
 
-class LeftOut:
-    """The reflectors where ``away`` (m,) is true, taken out of a state; see the module."""
+class InactivePart:
+    """The reflectors where ``away`` (m,) is true, removed from a state; see the module."""
 
     def __init__(self, state: JointState, away: NDArray[np.bool_]) -> None:
         b = _rows(np.flatnonzero(away))
@@ -46,15 +45,15 @@ class LeftOut:
         state.leave_out(away)
 
     def put_back(self, state: JointState) -> None:
-        """Append them to the state, after the reflectors that it has."""
+        """Append them to the state, after its reflectors."""
         s = state.tied
         b = self._b + self._W @ (state.x[s] - self._s)
         WL = self._W @ _roots(state.P[np.ix_(s, s)])[0]
         self._C += WL @ WL.T
         state.put_back(b, state.P[:, s] @ self._W.T, self._C)
 
-    def places(self, state: JointState) -> tuple[Array, Array]:
-        """Where they are, (k, 2) and covariances (k, 2, 2), in view of what the state is now."""
+    def positions(self, state: JointState) -> tuple[Array, Array]:
+        """Positions (k, 2) and covariances (k, 2, 2), given the current state."""
         s, k = state.tied, np.arange(len(self._b) // 2)
         b = self._b + self._W @ (state.x[s] - self._s)
         C = self._C.reshape(len(k), 2, len(k), 2)[k, :, k, :]
@@ -64,43 +63,43 @@ class LeftOut:
 
 
 class InactiveLandmarks:
-    """Keeps the confirmed reflectors beyond ``reach`` [m] out of a state and its tracks."""
+    """Keeps the confirmed reflectors beyond ``max_range`` [m] out of a state and its tracks."""
 
-    def __init__(self, reach: float, min_sightings: int) -> None:
-        self._reach = reach
+    def __init__(self, max_range: float, min_sightings: int) -> None:
+        self._max_range = max_range
         self._min_sightings = min_sightings
-        self._left_out: LeftOut | None = None
+        self._part: InactivePart | None = None
         self._tracks = LandmarkTracks()
-        self._middle, self._sigma = np.full(2, np.inf), 0.0
+        self._centre, self._sigma = np.full(2, np.inf), 0.0
 
-    def follow(self, state: JointState, tracks: LandmarkTracks, ids: NDArray[np.int64]) -> None:
-        """Exchange reflectors where the pose left the middle of the part that is in the state.
+    def update(self, state: JointState, tracks: LandmarkTracks, ids: NDArray[np.int64]) -> None:
+        """Exchange reflectors if the pose is far from the centre of the part in the state.
 
-        One that tells by ``ids`` (k,) that it is seen is in reach, wherever it was believed.
+        A reflector whose id is among the detected ``ids`` (k,) is always in the state.
         """
         at, P = state.pose[:2], state.P
         sigma = math.sqrt(P[0, 0] + P[1, 1])
         out = self._tracks.ids
         seen = len(out) > 0 and bool(np.isin(out, ids[ids != ANONYMOUS]).any())
-        if np.hypot(*(at - self._middle)) + 3.0 * (sigma - self._sigma) <= MARGIN and not seen:
+        if np.hypot(*(at - self._centre)) + 3.0 * (sigma - self._sigma) <= MARGIN and not seen:
             return
-        self.gather(state, tracks)
-        self._middle, self._sigma = at, sigma
+        self.restore(state, tracks)
+        self._centre, self._sigma = at, sigma
         gap = np.hypot(*(state.landmarks() - at).T)
-        away = gap > self._reach + MARGIN + 3.0 * np.maximum(_sigmas_from(state), sigma)
+        away = gap > self._max_range + MARGIN + 3.0 * np.maximum(_sigmas_from(state), sigma)
         away &= tracks.confirmed(self._min_sightings)
         away &= (tracks.ids == ANONYMOUS) | ~np.isin(tracks.ids, ids)
-        if away.sum() > FEW:
-            self._left_out = LeftOut(state, away)
+        if away.sum() > MIN_INACTIVE:
+            self._part = InactivePart(state, away)
             self._tracks = tracks.take(away)
 
-    def everything(
+    def all_landmarks(
         self, state: JointState, tracks: LandmarkTracks
     ) -> tuple[NDArray[np.int64], Array, Array]:
-        """Keys (n,), places (n, 2) and covariances (n, 2, 2) of those in and out of the state."""
-        if self._left_out is None:
+        """Keys (n,), positions (n, 2) and covariances (n, 2, 2), inactive reflectors last."""
+        if self._part is None:
             return tracks.keys, state.landmarks(), state.landmark_covs()
-        points, covs = self._left_out.places(state)
+        points, covs = self._part.positions(state)
         return (
             np.concatenate([tracks.keys, self._tracks.keys]),
             np.concatenate([state.landmarks(), points]),
@@ -108,26 +107,26 @@ class InactiveLandmarks:
         )
 
     def all_tracks(self, tracks: LandmarkTracks) -> LandmarkTracks:
-        """The tracks of those in and out of the state, in the order of :meth:`everything`."""
+        """Tracks of all reflectors, in the order of :meth:`all_landmarks`."""
         every = replace(tracks)
         every.extend(self._tracks)
         return every
 
     def has(self, keys: NDArray[np.int64]) -> bool:
-        """Whether any of ``keys`` (k,) is out of the state."""
+        """Whether any of ``keys`` (k,) is inactive."""
         return bool(np.isin(self._tracks.keys, keys).any())
 
-    def gather(self, state: JointState, tracks: LandmarkTracks) -> None:
-        """Put all of them back."""
-        if self._left_out is not None:
-            self._left_out.put_back(state)
+    def restore(self, state: JointState, tracks: LandmarkTracks) -> None:
+        """Put all inactive reflectors back into the state."""
+        if self._part is not None:
+            self._part.put_back(state)
             tracks.extend(self._tracks)
-            self._left_out, self._tracks = None, LandmarkTracks()
-        self._middle = np.full(2, np.inf)
+            self._part, self._tracks = None, LandmarkTracks()
+        self._centre = np.full(2, np.inf)
 
 
 def _sigmas_from(state: JointState) -> Array:
-    """Sigmas (m,) [m] of where reflectors are from the pose, both directions together."""
+    """Sigmas (m,) [m] of the positions of reflectors relative to the pose, of both axes."""
     x = slice(LANDMARKS, LANDMARKS + 2 * state.num_landmarks, 2)
     y = slice(x.start + 1, x.stop, 2)
     P = state.P

@@ -144,6 +144,11 @@ class JointState:
         self.P[:3, :3] = cov
         self.P[MOVING, MOVING] = self._unknown
 
+    def take_systematic_errors(self, other: JointState) -> None:
+        """Take gyro bias and scale errors, with their covariance, of another state."""
+        self.x[SYSTEMATIC] = other.x[SYSTEMATIC]
+        self.P[SYSTEMATIC, SYSTEMATIC] = other.P[SYSTEMATIC, SYSTEMATIC]
+
     def widen(self, cov: Array) -> None:
         """Add independent uncertainty (3, 3) to the pose."""
         self.P[:3, :3] += cov

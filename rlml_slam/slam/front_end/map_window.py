@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The part of a given reflector map that is in reach: a plant has more than one scan can see.
+"""Sliding window over the reflectors of a saved map: only those in range are in the state.
 
-The cost of an update grows with the square of the reflectors in the state. Those far away are left
-out of it, and come back as the map has them.
+The cost of an update grows with the square of the number of reflectors in the state. A reflector
+that leaves the window returns with the position and covariance of the map.
 """
 
 from __future__ import annotations
@@ -13,25 +13,25 @@ from rlml_slam.estimation.landmark_tracks import LandmarkTracks
 from rlml_slam.slam.front_end.joint_state import JointState
 from rlml_slam.types import Reflectors
 
-MARGIN = 10.0  # [m] beyond reach, so that the part changes seldom
+MARGIN = 10.0  # [m] beyond the range of detections, so that the window changes rarely
 
 
 class MapWindow:
-    """Keeps the reflectors within ``reach`` [m] in a state; keys are rows of the map."""
+    """Keeps the reflectors within ``max_range`` [m] in a state; keys are rows of the map."""
 
-    def __init__(self, reflectors: Reflectors, reach: float) -> None:
+    def __init__(self, reflectors: Reflectors, max_range: float) -> None:
         self._map = reflectors
-        self._reach = reach
-        self._middle = np.full(2, np.inf)
+        self._max_range = max_range
+        self._centre = np.full(2, np.inf)
 
-    def follow(self, state: JointState, tracks: LandmarkTracks) -> None:
-        """Exchange reflectors where the pose left the middle of the part that is in the state."""
+    def update(self, state: JointState, tracks: LandmarkTracks) -> None:
+        """Exchange reflectors if the pose is far from the centre of the window."""
         at = state.pose[:2]
         sigma = float(np.sqrt(np.trace(state.pose_cov[:2, :2])))
-        if np.hypot(*(at - self._middle)) + 3.0 * sigma <= MARGIN:
+        if np.hypot(*(at - self._centre)) + 3.0 * sigma <= MARGIN:
             return
-        self._middle = at
-        near = np.hypot(*(self._map.points - at).T) < self._reach + MARGIN + 3.0 * sigma
+        self._centre = at
+        near = np.hypot(*(self._map.points - at).T) < self._max_range + MARGIN + 3.0 * sigma
         keep = near[tracks.keys]
         if not keep.all():
             state.remove_landmarks(keep)

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The reflector term: which detection is of which reflector, and what that says (e_R of eq. 2)."""
+"""The reflector term: association of detections and update with them (e_R of eq. 2)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.estimation.kidnapping_detection import consents
+from rlml_slam.estimation.kidnapping_detection import agree_with_map
 from rlml_slam.estimation.landmark_tracks import LandmarkTracks
 from rlml_slam.matching.reflectors import association
 from rlml_slam.params import Parameters
@@ -23,77 +23,92 @@ from rlml_slam.slam.landmarks.visibility import expected
 from rlml_slam.types import ANONYMOUS, Belief, Detections, Observation, Reflectors, Status
 
 NONE = np.zeros(0, dtype=np.int64)
-# as plain numbers: a member of an enumeration takes longer to be looked up than to be compared
+# as plain integers: comparing arrays with members of an enumeration is slow
 USED, GHOST = int(Status.USED), int(Status.GHOST)
 NEW, DEFERRED, AMBIGUOUS = int(Status.NEW), int(Status.DEFERRED), int(Status.AMBIGUOUS)
 
 
-class Matched:
-    """What became of each detection (k) so far in one step."""
+@dataclass(frozen=True)
+class Matches:
+    """Association of the detections (k,) of one observation.
 
-    def __init__(self, k: int) -> None:
-        self.index = np.full(k, -1, dtype=np.int64)
-        self.keys = np.full(k, -1, dtype=np.int64)
-        self.status = np.full(k, NEW, dtype=np.int64)
-        self.distance2 = np.full(k, np.nan)
+    ``index``: reflector in the state, -1 if none; ``keys``: its key; ``status``: a Status;
+    ``distance2``: squared Mahalanobis distance of the innovation, NaN if unmatched.
+    """
+
+    index: NDArray[np.int64]
+    keys: NDArray[np.int64]
+    status: NDArray[np.int64]
+    distance2: Array
 
     @classmethod
-    def none(cls, detections: Detections | None) -> Matched:
-        """Of detections of which nothing is known yet."""
-        return cls(0 if detections is None else len(detections))
+    def none(cls, k: int) -> Matches:
+        """No detection is matched yet."""
+        return cls(
+            np.full(k, -1, dtype=np.int64), np.full(k, -1, dtype=np.int64),
+            np.full(k, NEW, dtype=np.int64), np.full(k, np.nan),
+        )  # fmt: skip
 
     @property
     def num_used(self) -> int:
-        """Detections that moved the estimate."""
+        """Number of detections that updated the estimate."""
         return int(np.count_nonzero(self.status == USED))
 
     @property
-    def agrees(self) -> bool:
-        """Whether enough of them match to speak for the map."""
-        return consents(len(self.status), self.num_used)
+    def agree_with_map(self) -> bool:
+        """Whether enough detections match to confirm the map."""
+        return agree_with_map(len(self.status), self.num_used)
 
     @property
-    def open(self) -> NDArray[np.bool_]:
-        """Detections without a reflector."""
+    def unmatched(self) -> NDArray[np.bool_]:
+        """(k,): detections without a reflector."""
         return self.index < 0
+
+    def num_unmatched_ids(self, detections: Detections | None) -> int:
+        """Number of unmatched detections that have an id."""
+        if detections is None:
+            return 0
+        return int(((detections.ids != ANONYMOUS) & self.unmatched).sum())
 
 
 class ReflectorTerm:
-    """The reflectors of a joint state: ``tracks`` tells whose its landmarks are, row by row."""
+    """Reflectors of a joint state; ``tracks`` has their identities, row by row."""
 
     def __init__(self, params: Parameters, state: JointState) -> None:
         self._p = params
         self._state = state
         self.tracks = LandmarkTracks()
         self._associator = association.Associator(params.reflector)
-        self._contradiction = association.gate(params.reflector.new_gate)
+        self._gate2 = association.gate(params.reflector.new_gate)
         self._window: MapWindow | None = None
         r = params.reflector
-        self._distant = InactiveLandmarks(r.max_range, r.min_sightings)
-        self._reach = 0.0
+        self._inactive = InactiveLandmarks(r.max_range, r.min_sightings)
+        self._max_range_seen = 0.0
 
     def use_map(self, reflectors: Reflectors) -> None:
-        """Have these (map frame), and never others."""
+        """Use the reflectors of a saved map (map frame), and no others."""
         self._window = MapWindow(reflectors, self._p.reflector.max_range)
-        self._window.follow(self._state, self.tracks)
+        self._window.update(self._state, self.tracks)
 
-    def follow(self, detections: Detections | None) -> None:
-        """Only reflectors in reach are in the state."""
+    def select(self, observation: Observation) -> Matches:
+        """Keep only the reflectors in range in the state; matches of the observation: none."""
+        detections = observation.detections
         if self._window is not None:
-            self._window.follow(self._state, self.tracks)
+            self._window.update(self._state, self.tracks)
         elif self._p.node.mode == 'mapping':
             ids = NONE if detections is None else detections.ids
-            self._distant.follow(self._state, self.tracks, ids)
+            self._inactive.update(self._state, self.tracks, ids)
+        return Matches.none(0 if detections is None else len(detections))
 
-    def use(self, observation: Observation, matched: Matched) -> None:
-        """Associate what is not yet associated and update with it (e_R of eq. 2)."""
+    def update(self, observation: Observation, matches: Matches) -> Matches:
+        """Associate the unmatched detections and update the state with them (e_R of eq. 2)."""
         detections = observation.detections
-        if detections is None or not matched.open.any():
-            return
-        rows = np.flatnonzero(matched.open)
-        afresh = len(rows) == len(detections)
+        rows = np.flatnonzero(matches.unmatched)
+        if detections is None or not len(rows):
+            return matches
+        is_first = len(rows) == len(detections)
         result = self._associator.associate(
-            detections if afresh else _subset(detections, rows),
+            detections if is_first else _subset(detections, rows),
             association.Believed(
                 self._state.pose,
                 self._state.landmarks(),
@@ -103,101 +118,104 @@ class ReflectorTerm:
                 self.tracks.spread2,
             ),
         )
-        used = result.match >= 0
-        matched.status[rows] = result.status
-        if not afresh:
-            taken = used & (result.match[:, None] == matched.index).any(axis=1)
-            matched.status[rows[taken]] = AMBIGUOUS
-            used &= ~taken
-        if not used.any():
-            return
-        k, index = rows[used], result.match[used]
-        matched.index[k] = index
-        matched.distance2[k] = result.distance2[used]
-        use_reflectors(
-            self._state.x, self._state.P, index, detections.points[k], detections.cov[k],
-            self.tracks.spread2[index], matched.distance2[k], self._p.reflector.robust_scale,
+        index, status, distance2 = (
+            matches.index.copy(), matches.status.copy(), matches.distance2.copy()
         )  # fmt: skip
-        self.tracks.see(index, observation.stamp, detections.ids[k])
+        used = result.match >= 0
+        status[rows] = result.status
+        if not is_first:
+            taken = used & (result.match[:, None] == index).any(axis=1)
+            status[rows[taken]] = AMBIGUOUS
+            used &= ~taken
+        if used.any():
+            k, landmarks = rows[used], result.match[used]
+            index[k], distance2[k] = landmarks, result.distance2[used]
+            use_reflectors(
+                self._state.x, self._state.P, landmarks, detections.points[k], detections.cov[k],
+                self.tracks.spread2[landmarks], distance2[k], self._p.reflector.robust_scale,
+            )  # fmt: skip
+            self.tracks.see(landmarks, observation.stamp, detections.ids[k])
+        return Matches(index, matches.keys, status, distance2)
 
     def _recent(self, stamp: int) -> NDArray[np.bool_] | None:
-        """(m,): reflectors that were in view a moment ago; a given map needs no such care."""
+        """(m,): reflectors seen within ``track_timeout``; None in a saved map, which is fixed."""
         if self._p.node.mode != 'mapping':
             return None
         return stamp - self.tracks.last_seen < self._p.reflector.track_timeout * 1e9
 
-    def with_spread(self, observation: Observation, matched: Matched) -> Observation:
-        """The observation with what its detections' groups add to their noise; learns of groups.
+    def widen(self, observation: Observation, matches: Matches) -> Observation:
+        """Add the spread of groups to the noise of their detections; detects groups.
 
-        Where two detections at once are of one reflector, that is several which cannot be told
-        apart, and each detection is of any of them.
+        A group are several reflectors that are closer than they can be distinguished. It is one
+        reflector of the state; two detections of it at once show that it is a group.
         """
         detections = observation.detections
         if detections is None or not len(detections):
             return observation
-        seen = np.flatnonzero(matched.index >= 0)
+        seen = np.flatnonzero(matches.index >= 0)
         spread2 = np.zeros(len(detections))
-        spread2[seen] = self.tracks.spread2[matched.index[seen]]
+        spread2[seen] = self.tracks.spread2[matches.index[seen]]
         if self._p.node.mode == 'mapping' and 0 < len(seen) < len(detections):
-            double = self._associator.doubles(detections, matched.index)
+            double = self._associator.doubles(detections, matches.index)
             for k in np.flatnonzero(double >= 0):
                 gap = detections.points[k] - detections.points[double[k]]
-                self.tracks.see_double(int(matched.index[double[k]]), float(np.linalg.norm(gap)))
+                self.tracks.see_double(int(matches.index[double[k]]), float(np.linalg.norm(gap)))
         if not spread2.any():
             return observation
         cov = detections.cov + spread2[:, None, None] * np.eye(2)
         return replace(observation, detections=replace(detections, cov=cov))
 
-    def grow(self, observation: Observation, matched: Matched, doubtful: bool) -> None:
-        """New reflectors enter as candidates, candidates not seen again leave."""
+    def grow(self, observation: Observation, matches: Matches, contradicted: bool) -> Matches:
+        """Add new reflectors as candidates, drop stale candidates; matches with keys."""
         p, detections = self._p.reflector, observation.detections
+        index, keys, status = matches.index.copy(), matches.keys.copy(), matches.status.copy()
         if self._p.node.mode != 'mapping':
-            # a map that never changes has all reflectors that there are
-            matched.status[matched.status == NEW] = GHOST
-        elif detections is not None and not doubtful:
-            fresh = (matched.status == NEW) | (matched.status == DEFERRED)
-            for k in np.flatnonzero(fresh):
-                matched.index[k] = self._state.add_landmark(
-                    detections.points[k], detections.cov[k]
-                )
+            status[status == NEW] = GHOST  # a saved map does not grow
+        elif detections is not None and not contradicted:
+            for k in np.flatnonzero((status == NEW) | (status == DEFERRED)):
+                index[k] = self._state.add_landmark(detections.points[k], detections.cov[k])
                 self.tracks.append(
                     observation.stamp, int(detections.ids[k]), float(detections.diameters[k])
                 )
-        seen = matched.index >= 0
-        matched.keys[seen] = self.tracks.keys[matched.index[seen]]
+        seen = index >= 0
+        keys[seen] = self.tracks.keys[index[seen]]
         if detections is not None:
-            # what tells its id is known even where it does not fit: the back end weighs it
+            # an id is known even if the detection does not match: the back end decides
             for k in np.flatnonzero(~seen & (detections.ids != ANONYMOUS)):
                 same = np.flatnonzero(self.tracks.ids == detections.ids[k])
                 if len(same):
-                    matched.keys[k] = self.tracks.keys[same[0]]
+                    keys[k] = self.tracks.keys[same[0]]
         drop = self.tracks.stale(observation.stamp, p.min_sightings, p.candidate_timeout)
         if drop.any():
             self._state.remove_landmarks(~drop)
             self.tracks.keep(~drop)
+        return Matches(index, keys, status, matches.distance2)
 
-    def due(self, observation: Observation, matched: Matched) -> NDArray[np.bool_]:
-        """Which reflectors (m,) should have been detected; none where no one looked for them."""
-        d, m = observation.detections, len(self.tracks)
+    def expected_and_seen(self, observation: Observation, matches: Matches) -> tuple[int, int]:
+        """Number of reflectors that should be in view, and how many of these were matched."""
+        d = observation.detections
         if d is None or observation.points is None or observation.origin is None:
-            return np.zeros(m, dtype=np.bool_)
-        used = d.points[matched.status == USED]
-        if len(used):
-            self._reach = max(self._reach, float(np.hypot(used[:, 0], used[:, 1]).max()))
+            return 0, 0
+        used = matches.status == USED
+        points = d.points[used]
+        if len(points):
+            farthest = float(np.hypot(points[:, 0], points[:, 1]).max())
+            self._max_range_seen = max(self._max_range_seen, farthest)
         due: NDArray[np.bool_] = self.tracks.confirmed(self._p.reflector.min_sightings)
         due &= expected(
             self._state.pose, self._state.landmarks(), observation.points, observation.origin,
-            self._reach,
+            self._max_range_seen,
         )  # fmt: skip
-        return due
+        seen = set(self.tracks.keys[due].tolist()).intersection(matches.keys[used].tolist())
+        return int(due.sum()), len(seen)
 
     def contradicts(self, belief: Belief, T_map_local: Array) -> bool:
-        """Whether the back end's reflectors are not where the state has them.
+        """Whether the reflectors of the back end are outside the gates of those of the state.
 
-        Both come from the same detections, so a difference beyond the gate is no noise: one of
-        them linearised too early, or took one reflector for another, and it is not the graph.
+        Both have the same detections, so that a larger difference is no noise: the state
+        linearized too early, or has a wrong association, which the graph has corrected.
         """
-        keys, places, covs = self._distant.everything(self._state, self.tracks)
+        keys, places, covs = self._inactive.all_landmarks(self._state, self.tracks)
         _, mine, theirs = np.intersect1d(keys, belief.keys, return_indices=True)
         if not len(mine):
             return False
@@ -205,15 +223,15 @@ class ReflectorTerm:
         d = points - places[mine]
         spread = covs[mine]
         d2 = np.einsum('ni,ni->n', d, np.linalg.solve(spread, d[..., None])[..., 0])
-        return bool((d2 > self._contradiction).any())
+        return bool((d2 > self._gate2).any())
 
     def adopt(self, belief: Belief, T_map_local: Array, bias: Array) -> None:
-        """Go on from the back end's reflectors, and its covariance of them and of the pose.
+        """Replace reflectors and their joint covariance with the pose by those of the back end.
 
-        The local pose stays as it is; candidates that the back end does not know start anew.
-        ``bias`` (3, 3) is the covariance that an anchor begun now has of its own.
+        The local pose stays; candidates that the back end does not have are dropped. ``bias``
+        (3, 3) is the covariance of the error of a submap that starts now.
         """
-        self._distant.gather(self._state, self.tracks)
+        self._inactive.restore(self._state, self.tracks)
         self.tracks.rename(belief.aliases)
         _, mine, theirs = np.intersect1d(self.tracks.keys, belief.keys, return_indices=True)
         keep = np.zeros(len(self.tracks), dtype=np.bool_)
@@ -231,20 +249,20 @@ class ReflectorTerm:
         self._state.replace(se2.transform(inverse, belief.points[order]), cov, bias)
 
     def forget(self, keys: Iterable[int]) -> None:
-        """Drop reflectors that the back end knows to be gone."""
-        gone = np.array(list(keys), dtype=np.int64)
-        if self._distant.has(gone):
-            self._distant.gather(self._state, self.tracks)
-        keep = ~np.isin(self.tracks.keys, gone)
+        """Drop reflectors that the back end has removed."""
+        removed = np.array(list(keys), dtype=np.int64)
+        if self._inactive.has(removed):
+            self._inactive.restore(self._state, self.tracks)
+        keep = ~np.isin(self.tracks.keys, removed)
         if not keep.all():
             self._state.remove_landmarks(keep)
             self.tracks.keep(keep)
 
     def confirmed(self, T_map_local: Array) -> Reflectors:
         """The confirmed reflectors in the map frame."""
-        # those out of the state come after those in it, as in everything()
-        tracks = self._distant.all_tracks(self.tracks)
-        _, places, covs = self._distant.everything(self._state, self.tracks)
+        # inactive reflectors come after those of the state, as in all_landmarks()
+        tracks = self._inactive.all_tracks(self.tracks)
+        _, places, covs = self._inactive.all_landmarks(self._state, self.tracks)
         keep = tracks.confirmed(self._p.reflector.min_sightings)
         R = se2.rotation(T_map_local[2])
         return Reflectors(

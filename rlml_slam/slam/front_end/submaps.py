@@ -14,8 +14,9 @@ from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.se2 import Array
 from rlml_slam.slam.front_end.joint_state import JointState
 
-# Walls run along and across the way that robots drive: a grid turned against them spreads its
-# rounding over a wall, where one along them would shift the whole wall by up to half a cell.
+# [rad] Walls are mostly parallel or normal to the route of a robot. A grid that is rotated against
+# them has a rounding error that averages out along a wall; that of a parallel grid would shift the
+# whole wall by up to half a cell.
 GRID_TURN = 0.53
 
 Placed: TypeAlias = tuple[Array, Array]  # end points and sensor origin in the submap's frame
@@ -27,7 +28,7 @@ class Submaps:
     def __init__(self, parameters: params.Submap) -> None:
         self._p = parameters
         self._maps: list[Submap] = []
-        self._open: list[list[Placed]] = []  # of each submap, scans that are still to be carved
+        self._pending: list[list[Placed]] = []  # of each submap, scans that are not carved yet
         self._last: Array | None = None
         self.bias = np.zeros((3, 3))
         self.bias[[0, 1, 2], [0, 1, 2]] = parameters.bias_variance
@@ -41,9 +42,9 @@ class Submaps:
         return self._maps[0]
 
     def insert(self, state: JointState, points: Array, origin: Array) -> bool:
-        """Insert end points and sensor origin (base frame) where the robot has moved enough.
+        """Insert end points and sensor origin (base frame) if the robot has moved enough.
 
-        The grids change by the next :meth:`settle`, and before anyone looks at them.
+        The grids change at the next :meth:`settle`, or before they are read.
         """
         pose = state.pose
         if self._last is not None:
@@ -56,46 +57,46 @@ class Submaps:
         self._last = pose
         self._turn_over(state)
         points = voxel_filter.thin(points, self._p.resolution, self._p.max_points)
-        for slot, scans in enumerate(self._open):
+        for slot, scans in enumerate(self._pending):
             T = se2.between(state.anchor(slot), pose)
             scans.append((se2.transform(T, points), se2.transform(T, origin[None])[0]))
         return True
 
-    def forget(self) -> None:
-        """Begin anew with the next scan."""
-        self._maps, self._open, self._last = [], [], None
+    def start_again(self) -> None:
+        """Drop all submaps; the next scan starts a new one."""
+        self._maps, self._pending, self._last = [], [], None
 
     def settle(self) -> None:
-        """Carve the scan that was inserted last: this takes longest, and no pose needs it.
+        """Carve the scan that was inserted last: it takes longest, and no pose needs it at once.
 
-        The newer submap is not looked at yet: it may be a scan behind, so that both have their
-        turns on different frames where not every frame is inserted.
+        The newer submap is not read yet and may be one scan behind, so that the two are carved
+        in different frames if not every frame is inserted.
         """
-        due = bool(self._open and self._open[0])
-        for slot in range(len(self._open)):
+        due = bool(self._pending and self._pending[0])
+        for slot in range(len(self._pending)):
             self._carve(slot, keep=int(due and slot > 0))
 
     def _carve(self, slot: int, keep: int = 0) -> None:
-        """Carve the scans of a submap but the newest ``keep``."""
-        scans = self._open[slot]
+        """Carve all pending scans of a submap except the newest ``keep``."""
+        scans = self._pending[slot]
         while len(scans) > keep:
             self._maps[slot].insert(*scans.pop(0))
 
     def _turn_over(self, state: JointState) -> None:
-        """Retire a full submap, begin the next one at half of it."""
+        """Retire a full submap; start the next one when it is half full."""
         if len(self._maps) > 1 and self._inserted(0) >= self._p.insertions:
-            del self._maps[0], self._open[0]
+            del self._maps[0], self._pending[0]
             state.move_anchor(1, 0)
         if not self._maps or (
             len(self._maps) == 1 and self._inserted(0) >= self._p.insertions // 2
         ):
             state.clone_pose(len(self._maps), GRID_TURN, self.bias)
             self._maps.append(Submap(self._p))
-            self._open.append([])
+            self._pending.append([])
 
     def _inserted(self, slot: int) -> int:
-        """Scans of a submap, carved or not."""
-        return self._maps[slot].insertions + len(self._open[slot])
+        """Number of scans of a submap, carved or pending."""
+        return self._maps[slot].insertions + len(self._pending[slot])
 
     def cells(self) -> int:
         """Allocated grid cells, for the memory report."""

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from scipy.stats import chi2
 
 from rlml_slam import se2
-from rlml_slam.estimation.correction import either, turned
+from rlml_slam.estimation.correction import either
 from rlml_slam.graph.batch.marginals import Marginals
 from rlml_slam.graph.batch.solver import optimize
 from rlml_slam.graph.model.factors import relative_information
@@ -74,7 +74,7 @@ def closure(graph, number, i, j, delta, cov):
 def test_way_driven_is_known_as_the_front_end_knows_it():
     way = PathCovariance()
     for key in chain(STEPS):
-        assert_allclose(turned(way.cov(key), key.T_local[2]), key.cov_local, atol=1e-15)
+        assert_allclose(se2.rotate_cov(way.cov(key), key.T_local[2]), key.cov_local, atol=1e-15)
 
 
 def test_other_end_of_a_closure_is_known_as_a_graph_of_the_closure_alone_knows_it():
@@ -91,7 +91,7 @@ def test_other_end_of_a_closure_is_known_as_a_graph_of_the_closure_alone_knows_i
             ClosureRecords([closure(graph, 0, 0, 1, delta, cov)]), [i, j], graph.edges
         )
         expected = Marginals(graph).poses([1])[0]
-        assert_allclose(turned(way.cov(j), j.T_local[2]), expected, rtol=1e-6, atol=1e-12)
+        assert_allclose(se2.rotate_cov(way.cov(j), j.T_local[2]), expected, rtol=1e-6, atol=1e-12)
 
 
 def test_nothing_gets_less_sure_by_a_closure_and_what_was_driven_before_it_gets_surer():
@@ -218,7 +218,7 @@ def test_wheels_that_err_for_long_are_in_the_covariance_after_a_loop(honest):
         cov = Marginals(graph).poses([len(steps)])[0]
         if honest:
             way.add_closures(ClosureRecords([found]), keys, graph.edges)
-            cov = either(cov, turned(way.cov(keys[-1]), graph.poses[-1, 2]))
+            cov = either(cov, se2.rotate_cov(way.cov(keys[-1]), graph.poses[-1, 2]))
         e = graph.poses[-1] - poses[-1]
         e[2] = se2.wrap(e[2])
         nees.append(e @ np.linalg.solve(cov, e))

@@ -11,7 +11,11 @@ from made_worlds import TinyWorld, drive, errors, observations, within
 from rlml_slam.estimation.landmark_tracks import LandmarkTracks
 from rlml_slam.params import Parameters, Reflector
 from rlml_slam.slam.front_end.front_end import FrontEnd
-from rlml_slam.slam.front_end.inactive_landmarks import FEW, InactiveLandmarks, LeftOut
+from rlml_slam.slam.front_end.inactive_landmarks import (
+    MIN_INACTIVE,
+    InactiveLandmarks,
+    InactivePart,
+)
 from rlml_slam.slam.front_end.joint_state import LANDMARKS, JointState
 from rlml_slam.slam.front_end.map_window import MARGIN
 from rlml_slam.slam.front_end.reflector_update import use_reflectors
@@ -45,7 +49,7 @@ def test_state_is_what_it_would_be_with_all_of_them_in_it(seed, same):
     away = np.zeros(9, dtype=np.bool_)
     away[[1, 4, 5, 8]] = True
     part = copy.deepcopy(whole)
-    out = LeftOut(part, away)
+    out = InactivePart(part, away)
     assert part.num_landmarks == 5
     near = np.flatnonzero(~away)
     live(whole, near, np.random.default_rng(seed))
@@ -55,7 +59,7 @@ def test_state_is_what_it_would_be_with_all_of_them_in_it(seed, same):
     first[[0, 10]] = later[[0, 6]] = False
     whole.remove_landmarks(first)
     part.remove_landmarks(later)
-    points, covs = out.places(part)
+    points, covs = out.positions(part)
     out.put_back(part)
     # in the whole state, those away stand between: after the first one, at 0, 3, 4 and 7
     order = np.r_[1, 2, 5, 6, np.arange(8, whole.num_landmarks), 0, 3, 4, 7]
@@ -69,7 +73,7 @@ def test_state_is_what_it_would_be_with_all_of_them_in_it(seed, same):
 
 def test_state_that_leaves_them_out_does_not_grow_by_those_that_come_and_go():
     state = made(0, landmarks=9)
-    LeftOut(state, np.arange(9) > 4)
+    InactivePart(state, np.arange(9) > 4)
     size = len(state.x)
     for _ in range(50):
         state.add_landmark(np.ones(2), np.eye(2))
@@ -93,35 +97,35 @@ def test_only_what_is_in_reach_is_in_the_state():
     distant = InactiveLandmarks(20.0, 3)
     for x in np.arange(0.0, 400.0, 4.0):
         state.x[0] = x
-        distant.follow(state, tracks, NOBODY)
+        distant.update(state, tracks, NOBODY)
         assert state.num_landmarks == len(tracks) < 2 * (20.0 + 2.0 * MARGIN) / 2.0 + 2
         assert set(np.flatnonzero(np.abs(points[:, 0] - x) < 19.0)) <= set(tracks.keys.tolist())
         np.testing.assert_allclose(state.landmarks(), points[tracks.keys], atol=1e-9)
-        keys, places, covs = distant.everything(state, tracks)
+        keys, places, covs = distant.all_landmarks(state, tracks)
         assert sorted(keys.tolist()) == list(range(200))
         np.testing.assert_allclose(places, points[keys], atol=1e-9)
         np.testing.assert_allclose(covs, np.tile(1e-4 * np.eye(2), (200, 1, 1)), atol=1e-9)
-    distant.gather(state, tracks)
+    distant.restore(state, tracks)
     assert len(tracks) == state.num_landmarks == 200
 
 
 def test_candidates_and_few_reflectors_stay():
     state, tracks, _ = aisle(400.0)
     tracks.sightings[150:] = 1
-    InactiveLandmarks(20.0, 3).follow(state, tracks, NOBODY)
+    InactiveLandmarks(20.0, 3).update(state, tracks, NOBODY)
     assert set(range(150, 200)) <= set(tracks.keys.tolist())
     near = int((20.0 + MARGIN) / 2.0)
-    state, tracks, _ = aisle(2.0 * (near + FEW))
-    InactiveLandmarks(20.0, 3).follow(state, tracks, NOBODY)
-    assert len(tracks) == near + FEW
+    state, tracks, _ = aisle(2.0 * (near + MIN_INACTIVE))
+    InactiveLandmarks(20.0, 3).update(state, tracks, NOBODY)
+    assert len(tracks) == near + MIN_INACTIVE
 
 
 def test_reflector_that_tells_its_id_is_in_reach_wherever_it_was_believed():
     state, tracks, _ = aisle(400.0)
     distant = InactiveLandmarks(20.0, 3)
-    distant.follow(state, tracks, np.array([ANONYMOUS]))
+    distant.update(state, tracks, np.array([ANONYMOUS]))
     assert 190 not in tracks.ids
-    distant.follow(state, tracks, np.array([ANONYMOUS, 190]))
+    distant.update(state, tracks, np.array([ANONYMOUS, 190]))
     assert 190 in tracks.ids
     assert len(tracks) < 30
 
@@ -158,7 +162,7 @@ def test_drive_is_the_same_with_and_without_those_out_of_reach():
 def test_reflector_that_may_be_in_reach_stays():
     state, tracks, points = aisle(400.0)
     state.P[LANDMARKS + 2 * 60, LANDMARKS + 2 * 60] = 40.0**2
-    InactiveLandmarks(20.0, 3).follow(state, tracks, NOBODY)
+    InactiveLandmarks(20.0, 3).update(state, tracks, NOBODY)
     assert points[60, 0] > 2.0 * (20.0 + MARGIN)
     assert 60 in tracks.keys
     assert 61 not in tracks.keys

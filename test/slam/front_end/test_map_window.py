@@ -33,7 +33,7 @@ def test_state_has_what_is_in_reach_as_the_map_has_it():
     state, tracks, window = at(0.0), LandmarkTracks(), MapWindow(MAP, REACH)
     for x in np.arange(0.0, 290.0, 3.0):
         state.x[0] = x
-        window.follow(state, tracks)
+        window.update(state, tracks)
         near = np.flatnonzero(np.abs(AISLE[:, 0] - x) < REACH)
         assert set(near) <= set(tracks.keys.tolist())
         assert len(tracks) < 2 * (REACH + 2 * MARGIN) / 2.5 + 4
@@ -45,13 +45,13 @@ def test_state_has_what_is_in_reach_as_the_map_has_it():
 
 def test_what_stays_in_reach_keeps_what_is_known_of_it():
     state, tracks, window = at(100.0), LandmarkTracks(), MapWindow(MAP, REACH)
-    window.follow(state, tracks)
+    window.update(state, tracks)
     index = int(np.argmin(np.abs(AISLE[tracks.keys, 0] - 106.0)))
     key = tracks.keys[index]
     state.apply(LANDMARKS + 2 * index + np.arange(2), np.eye(2), 1e-6 * np.eye(2), np.ones(2))
     told = state.landmark_covs()[index].copy()
     state.x[0] = 100.0 + 1.5 * MARGIN
-    window.follow(state, tracks)
+    window.update(state, tracks)
     (now,) = np.flatnonzero(tracks.keys == key)
     np.testing.assert_allclose(state.landmark_covs()[now], told)
     assert told[0, 0] < 1e-5
@@ -59,10 +59,10 @@ def test_what_stays_in_reach_keeps_what_is_known_of_it():
 
 def test_nothing_changes_while_the_pose_stays_near(monkeypatch):
     state, tracks, window = at(100.0), LandmarkTracks(), MapWindow(MAP, REACH)
-    window.follow(state, tracks)
+    window.update(state, tracks)
     monkeypatch.setattr(map_window.np, 'setdiff1d', None)
     state.x[0] += 0.9 * MARGIN
-    window.follow(state, tracks)
+    window.update(state, tracks)
 
 
 @pytest.mark.parametrize('reach', [REACH, 1000.0])

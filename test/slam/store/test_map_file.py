@@ -11,7 +11,6 @@ from rlml_slam import se2
 from rlml_slam.cli.main import main
 from rlml_slam.cli.map import map_export, map_info
 from rlml_slam.errors import FileFormatError, MapError
-from rlml_slam.estimation.correction import turned
 from rlml_slam.graph.batch.solver import optimize
 from rlml_slam.maps import map_container
 from rlml_slam.maps.map_container import Content
@@ -96,7 +95,7 @@ def test_a_jump_is_one_in_the_saved_map_as_well(saved):
     keys = again.keyframes
     before, after = (again.path_covariance.cov(keys[k]) for k in (5, 6))
     assert_allclose(before, without.path_covariance.cov(keys[5]), atol=1e-15)
-    assert_allclose(after, turned(keys[6].cov_local, -keys[6].T_local[2]), atol=1e-12)
+    assert_allclose(after, se2.rotate_cov(keys[6].cov_local, -keys[6].T_local[2]), atol=1e-12)
     assert again.path_covariance.newest == keys[6].stamp
 
 

@@ -6,7 +6,7 @@ from made_worlds import SECOND, STEP
 from rlml_slam import se2
 from rlml_slam.params import MotionNoise
 from rlml_slam.slam.front_end.joint_state import WHEELS, JointState
-from rlml_slam.slam.front_end.odometry_scale import went_on
+from rlml_slam.slam.front_end.motion_term import expected_motion
 from rlml_slam.types import Motion
 
 NOISE = MotionNoise()
@@ -36,7 +36,7 @@ def drive(rng, shares, steps, turning=0.6):
         by_turn = tells[1] * np.array([-0.5 * delta[1], 0.5 * delta[0], 1.0])
         before = state.pose
         motion = Motion(delta, cov, turn_gain=by_turn)
-        state.predict(motion, 0.0, kept, went_on(velocity, DT, NOISE))
+        state.predict(motion, 0.0, kept, expected_motion(velocity, DT, NOISE))
         z = pose + SIGMA * rng.standard_normal(3)
         error = z - state.pose
         error[2] = se2.wrapped(error[2])
@@ -78,6 +78,6 @@ def test_noise_of_the_wheels_is_not_taken_for_a_share():
 
 def test_what_may_be_no_way_at_all_tells_nothing():
     """After a jump of the pose its velocity is none; unseen, a robot may have braked."""
-    assert went_on(np.array([1.0, 0.0, 0.1]), 0.5, NOISE).all()
+    assert expected_motion(np.array([1.0, 0.0, 0.1]), 0.5, NOISE).all()
     for velocity, dt in (((1.0, 0.0, 0.1), 5.0), ((50.0, 0.0, 0.1), 0.5), ((1.0, 0.0, 50.0), 0.5)):
-        assert not went_on(np.array(velocity), dt, NOISE).any()
+        assert not expected_motion(np.array(velocity), dt, NOISE).any()

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Prediction of the joint state: odometry and IMU (e_o of eq. 2), or constant velocity.
+
+Scale errors of the wheels. The joint state has the scale errors of speed and turn. Their effect
+is proportional to the true motion. The measured motion must not replace it in the derivatives:
+its noise would bias the estimate towards zero by noise^2 / motion^2 (errors in variables). The
+motion estimated just before has about the same size and independent noise, so it serves as the
+instrument of instrumental variables (Reiersøl 1941). A motion below the noise floor carries no
+information about the scale.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from rlml_slam import se2
+from rlml_slam.params import MotionNoise
+from rlml_slam.se2 import Array
+from rlml_slam.slam.front_end.constant_velocity import ConstantVelocity
+from rlml_slam.slam.front_end.joint_state import STANDING, JointState
+from rlml_slam.types import Observation
+
+FRESH = 1.0  # [s] for which a velocity is assumed to last: a robot takes about as long to stop
+# [ns] shortest time over which a velocity is computed. Scans that arrive in a burst are too close:
+# a pose error of 2 mm would be 0.4 m/s over 5 ms, and is .04 m/s over this time.
+MIN_INTERVAL = 50_000_000
+
+
+class MotionTerm:
+    """Moves the joint state from one observation to the next; has the newest velocity.
+
+    ``stamp`` [ns] is that of the newest observation, None before the first. ``has_odometry``: at
+    least one observation had odometry. ``is_constant_velocity``: the last prediction was made
+    by the constant-velocity model. ``velocity`` (3,) [m/s, m/s, rad/s] is that of the base.
+    """
+
+    def __init__(self, params: MotionNoise) -> None:
+        self._p = params
+        self._constant_velocity = ConstantVelocity(params)
+        self.stamp: int | None = None
+        self.has_odometry = self.is_constant_velocity = False
+        self.forget_velocity()
+
+    def forget_velocity(self) -> None:
+        """Start again with velocity 0: the pose was moved."""
+        self.velocity = np.zeros(3)
+        self._since: tuple[int, Array] | None = None  # stamp and pose of the last velocity
+
+    def predict(self, state: JointState, observation: Observation) -> None:
+        """Move the pose to the stamp of the observation (eq. 5 to 9)."""
+        last, self.stamp = self.stamp, observation.stamp
+        self.has_odometry |= observation.odom_pose is not None
+        self.is_constant_velocity = not self.has_odometry and last is not None
+        dt = 0.0 if last is None else (observation.stamp - last) * 1e-9
+        p, motion = self._p, observation.motion
+        if self.is_constant_velocity:
+            self._constant_velocity.predict(state, dt, motion)
+            return
+        expected = expected_motion(self.velocity, dt, p) if motion.known else STANDING
+        kept = math.exp(-dt / p.scale_error_time)
+        state.predict(motion, p.imu_bias_walk**2 * dt, kept, expected)
+
+    def corrected(self, state: JointState, observation: Observation) -> Observation:
+        """The observation with its motion as estimated now; measures the velocity."""
+        self._measure_velocity(observation.stamp, state.pose)
+        if self.is_constant_velocity:
+            motion = self._constant_velocity.estimated(state, observation.motion)
+        else:
+            motion = state.corrected(observation.motion)
+        return replace(observation, motion=motion)
+
+    def _measure_velocity(self, stamp: int, pose: Array) -> None:
+        if self._since is None:
+            self._since = (stamp, pose)
+        elif stamp - self._since[0] >= MIN_INTERVAL:
+            dt = (stamp - self._since[0]) * 1e-9
+            self.velocity = se2.log(se2.between(self._since[1], pose)) / dt
+            self._since = (stamp, pose)
+
+    def stamp_error_cov(self, heading: float, sigma: float) -> Array:
+        """Covariance (3, 3), local axes, of the motion during the error ``sigma`` [s] of a stamp.
+
+        It is added to what is published only: the errors of two successive stamps are nearly the
+        same, so that the map and the next pose do not have it.
+        """
+        if sigma == 0.0:
+            return np.zeros((3, 3))
+        moved = se2.rotation3(heading) @ self.velocity * sigma
+        return np.outer(moved, moved)
+
+
+def expected_motion(velocity: Array, dt: float, noise: MotionNoise) -> Array:
+    """Distance and turn (2,) [m, rad] in ``dt`` [s] at a velocity (3,), less the noise floors.
+
+    Zeros if the velocity is too old, or faster than the robot can be because the pose was
+    corrected. The measured motion must not bound it, or its noise would enter again.
+    """
+    v, w = float(velocity[0]), float(velocity[2])
+    if dt > FRESH or abs(v) > noise.max_speed or abs(w) > noise.max_turn_rate:
+        return np.zeros(2)
+    return np.array(
+        [
+            dt * math.copysign(max(abs(v) - noise.speed_noise_floor, 0.0), v),
+            dt * math.copysign(max(abs(w) - noise.turn_noise_floor, 0.0), w),
+        ]
+    )
