@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+import pytest
+
+from rlml_slam.errors import InputError
+from rlml_slam.motion import SECOND
+from rlml_slam.sensing.synchronization.input_counts import InputCounts
+from rlml_slam.sensing.synchronization.stamp_check import CONFIRM, PERSISTENT, StampCheck
+from rlml_slam.types import Imu
+
+T0 = 10 * SECOND
+STEP = SECOND // 50
+
+
+def running(count=20):
+    """A check that has accepted ``count`` stamps of odometry."""
+    stamps = StampCheck(InputCounts())
+    for k in range(count):
+        assert stamps.accept('odom', T0 + k * STEP, stamps.newest_of('odom'))
+    return stamps, T0 + (count - 1) * STEP
+
+
+def test_newest_stamp_of_all_streams_and_of_each():
+    stamps, newest = running()
+    assert stamps.accept('imu', newest - STEP, None)
+    assert (stamps.newest, stamps.newest_of('imu')) == (newest, newest - STEP)
+    assert stamps.newest_of('scan') is None
+    assert stamps.first == T0
+
+
+def test_stamp_that_is_not_after_the_limit_is_late():
+    stamps, newest = running()
+    assert not stamps.accept('odom', newest, newest)
+    assert stamps._inputs.totals() == {'odom': {'late': 1}}
+
+
+def test_newest_stamp_of_a_source_is_a_duplicate():
+    stamps, newest = running()
+    assert stamps.accept('scan', newest, None, 'front')
+    assert stamps.is_duplicate('scan', newest, 'front')
+    assert not stamps.is_duplicate('scan', newest, 'rear')
+
+
+def test_message_far_ahead_is_held_and_rejected_if_the_others_go_on():
+    stamps, newest = running()
+    assert stamps.holds('imu', Imu(newest + 100 * SECOND, 0.0))
+    assert list(stamps.release_held(CONFIRM)) == []
+    for k in range(CONFIRM):
+        message = Imu(newest + (k + 1) * STEP, 0.0)
+        assert not stamps.holds('odom', message)
+        assert stamps.accept('odom', message.stamp, stamps.newest_of('odom'))
+    assert list(stamps.release_held(CONFIRM)) == []
+    assert not stamps.has_held
+    assert stamps._inputs.totals() == {'imu': {'future': 1}}
+
+
+def test_messages_far_ahead_are_accepted_if_more_follow():
+    stamps, newest = running()
+    ahead = [Imu(newest + 100 * SECOND + k * STEP, 0.0) for k in range(CONFIRM)]
+    assert all(stamps.holds('imu', message) for message in ahead)
+    assert [m for _, m in stamps.release_held(CONFIRM)] == ahead
+    assert not stamps.holds('imu', Imu(ahead[-1].stamp + STEP, 0.0))
+
+
+def test_stamps_that_stay_behind_show_that_the_newest_was_wrong():
+    stamps, newest = running()
+    assert stamps.accept('imu', newest + 60 * SECOND, None)
+    found = [stamps.wrong_after('odom', newest + k, None) for k in range(PERSISTENT)]
+    assert found[:-1] == [None] * (PERSISTENT - 1)
+    stamps.forget_after(found[-1])
+    assert stamps.newest == newest
+    assert stamps._inputs.totals() == {'imu': {'future': 1}}
+
+
+def test_clock_that_was_set_back_is_an_error():
+    stamps, newest = running()
+    for _ in range(PERSISTENT - 1):
+        assert stamps.wrong_after('odom', newest - 10 * SECOND, newest) is None
+    with pytest.raises(InputError, match=r'the clock of odom jumped back by 10\.0 s'):
+        stamps.wrong_after('odom', newest - 10 * SECOND, newest)
