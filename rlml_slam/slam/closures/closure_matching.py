@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -60,6 +61,14 @@ class Match:
         )  # fmt: skip
 
 
+class SearchResult(NamedTuple):
+    """Result for a candidate, and the poses (n, 3) of the grid frame that fit equally well."""
+
+    candidate: Candidate
+    result: Match | Closure
+    poses: Array
+
+
 class ClosureMatcher:
     """Searches and verifies matches; caches the search pyramids of the latest submaps."""
 
@@ -67,13 +76,14 @@ class ClosureMatcher:
         self._p = params
         self._pyramids: OrderedDict[KeyframeSubmap, branch_and_bound.Pyramid] = OrderedDict()
 
-    def match(self, candidate: Candidate, key: Keyframe, points: Array) -> Match | Closure:
+    def match(self, candidate: Candidate, key: Keyframe, points: Array) -> SearchResult:
         """Match ``points`` (n, 2) of a keyframe; a Closure as record of a rejected match."""
         p, m, guess = self._p.loop_closure, candidate.m, candidate.guess
         i, j = m.anchor.index, key.index
 
-        def rejected(why: str, score: float = 0.0) -> Closure:
-            return Closure(i, j, guess, score, -1, why)
+        def rejected(why: str, score: float = 0.0, *poses: Array) -> SearchResult:
+            closure = Closure(i, j, guess, score, -1, why)
+            return SearchResult(candidate, closure, np.array(poses).reshape(-1, 3))
 
         result = branch_and_bound.wide(
             self._pyramid(m), points, guess, candidate.window, candidate.angle, p.min_score,
@@ -85,7 +95,7 @@ class ClosureMatcher:
             result.second is not None
             and result.second.score > p.ambiguity_ratio * result.best.score
         ):
-            return rejected(AMBIGUOUS, result.best.score)
+            return rejected(AMBIGUOUS, result.best.score, result.best.pose, result.second.pose)
         prior = np.diag(1.0 / SEARCH_SIGMA**2)
         found = match(
             m.submap, points, result.best.pose, prior, self._p.scan_match, searched=False
@@ -96,16 +106,17 @@ class ClosureMatcher:
             m.submap, points, found.pose, self._p.scan_match
         )
         if _largest_variance(information) > MAX_SIGMA**2:
-            return rejected(DEGENERATE, found.score)
+            return rejected(DEGENERATE, found.score, found.pose)
         term = linearize(m.submap, points, found.pose)
         second = math.nan if result.second is None else result.second.score / result.best.score
         overlap = term.inliers / max(term.count, 1)
         assert key.origin is not None
         view_range = float(np.median(np.hypot(*(points - key.origin).T)))
-        return Match(
+        fit = Match(
             m, key, found.pose, information, found.score, overlap, second, candidate.search_area,
             view_range=view_range,
         )  # fmt: skip
+        return SearchResult(candidate, fit, found.pose[None])
 
     def _pyramid(self, m: KeyframeSubmap) -> branch_and_bound.Pyramid:
         if m not in self._pyramids:

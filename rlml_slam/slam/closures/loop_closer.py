@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loop closing: search, verification and monitoring of closures, behind one class.
 
-A closure that the scan match proposes passes three checks, each in a file of its own:
+A closure that the scan match proposes passes four checks, each in a file of its own:
 
 1. verification of the match: score, ambiguity ratio, degeneracy (closure_matching.py);
-2. consistency with the graph, alone or with other closures (closure_consistency.py);
-3. monitoring after each solve: inconsistent ones are disabled (closure_monitor.py).
+2. no better placed match in another submap (closure_ambiguity.py);
+3. consistency with the graph, alone or with other closures (closure_consistency.py);
+4. monitoring after each solve: inconsistent ones are disabled (closure_monitor.py).
 
 In the graph it has a robust loss besides. Rejected closures are recorded, those that lack support
 stay pending.
@@ -28,6 +29,7 @@ from rlml_slam.graph.robust.inlier_evidence import uniform
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
+from rlml_slam.slam.closures.closure_ambiguity import reject_ambiguous
 from rlml_slam.slam.closures.closure_candidates import Candidate, candidates
 from rlml_slam.slam.closures.closure_consistency import is_consistent
 from rlml_slam.slam.closures.closure_matching import UNDECIDED, ClosureMatcher, Match
@@ -86,7 +88,9 @@ class LoopCloser:
     ) -> tuple[Closure, ...]:
         """Closures of a keyframe with ``points`` (n, 2) and the finished ``submaps`` near it."""
         near = candidates(self._graph, key, submaps, self._p.loop_closure)
-        return self._add([self._matcher.match(candidate, key, points) for candidate in near])
+        results = [self._matcher.match(candidate, key, points) for candidate in near]
+        ratio = self._p.loop_closure.ambiguity_ratio
+        return self._add(reject_ambiguous(self._graph, key, points, results, ratio))
 
     def confirm(
         self, proposed: ConstellationMatch, points: Array | None, submaps: Sequence[KeyframeSubmap]
@@ -129,7 +133,7 @@ class LoopCloser:
         m = old[int(np.argmin(gaps))]
         grid = m.grid_pose(poses)
         candidate = Candidate(m, se2.between(grid, T_map_key), *CONFIRMATION_WINDOW)
-        found = self._matcher.match(candidate, key, points)
+        found = self._matcher.match(candidate, key, points).result
         if isinstance(found, Closure):
             if found.why in UNDECIDED:
                 return result

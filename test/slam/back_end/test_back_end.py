@@ -447,7 +447,7 @@ def test_loop_is_closed_only_by_a_scan_that_holds_its_place(open_):
     m.submap.complete()
     (candidate,) = candidates(graph, keys[1], [m], LoopClosure())
     seen = se2.transform(se2.inverse(pose), walls)
-    found = ClosureMatcher(Parameters()).match(candidate, keys[1], seen)
+    found = ClosureMatcher(Parameters()).match(candidate, keys[1], seen).result
     if open_:
         assert found.why == 'the scan does not constrain one direction'
     else:
