@@ -21,7 +21,7 @@ def mahalanobis2(nu: Array, S: Array) -> Array:
 
 
 def compatible_ids(a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """(k, m): may be one landmark as far as identities tell."""
+    """(k, m): ids are equal, or one of them is anonymous."""
     x, y = a[:, None], b[None, :]
     out: NDArray[np.bool_] = (x == y) | (x == ANONYMOUS) | (y == ANONYMOUS)
     return out

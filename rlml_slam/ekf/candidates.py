@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Landmarks that have not been seen often enough, held relative to the robot.
+"""Candidates: landmarks that have not been seen often enough, relative to the robot.
 
-A candidate is moved with the odometry and compared with detections in the robot's frame, so its
-gate holds the measurements' noise and the motion since, and none of the robot's error in the map.
-It enters the state with its last measurement alone, whose noise the filter has not seen yet.
+A candidate is moved with the odometry and compared with detections in the robot's frame, so that
+its covariance contains the noise of measurements and motion, but not the error of the pose. It
+enters the state with its last measurement alone, which the filter has not used yet.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ class Candidates:
     def see(
         self, stamp: int, z: Array, R: Array, ids: NDArray[np.int64], gate: float
     ) -> NDArray[np.int64]:
-        """Sightings (k,) so far of the candidates that detections (k) belong to, these included.
+        """Number (k,) of sightings of the candidate of each detection, these included.
 
-        A detection that belongs to none begins one.
+        A detection without a candidate starts one.
         """
         nu = self._model.innovation(z[:, None], self.z[None])
         d2 = mahalanobis2(nu, R[:, None] + self.cov[None])
@@ -61,8 +61,8 @@ class Candidates:
             self.cov[c] -= K @ self.cov[c]
             self.sightings[c] += 1
             self.last_seen[c] = stamp
-            told = ids[seen] != ANONYMOUS
-            self.ids[c[told]] = ids[seen][told]
+            has_id = ids[seen] != ANONYMOUS
+            self.ids[c[has_id]] = ids[seen][has_id]
             out[seen] = self.sightings[c]
         new = match < 0
         k = int(new.sum())
@@ -74,7 +74,7 @@ class Candidates:
         return out
 
     def drop(self, now: int, sightings: int, timeout: float, sigma: float) -> None:
-        """Forget what has become a landmark, was not seen for long, or is anywhere by now."""
+        """Drop those that became landmarks, timed out, or have a large covariance."""
         J = self._model.place(_ORIGIN, self.z)[2]
         area = J @ self.cov @ J.transpose(0, 2, 1)
         sure = area[:, 0, 0] + area[:, 1, 1] <= 2.0 * sigma**2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The note's processing steps for each observation: predict, associate, update, augment."""
+"""EKF-SLAM steps for each observation: predict, associate, update, augment."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.ekf.branch import Branch, Look, Looked
+from rlml_slam.ekf.branch import Associations, Branch, MeasuredFrame
 from rlml_slam.ekf.extraction import Measured, measure
 from rlml_slam.ekf.filter import Filter
-from rlml_slam.ekf.likelihood import ALIKE
+from rlml_slam.ekf.likelihood import DECORRELATION
 from rlml_slam.ekf.matching import Matcher
 from rlml_slam.estimation.health import HealthInputs, HealthMonitor, ScanEvidence
 from rlml_slam.estimation.kidnapping_detection import agree_with_map
@@ -33,18 +33,18 @@ from rlml_slam.slam.landmarks.delayed_association import SLIP2
 from rlml_slam.types import Frame, Observation, Reflectors, Status
 
 MAX_BRANCHES = 32
-WORK = 64  # measurements of all branches in a look: with many at once there are fewer branches
-MEMORY = 2e7  # values of all covariances: with very many landmarks there are fewer branches
-LEAD = 10.0  # of log weight over a branch that is given up
-BLIND = 3.0  # [s] without a landmark after which nobody would notice that the wheels slip
+MAX_MEASUREMENTS = 64  # of all branches in a frame: with many at once there are fewer branches
+MAX_VALUES = 2e7  # of all covariances: with very many landmarks there are fewer branches
+MAX_LOG_RATIO = 10.0  # of the weights of the best branch and one that is dropped
+BLIND = 3.0  # [s] without a landmark after which wheel slip would not be noticed
 MAP_TRAVEL, MAP_TURN = 0.3, 0.25  # [m], [rad] between two scans that are drawn into the grid
 
 
 class Estimator:
-    """Filters and results; ``process`` is the system. One branch as long as all can be told."""
+    """Branches and results; one branch as long as all associations are unique."""
 
     def __init__(self, params: EkfParameters, keep_steps: bool = False) -> None:
-        """``keep_steps``: what the path comes from is kept, to be smoothed in the end."""
+        """``keep_steps``: the measurements are kept, to smooth the path in the end."""
         self._p = params
         self._keeps_steps = keep_steps
         e = params.ekf
@@ -53,8 +53,8 @@ class Estimator:
         self.reset(np.array(params.node.map_start_pose), np.zeros((3, 3)))
 
     def reset(self, pose: Array, cov: Array) -> None:
-        """Forget everything and start at a pose (3,) of the map with covariance (3, 3)."""
-        # a line is no point that turns with the rest
+        """Start again at a pose (3,) of the map with covariance (3, 3)."""
+        # the invariant error is defined for points only
         invariant = self._p.ekf.error_model == 'invariant' and self.model is POINT
         m = self._p.motion
         filter_ = Filter(pose, cov, m.imu_bias_sigma, self.model, invariant, m.scale_error_sigma)
@@ -65,26 +65,26 @@ class Estimator:
         self.fates: Counter[str] = Counter()
         self._mapping = self._p.node.mode == 'mapping'
         self._last_stamp: int | None = None
-        self._since = np.zeros(2)  # way and turn since something was last seen
+        self._since = np.zeros(2)  # distance and turn since the last measurement
         self._next_key = 0
         self._last_used = 0
         self._drawn: list[tuple[int, Array, Array, Array]] = []
 
     @property
     def filter(self) -> Filter:
-        """That of the likeliest branch."""
+        """Filter of the likeliest branch."""
         return self.branches[0].filter
 
     def use_map(self, reflectors: Reflectors) -> None:
-        """Localise against given landmarks (map frame); no others are added from now on.
+        """Localize with given landmarks (map frame); no others are added from now on.
 
-        A start pose with no covariance is only assumed, and has that of a person's guess.
+        A start pose without covariance is an assumption, and gets START_SIGMA.
         """
         if not self.filter.pose_cov.any():
             self.reset(self.filter.pose, np.diag(np.array(self._p.node.map_start_sigma) ** 2))
         self.confirmation.begin()
         self._mapping = False
-        self._keeps_steps = False  # the map is not of this drive
+        self._keeps_steps = False  # the map is of another drive
         for branch in self.branches:
             branch.use_map(reflectors)
 
@@ -94,11 +94,11 @@ class Estimator:
         self._predict(observation)
         seen = measure(observation, self._p)
         if seen is not None:
-            self._look(seen, observation.stamp)
+            self._update(seen, observation.stamp)
         for branch in self.branches:
-            branch.log(observation.stamp, self._keeps_steps)
+            branch.path.append(observation.stamp, branch.filter.pose, self._keeps_steps)
         self._draw(observation)
-        return self._frame(observation, seen, self.branches[0].looked, began)
+        return self._frame(observation, seen, self.branches[0].associations, began)
 
     def _predict(self, observation: Observation) -> None:
         motion = observation.motion
@@ -113,26 +113,25 @@ class Estimator:
             branch.predict(motion, m.imu_bias_walk**2 * dt, math.exp(-dt / m.scale_error_time))
         self._since += [np.hypot(motion.delta[0], motion.delta[1]), abs(motion.delta[2])]
 
-    def _look(self, seen: Measured, stamp: int) -> None:
-        """Associate, update, augment in every branch; keep those that explain what was seen.
+    def _update(self, seen: Measured, stamp: int) -> None:
+        """Associate, update, augment in every branch; keep the likely ones.
 
-        Errors of a sensor are alike from one look to the next: looks from one place count as one.
+        Errors of a sensor are correlated: frames from one place count as one.
         """
-        worth = min(float((self._since / ALIKE).max()), 1.0)
+        weight = min(float((self._since / DECORRELATION).max()), 1.0)
         if len(seen.z):
             self._since = np.zeros(2)
         keys = itertools.count(self._next_key)
         key_of = cache(lambda i: next(keys))
-        look = Look(seen, stamp, worth, self._mapping, key_of)
+        frame = MeasuredFrame(seen, stamp, weight, self._mapping, key_of)
         self.branches = _best(
-            [child for b in self.branches for child in b.look(look)], WORK / max(len(seen.z), 1)
+            [child for b in self.branches for child in b.update(frame)],
+            MAX_MEASUREMENTS / max(len(seen.z), 1),
         )
         self._next_key = next(keys)
-        if (self.branches[0].looked.statuses == Status.USED).any():
+        if (self.branches[0].associations.statuses == Status.USED).any():
             self._last_used = stamp
-        self.fates.update(Status(s).name for s in self.branches[0].looked.statuses)
-
-    # --- results ---------------------------------------------------------------------------------
+        self.fates.update(Status(s).name for s in self.branches[0].associations.statuses)
 
     def _draw(self, observation: Observation) -> None:
         """Keep a scan for the grid where the robot has moved since the last one kept."""
@@ -150,18 +149,18 @@ class Estimator:
         self,
         observation: Observation,
         seen: Measured | None,
-        looked: Looked,
+        associations: Associations,
         began: float,
     ) -> Frame:
         pose, cov = self.filter.pose, self.pose_cov
-        keys, statuses = looked.keys, looked.statuses
-        if seen is not None:  # keys and statuses are of what was measured
+        keys, statuses = associations.keys, associations.statuses
+        if seen is not None:  # keys and statuses belong to the measurements
             observation = dataclasses.replace(observation, detections=seen.detections)
         n, used = len(statuses), int((statuses == Status.USED).sum())
-        gone = float(np.hypot(*observation.motion.delta[:2]))
+        travel = float(np.hypot(*observation.motion.delta[:2]))
         in_map = self.confirmation
         agree = agree_with_map(n, used)
-        in_map.check(observation.stamp, gone, n, used, agree, GridMatch(math.nan))
+        in_map.check(observation.stamp, travel, n, used, agree, GridMatch(math.nan))
         health = self.health.evaluate(
             observation.stamp,
             HealthInputs(
@@ -185,25 +184,21 @@ class Estimator:
             statuses=statuses,
             health=health,
             unconfirmed=in_map.is_pending,
-            chi2=looked.chi2,
+            chi2=associations.chi2,
             wall_ms=(time.perf_counter() - began) * 1e3,
         )
 
     def trajectory(self) -> tuple[NDArray[np.int64], Array]:
         """Stamps (n,) and poses (n, 3) in the map frame, as the likeliest branch had them live."""
-        path, node = [], self.branches[0].path
-        while node is not None:
-            path.append(node)
-            node = node.before
-        path.reverse()
+        path = self.branches[0].path.nodes()
         return (
             np.array([p.stamp for p in path], dtype=np.int64),
             np.array([p.pose for p in path]).reshape(-1, 3),
         )
 
     def smoothed(self) -> Smoothed | None:
-        """The likeliest branch's path by all measurements, None where its steps were not kept."""
-        steps = self.branches[0].steps()
+        """Smoothed path of the likeliest branch, None where its steps were not kept."""
+        steps = self.branches[0].path.steps()
         if not steps:
             return None
         return smooth(self._start, steps, self.model, self.trajectory()[1])
@@ -214,7 +209,7 @@ class Estimator:
 
     @property
     def pose_cov(self) -> Array:
-        """Covariance (3, 3) of the likeliest pose: its own, and that others may be right."""
+        """Covariance (3, 3) of the likeliest pose, of the mixture of all branches."""
         weights = np.exp([b.weight for b in self.branches])
         weights /= weights.sum()
         best = self.branches[0].filter.pose
@@ -240,7 +235,7 @@ class Estimator:
 
 
 def _best(branches: Sequence[Branch], affordable: float) -> list[Branch]:
-    """The branches that explain what was seen, the likeliest first; each of its kind once."""
+    """The likely branches, the likeliest first, without duplicates."""
     different: list[Branch] = []
     for b in sorted(branches, key=lambda b: -b.weight):
         twin = next((d for d in different if d.equals(b)), None)
@@ -249,10 +244,10 @@ def _best(branches: Sequence[Branch], affordable: float) -> list[Branch]:
         else:
             twin.weight = float(np.logaddexp(twin.weight, b.weight))
     size = max(len(b.filter.x) for b in different)
-    most = int(np.clip(min(MEMORY / size**2, affordable), 2, MAX_BRANCHES))
+    most = int(np.clip(min(MAX_VALUES / size**2, affordable), 2, MAX_BRANCHES))
     different.sort(key=lambda b: -b.weight)
     best = different[0].weight
-    kept = [b for b in different[:most] if b.weight > best - LEAD]
+    kept = [b for b in different[:most] if b.weight > best - MAX_LOG_RATIO]
     for b in kept:
         b.weight -= best
     return kept

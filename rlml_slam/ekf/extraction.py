@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An observation becomes measurements of the filter: reflectors, spikes or lines."""
+"""Extraction of measurements from an observation: reflectors, spikes or lines."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Measured:
 
 
 def measure(observation: Observation, params: EkfParameters) -> Measured | None:
-    """The measurements by the extractor that ``params`` name; None where nothing was looked for.
+    """The measurements by the extractor that ``params`` name; None without data.
 
     Points are measured as range and bearing, lines as distance and direction.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which measurement is of which landmark of the state, by the rule that the parameters name."""
+"""Association of measurements with landmarks of the state, by the selected method."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rlml_slam.ekf.association import compatible_ids, mahalanobis2, nearest
 from rlml_slam.ekf.extraction import Measured
-from rlml_slam.ekf.filter import Filter
+from rlml_slam.ekf.filter import Filter, innovation_covs
 from rlml_slam.estimation.landmark_tracks import LandmarkTracks
 from rlml_slam.matching.reflectors.association import Associator, Believed, gate
 from rlml_slam.params import EkfParameters
@@ -34,7 +34,7 @@ class Matches:
 class Matcher:
     """Association with the thresholds of one parameter set.
 
-    ``defers``: what cannot be told yet is kept apart, and asks to be told later.
+    ``defers``: ambiguous measurements are associated later, by branches.
     """
 
     def __init__(self, params: EkfParameters) -> None:
@@ -42,10 +42,10 @@ class Matcher:
         self._reflector = params.reflector
         self.gate, self._new_gate = gate(e.gate), gate(e.new_gate)
         self._joint: Associator | None = None
-        # what is extracted comes and goes with each scan, too much of it to wait for answers
+        # extracted features are too many, and too short-lived, for branches
         auto = 'deferred' if e.extractor == 'reflectors' else 'nearest'
         association = auto if e.association == 'auto' else e.association
-        # a line has no place that could be jointly compatible
+        # lines have no position for the test of joint compatibility
         if association != 'nearest' and e.extractor != 'lines':
             self._joint = Associator(
                 dataclasses.replace(
@@ -58,8 +58,8 @@ class Matcher:
     def match(
         self, seen: Measured, filter_: Filter, tracks: LandmarkTracks, stamp: int
     ) -> Matches:
-        """The landmark of the filter's region that each measurement is of."""
-        # where all tell their ids there is no question that others could help to answer
+        """Associate measurements with the landmarks of the filter's region."""
+        # with ids, joint compatibility adds nothing
         if self._joint is None or (seen.detections.ids != ANONYMOUS).all():
             return self._nearest(seen, filter_, tracks.ids[filter_.local])
         local = filter_.local
@@ -76,7 +76,7 @@ class Matcher:
     def learn_spread(
         self, seen: Measured, matches: Matches, local: NDArray[np.int64], tracks: LandmarkTracks
     ) -> None:
-        """Two detections at once of one landmark: it is several which cannot be told apart."""
+        """Learn the spread of a landmark that is several close ones, from double detections."""
         assert self._joint is not None
         points = seen.detections.points
         double = self._joint.doubles(seen.detections, matches.slots)
@@ -85,7 +85,7 @@ class Matcher:
             tracks.see_double(int(local[matches.slots[double[k]]]), gap)
 
     def _nearest(self, seen: Measured, filter_: Filter, ids: NDArray[np.int64]) -> Matches:
-        """The nearest neighbour in the gate; an id needs no gate but sense."""
+        """Nearest neighbour within the gate; a known id uses the wider new-landmark gate."""
         z, detections, k = seen.z, seen.detections, len(seen.z)
         slots, statuses = np.full(k, -1, dtype=np.int64), np.full(k, Status.NEW, dtype=np.int64)
         if not len(ids):
@@ -93,27 +93,27 @@ class Matcher:
         model = filter_.model
         h, H_r, H_m = model.observe(filter_.x[:3], filter_.points)
         nu = model.innovation(z[:, None], h[None])
-        d2 = mahalanobis2(nu, filter_.innovation_covs(H_r, H_m)[None] + seen.R[:, None])
-        told = (detections.ids[:, None] == ids[None]) & (ids[None] != ANONYMOUS)
-        gated = np.where(told, np.where(d2 <= self._new_gate, 0.0, np.inf), d2)
+        d2 = mahalanobis2(nu, innovation_covs(filter_, H_r, H_m)[None] + seen.R[:, None])
+        same_id = (detections.ids[:, None] == ids[None]) & (ids[None] != ANONYMOUS)
+        gated = np.where(same_id, np.where(d2 <= self._new_gate, 0.0, np.inf), d2)
         same = compatible_ids(detections.ids, ids)
         slots = nearest(np.where(same, gated, np.inf), self.gate)
         statuses[slots >= 0] = Status.USED
-        statuses[(slots < 0) & self._is_known(seen, filter_, d2, told)] = Status.GATED
+        statuses[(slots < 0) & self._is_known(seen, filter_, d2, same_id)] = Status.GATED
         best = np.where(slots >= 0, d2[np.arange(k), np.maximum(slots, 0)], np.nan)
         return Matches(slots, statuses, best)
 
     def _is_known(
-        self, seen: Measured, filter_: Filter, d2: Array, told: NDArray[np.bool_]
+        self, seen: Measured, filter_: Filter, d2: Array, same_id: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """(k,): so near to a landmark, though outside of its gate, that it starts no candidate."""
+        """(k,): too close to a landmark, though outside of its gate, to start a candidate."""
         where = filter_.model.place(filter_.x[:3], seen.z)[0]
         gap = np.linalg.norm(where[:, None] - filter_.points[None], axis=-1)
         sigma = np.sqrt(np.linalg.eigvalsh(seen.detections.cov)[:, -1])
         blur = self._reflector.separability_sigma * sigma
         near = gap.min(axis=1) < np.maximum(self._p.min_separation, blur)
         near |= d2.min(axis=1) <= self._new_gate
-        # one that tells who it is, is new if nobody has told so before
+        # a detection with an id is new if no landmark has it
         anonymous = seen.detections.ids == ANONYMOUS
-        out: NDArray[np.bool_] = (near & anonymous) | told.any(axis=1)
+        out: NDArray[np.bool_] = (near & anonymous) | same_id.any(axis=1)
         return out

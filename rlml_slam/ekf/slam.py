@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""EKF-SLAM in one object, with the interface of rlml/slam.py: inputs in, frames and a map out."""
+"""EKF-SLAM system with the interface of the RLML replay: inputs in, frames and a map out."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ class EkfSlam(SynchronizedSystem):
         self._smoothed: Smoothed | None = None
 
     def finish(self) -> list[Frame]:
-        """Everything that still waits; then the path is smoothed."""
+        """Process the remaining inputs, then smooth the path."""
         frames = self.process(self.synchronizer.flush())
         self.estimator.filter.settle()
         self._smoothed = self.estimator.smoothed()
         return frames
 
     def process(self, observations: Iterable[Observation]) -> list[Frame]:
-        """What the sequencer made of the inputs."""
+        """Frames of the synchronized observations."""
         return [self.estimator.process(o) for o in observations]
 
     def trajectory(self) -> tuple[NDArray[np.int64], Array]:
-        """Stamps (n,) and poses (n, 3) of the likeliest branch, by all that was measured.
+        """Stamps (n,) and poses (n, 3) of the likeliest branch, smoothed.
 
-        As they were estimated live before the end, and where ``ekf.smooth`` is false.
+        Before the end, and without ``ekf.smooth``, those estimated live.
         """
         stamps, poses = self.estimator.trajectory()
         return stamps, poses if self._smoothed is None else self._smoothed.states[:, :3].copy()
 
     def reflectors(self) -> Reflectors:
-        """The landmarks of the state, where the smoothed path has them and as sure as it is."""
+        """Landmarks with positions and covariances of the smoothed path."""
         found = self.estimator.reflectors()
         if self._smoothed is None:
             return found

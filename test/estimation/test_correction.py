@@ -7,6 +7,7 @@ from made_worlds import ROOM, drive, observations
 
 from rlml_slam import se2
 from rlml_slam.estimation.correction import Correction, ReferencePose, carried, either, positive
+from rlml_slam.graph.batch.marginals import Marginals
 from rlml_slam.params import Parameters
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.front_end.front_end import FrontEnd
@@ -92,7 +93,7 @@ def test_newest_keyframe_is_known_no_better_than_graph_or_front_end_know_the_one
         asked += 1
         before, last = back_end.keyframes[-2:]
         way = back_end.graph.poses[last.index, :2] - back_end.graph.poses[before.index, :2]
-        graph = back_end.marginals().poses([before.index])[0]
+        graph = Marginals(back_end.graph).poses([before.index])[0]
         R = np.eye(3)
         R[:2, :2] = se2.rotation(back_end.T_map_local[2])
         for cov in (graph, R @ before.cov_local @ R.T):

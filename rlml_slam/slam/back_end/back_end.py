@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +12,6 @@ from numpy.typing import NDArray
 from rlml_slam import se2
 from rlml_slam.errors import MapError
 from rlml_slam.estimation.correction import ReferencePose
-from rlml_slam.graph.batch.marginals import Marginals
 from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.factors import relative_information
 from rlml_slam.graph.model.graph import Graph
@@ -242,7 +240,10 @@ class BackEnd:
         if self.loop_closer.needs_selection(final):
             enabled = self.loop_closer.select()
             self.solver.solve_all()
-            self._update_closures(enabled)
+            changed = self.loop_closer.update_states(enabled)
+            self._changed += changed
+            if changed:
+                self.path_covariance.remove_closures()
         self.solver.solve()  # the incremental factorization, where the batch solver was last
         self._correct_local_frame()
 
@@ -267,12 +268,6 @@ class BackEnd:
         if self.survey_frame is None or self.delayed_association.pending:
             return False
         return self.survey_frame.update()
-
-    def _update_closures(self, enabled: Mapping[int, bool]) -> None:
-        changed = self.loop_closer.update_states(enabled)
-        if changed:
-            self._changed += changed
-            self.path_covariance.remove_closures()
 
     def _correct_local_frame(self) -> None:
         """Set ``T_map_local`` and its covariance from the newest keyframe."""
@@ -306,10 +301,6 @@ class BackEnd:
         if not self.keyframes:
             return self.frame_trajectory.stamps(), np.zeros((0, 3))
         return self.frame_trajectory.stamps(), self.frame_trajectory.poses(self.graph.poses)
-
-    def marginals(self) -> Marginals:
-        """Covariances at the current estimate."""
-        return Marginals(self.graph)
 
     def reflectors(self) -> Reflectors:
         """The reflector map with marginal covariances, map frame."""
