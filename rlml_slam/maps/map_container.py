@@ -9,8 +9,7 @@ a ``NAME.npy`` for each array (numpy's format, without pickled objects). The hea
     32 bytes  SHA-256 of the archive
     16 bytes  the first 16 of the SHA-256 of the 48 bytes before
 
-So a file that is too short, too long or changed in any bit is told from a whole one before
-anything of it is used.
+So a file that is too short, too long or changed in any bit is detected before it is used.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ PLAIN = frozenset('f')  # kinds of numbers that hardly get smaller: measurements
 
 
 class Content(NamedTuple):
-    """Arrays by name, and whatever JSON can tell of them."""
+    """Arrays by name, and a description in JSON."""
 
     arrays: Mapping[str, NDArray[Any]]
     description: Mapping[str, Any]

@@ -30,7 +30,7 @@ IMK_FIELDS = 6  # before the layers
 
 
 class Survey(NamedTuple):
-    """``ids`` (n,), ANONYMOUS where not told, ``points`` (n, 2) and ``diameters`` (n,) or NaN."""
+    """``ids`` (n,) or ANONYMOUS, ``points`` (n, 2) and ``diameters`` (n,) or NaN."""
 
     ids: NDArray[np.int64]
     points: Array
@@ -65,9 +65,9 @@ def load(path: str | Path) -> Survey:
         raise FileFormatError(f'{path}: no reflector in it')
     values = np.array(rows)
     ids = values[:, 0].astype(np.int64)
-    told = ids[ids != ANONYMOUS]
-    if len(np.unique(told)) != len(told):
-        raise FileFormatError(f'{path}: an id stands for two reflectors')
+    known = ids[ids != ANONYMOUS]
+    if len(np.unique(known)) != len(known):
+        raise FileFormatError(f'{path}: two reflectors have the same id')
     return Survey(ids, values[:, 1:3].copy(), values[:, 3].copy())
 
 

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which reflectors explain all detections of a run, and which detection is of which.
+"""Association of all detections of a run with reflectors, whose number is estimated with it.
 
-A detection is of one reflector, or of nothing (hypotheses.OUTLIER); a reflector is seen once in a
-look. How many there are is told by the likelihood of all answers, with two prices. One is for the
-place of each: a prior of ``reflector.unmapped_density`` against how surely its detections tell it
-(Laplace), which is the penalty of the BIC with its constants. The other is for what two close ones
-leave open: which of them is seen in a look is an answer as well, and costs its entropy (integrated
-completed likelihood: Biernacki, Celeux, Govaert 2000). So one cloud of detections stays one
-reflector however many they are, and two that are seen together are two.
+A detection belongs to one reflector or to none (multi_hypothesis.OUTLIER); a reflector is
+detected once in a frame. The number of reflectors maximizes the likelihood of all associations
+less two costs. One is that of each position: a prior of ``reflector.unmapped_density`` against the
+covariance of its detections (Laplace), which is the penalty of the BIC with its constants. The
+other is the entropy of associations between two close reflectors (integrated completed likelihood:
+Biernacki, Celeux, Govaert 2000). So one cluster of detections is one reflector however many they
+are, and two reflectors seen in one frame are two.
 """
 
 from __future__ import annotations
@@ -38,21 +38,21 @@ VALLEY = 0.5
 Indices = NDArray[np.int64]
 
 
-class Marks(NamedTuple):
-    """Reflectors at ``points`` (m, 2), map frame, that tell ``ids`` (m,)."""
+class ReflectorPoints(NamedTuple):
+    """Reflectors at ``points`` (m, 2), map frame, with ``ids`` (m,)."""
 
     points: Array
     ids: Indices
 
 
 class Pairs(NamedTuple):
-    """For each detection (n,) its nearest reflectors, and what each explains.
+    """Nearest reflectors of each detection, and the gain of each association.
 
-    ``mark`` (n, NEAREST), -1 where there are fewer; ``gain`` (n, NEAREST) is the log odds against
-    nothing, -inf where it cannot be.
+    ``reflector`` (n, NEAREST), -1 where there are fewer; ``gain`` (n, NEAREST) is the log odds
+    against none, -inf outside the gate.
     """
 
-    mark: Indices
+    reflector: Indices
     gain: Array
 
 
@@ -61,7 +61,7 @@ class BatchAssociation:
 
     def __init__(self, seen: Sequence[Detections | None], params: Reflector) -> None:
         kept = [(k, d) for k, d in enumerate(seen) if d is not None and len(d)]
-        self._look = np.concatenate([np.full(len(d), k) for k, d in kept])
+        self._frame_of = np.concatenate([np.full(len(d), k) for k, d in kept])
         self._z, self._R = (
             np.concatenate([getattr(d, name) for _, d in kept]) for name in ('points', 'cov')
         )
@@ -73,76 +73,84 @@ class BatchAssociation:
         self._separation = params.min_separation
 
     @property
-    def is_open(self) -> bool:
+    def is_ambiguous(self) -> bool:
         """Whether any detection leaves open which reflector it is of."""
         return bool((self._ids == ANONYMOUS).any())
 
-    def looks(self, answers: Indices) -> list[Indices]:
-        """The answers (n,) to the detections of each observation."""
-        return np.split(answers, self._ends[:-1])
+    def by_frame(self, associations: Indices) -> list[Indices]:
+        """The associations (n,) to the detections of each observation."""
+        return np.split(associations, self._ends[:-1])
 
-    def answer(self, poses: Array, marks: Marks, granted: float = 0.0) -> tuple[Marks, Indices]:
-        """The reflectors, and which (n,) each detection is of, -1 for none, by ``poses`` (k, 3).
+    def associate(
+        self, poses: Array, reflectors: ReflectorPoints, extra_variance: float = 0.0
+    ) -> tuple[ReflectorPoints, Indices]:
+        """Reflectors, and the one (n,) of each detection, -1 for none, for ``poses`` (k, 3).
 
-        The poses may err by the variance ``granted`` per axis [m²], or by more where it shows.
-        All reflectors are of some detection.
+        ``extra_variance`` [m²] per axis, or a larger one that the residuals show, is added to the
+        covariances. All reflectors have detections.
         """
-        T = poses[self._look]
+        T = poses[self._frame_of]
         self._points = se2.transform(T, self._z[:, None])[:, 0]
         R = se2.rotation(T[:, 2])
         cov = R @ self._R @ np.swapaxes(R, 1, 2)
-        self._cov = cov + max(granted, self._spread2(cov, marks)) * np.eye(2)
+        self._cov = cov + max(extra_variance, self._spread2(cov, reflectors)) * np.eye(2)
         self._W = np.linalg.inv(self._cov)
         self._peak = 0.5 * np.linalg.slogdet(self._W)[1] - math.log(2.0 * math.pi) - OUTLIER
         self._reach = np.sqrt(self._limit * np.linalg.eigvalsh(self._cov)[:, 1])
-        marks = self._with_new(marks)
-        marks = self._needed(marks)
-        pairs = self._pairs(marks)
-        return _numbered(marks, self._match(pairs))
+        reflectors = self._with_new(reflectors)
+        reflectors = self._needed(reflectors)
+        pairs = self._pairs(reflectors)
+        return _numbered(reflectors, self._match(pairs))
 
-    def joined(self, marks: Marks, answers: Indices) -> tuple[Marks, Indices]:
+    def joined(
+        self, reflectors: ReflectorPoints, associations: Indices
+    ) -> tuple[ReflectorPoints, Indices]:
         """Those nearer than ``reflector.min_separation`` that are one cloud are one reflector.
 
         Two that stand beside each other are seen together in some look, or there is a gap between
         their detections. What is in many places, never in two at once, and anywhere between them
-        is a person, or a detection that scatters more than it tells.
+        is a person, or a detection with more noise than its covariance.
         """
-        while (pair := self._of_one(marks, answers)) is not None:
+        while (pair := self._of_one(reflectors, associations)) is not None:
             a, b = pair
-            answers = np.where(answers == b, a, answers)
-            points, ids = marks.points.copy(), marks.ids.copy()
-            points[a] = self._mean(np.flatnonzero(answers == a))
+            associations = np.where(associations == b, a, associations)
+            points, ids = reflectors.points.copy(), reflectors.ids.copy()
+            points[a] = self._mean(np.flatnonzero(associations == a))
             ids[a] = ids[b] if ids[a] == ANONYMOUS else ids[a]
-            marks, answers = _numbered(Marks(points, ids), answers)
-        return marks, answers
+            reflectors, associations = _numbered(ReflectorPoints(points, ids), associations)
+        return reflectors, associations
 
-    def _of_one(self, marks: Marks, answers: Indices) -> tuple[int, int] | None:
+    def _of_one(
+        self, reflectors: ReflectorPoints, associations: Indices
+    ) -> tuple[int, int] | None:
         """The nearest two that are one."""
-        if not len(marks.points):
+        if not len(reflectors.points):
             return None
-        pairs = cKDTree(marks.points).query_pairs(self._separation, output_type='ndarray')
-        apart = marks.points[pairs[:, 1]] - marks.points[pairs[:, 0]]
+        pairs = cKDTree(reflectors.points).query_pairs(self._separation, output_type='ndarray')
+        apart = reflectors.points[pairs[:, 1]] - reflectors.points[pairs[:, 0]]
         for k in np.argsort(np.hypot(*apart.T), kind='stable').tolist():
             a, b = pairs[k].tolist()
-            of_a, of_b = np.flatnonzero(answers == a), np.flatnonzero(answers == b)
-            is_named = (marks.ids[pairs[k]] != ANONYMOUS).all()
-            if is_named or len(np.intersect1d(self._look[of_a], self._look[of_b])):
+            of_a, of_b = np.flatnonzero(associations == a), np.flatnonzero(associations == b)
+            is_named = (reflectors.ids[pairs[k]] != ANONYMOUS).all()
+            if is_named or len(np.intersect1d(self._frame_of[of_a], self._frame_of[of_b])):
                 continue
-            own = self._points[np.append(of_a, of_b)] - marks.points[a]
+            own = self._points[np.append(of_a, of_b)] - reflectors.points[a]
             along = own @ apart[k] / (apart[k] @ apart[k])
             first, middle, last = np.histogram(along, 3, (0.0, 1.0))[0].tolist()
             if middle >= VALLEY * 0.5 * (first + last):
                 return a, b
         return None
 
-    def _spread2(self, cov: Array, marks: Marks) -> float:
+    def _spread2(self, cov: Array, reflectors: ReflectorPoints) -> float:
         """Variance per axis [m²] by which detections miss their reflectors beyond their noise.
 
         With it, half of them are within the median of chi-square: others may be of anything.
         """
-        gap, at = cKDTree(marks.points).query(self._points)
-        near = gap < np.sqrt(self._limit * np.linalg.eigvalsh(cov)[:, 1]) + self._widest(marks)
-        nu, cov = (self._points - marks.points[at])[near], cov[near]
+        gap, at = cKDTree(reflectors.points).query(self._points)
+        near = gap < np.sqrt(self._limit * np.linalg.eigvalsh(cov)[:, 1]) + self._widest(
+            reflectors
+        )
+        nu, cov = (self._points - reflectors.points[at])[near], cov[near]
         if not len(nu):
             return 0.0
         low, high = 0.0, float((nu**2).sum(axis=1).max())
@@ -153,54 +161,58 @@ class BatchAssociation:
         return high
 
     @staticmethod
-    def _widest(marks: Marks) -> float:
+    def _widest(reflectors: ReflectorPoints) -> float:
         """How far off a detection may be and still be nearer to its reflector than to others."""
-        if len(marks.points) < 2:
+        if len(reflectors.points) < 2:
             return math.inf
-        gaps = cKDTree(marks.points).query(marks.points, 2)[0][:, 1]
+        gaps = cKDTree(reflectors.points).query(reflectors.points, 2)[0][:, 1]
         return 0.5 * float(np.median(gaps))
 
-    def _pairs(self, marks: Marks) -> Pairs:
-        k = min(NEAREST, len(marks.points))
-        gap, mark = cKDTree(marks.points).query(self._points, range(1, k + 1))
+    def _pairs(self, reflectors: ReflectorPoints) -> Pairs:
+        k = min(NEAREST, len(reflectors.points))
+        gap, reflector = cKDTree(reflectors.points).query(self._points, range(1, k + 1))
         inside = gap < self._reach[:, None]
-        mark[~inside] = -1
-        d2 = _distance2(self._points[:, None] - marks.points[mark], self._W[:, None])
+        reflector[~inside] = -1
+        d2 = _distance2(self._points[:, None] - reflectors.points[reflector], self._W[:, None])
         gain = np.where(inside & (d2 < self._limit), self._peak[:, None] - 0.5 * d2, -np.inf)
         named = self._ids[:, None] != ANONYMOUS
         gain[
-            named & (marks.ids[mark] != ANONYMOUS) & (marks.ids[mark] != self._ids[:, None])
+            named
+            & (reflectors.ids[reflector] != ANONYMOUS)
+            & (reflectors.ids[reflector] != self._ids[:, None])
         ] = -np.inf
-        return self._by_id(Pairs(mark, np.where(gain > 0.0, gain, -np.inf)), marks)
+        return self._by_id(Pairs(reflector, np.where(gain > 0.0, gain, -np.inf)), reflectors)
 
-    def _by_id(self, pairs: Pairs, marks: Marks) -> Pairs:
-        """What tells the id of a reflector is of that one, however far off."""
-        order = np.argsort(marks.ids, kind='stable')
-        at = np.searchsorted(marks.ids[order], self._ids)
+    def _by_id(self, pairs: Pairs, reflectors: ReflectorPoints) -> Pairs:
+        """A detection with the id of a reflector belongs to it, at any distance."""
+        order = np.argsort(reflectors.ids, kind='stable')
+        at = np.searchsorted(reflectors.ids[order], self._ids)
         at = order[np.minimum(at, len(order) - 1)]
-        own = (self._ids != ANONYMOUS) & (marks.ids[at] == self._ids)
-        pairs.mark[own], pairs.gain[own] = -1, -np.inf
-        pairs.mark[own, 0], pairs.gain[own, 0] = at[own], self._peak[own]
+        own = (self._ids != ANONYMOUS) & (reflectors.ids[at] == self._ids)
+        pairs.reflector[own], pairs.gain[own] = -1, -np.inf
+        pairs.reflector[own, 0], pairs.gain[own, 0] = at[own], self._peak[own]
         return pairs
 
     def _match(self, pairs: Pairs) -> Indices:
         """The likeliest reflector (n,) of each detection, each once in a look; -1 for none."""
         rows = np.arange(len(pairs.gain))
         best = pairs.gain.argmax(axis=1)
-        out = np.where(pairs.gain[rows, best] > 0.0, pairs.mark[rows, best], -1)
+        out = np.where(pairs.gain[rows, best] > 0.0, pairs.reflector[rows, best], -1)
         used = np.flatnonzero(out >= 0)
-        seen = np.stack([self._look[used], out[used]])
+        seen = np.stack([self._frame_of[used], out[used]])
         _, first, count = np.unique(seen, axis=1, return_inverse=True, return_counts=True)
         # in most looks each has one of its own, and there is nothing to be weighed
-        for k in np.unique(self._look[used][count[first.ravel()] > 1]).tolist():
+        for k in np.unique(self._frame_of[used][count[first.ravel()] > 1]).tolist():
             look = slice(self._ends[k - 1] if k else 0, self._ends[k])
-            out[look] = _assigned(pairs.mark[look], pairs.gain[look])
+            out[look] = _assigned(pairs.reflector[look], pairs.gain[look])
         return out
 
-    def _with_new(self, marks: Marks) -> Marks:
+    def _with_new(self, reflectors: ReflectorPoints) -> ReflectorPoints:
         """The reflectors and, after them, those that detections of none of them show."""
-        left = np.flatnonzero((self._match(self._pairs(marks)) < 0) & (self._ids == ANONYMOUS))
-        found = [marks.points]
+        left = np.flatnonzero(
+            (self._match(self._pairs(reflectors)) < 0) & (self._ids == ANONYMOUS)
+        )
+        found = [reflectors.points]
         tree = cKDTree(self._points[left])
         # of many in one cloud each is near all others: their lists are made one by one
         near = tree.query_ball_point(self._points[left], self._reach[left], return_length=True)
@@ -212,29 +224,31 @@ class BatchAssociation:
             group = left[group[free[group]]]
             point = self._mean(group)
             own = group[np.argsort(-self._gain(group, point))]
-            own = own[np.unique(self._look[own], return_index=True)[1]]
+            own = own[np.unique(self._frame_of[own], return_index=True)[1]]
             gain = self._gain(own, point)
             own, gain = own[gain > 0.0], gain[gain > 0.0]
             # what is seen less often is no reflector to the back end, and most of it are ghosts
-            if len(own) >= self._fewest and gain.sum() > self._price(own):
+            if len(own) >= self._fewest and gain.sum() > self._cost(own):
                 found.append(self._mean(own)[None])
                 free[np.searchsorted(left, group)] = False
         points = np.concatenate(found)
-        new = np.full(len(points) - len(marks.ids), ANONYMOUS)
-        return Marks(points, np.append(marks.ids, new))
+        new = np.full(len(points) - len(reflectors.ids), ANONYMOUS)
+        return ReflectorPoints(points, np.append(reflectors.ids, new))
 
-    def _needed(self, marks: Marks) -> Marks:
+    def _needed(self, reflectors: ReflectorPoints) -> ReflectorPoints:
         """Without those, least needed first, that explain less than they cost."""
-        while len(marks.points) > 1:
-            pairs = self._pairs(marks)
-            worth = self._worth(pairs, self._match(pairs), len(marks.points))
-            k = int(np.argmin(worth))
-            if worth[k] >= 0.0:
+        while len(reflectors.points) > 1:
+            pairs = self._pairs(reflectors)
+            net_gain = self._net_gain(pairs, self._match(pairs), len(reflectors.points))
+            k = int(np.argmin(net_gain))
+            if net_gain[k] >= 0.0:
                 break
-            marks = Marks(np.delete(marks.points, k, 0), np.delete(marks.ids, k))
-        return marks
+            reflectors = ReflectorPoints(
+                np.delete(reflectors.points, k, 0), np.delete(reflectors.ids, k)
+            )
+        return reflectors
 
-    def _worth(self, pairs: Pairs, at: Indices, m: int) -> Array:
+    def _net_gain(self, pairs: Pairs, at: Indices, m: int) -> Array:
         """What each of m reflectors explains (m,) beyond the others, less its price.
 
         Without it, its detections go to the nearest one that the look leaves free, or in place of
@@ -243,7 +257,7 @@ class BatchAssociation:
         order = np.argsort(at, kind='stable')
         ends = np.searchsorted(at[order], np.arange(m + 1))
         own_gain = self._gain_of(pairs, at)
-        keys = self._look * m + at  # of (look, reflector), sorted below to be searched
+        keys = self._frame_of * m + at  # of (look, reflector), sorted below to be searched
         used = np.flatnonzero(at >= 0)
         used = used[np.argsort(keys[used], kind='stable')]
         sorted_keys = keys[used]
@@ -253,26 +267,28 @@ class BatchAssociation:
             if not len(own):
                 out[k] = -np.inf
                 continue
-            mark = pairs.mark[own]
-            gain = np.where(mark == k, 0.0, np.maximum(pairs.gain[own], 0.0))
-            key = self._look[own, None] * m + mark
+            reflector = pairs.reflector[own]
+            gain = np.where(reflector == k, 0.0, np.maximum(pairs.gain[own], 0.0))
+            key = self._frame_of[own, None] * m + reflector
             slot = np.minimum(np.searchsorted(sorted_keys, key), len(sorted_keys) - 1)
-            taken = (sorted_keys[slot] == key) & (mark >= 0)
+            taken = (sorted_keys[slot] == key) & (reflector >= 0)
             gain -= np.where(taken, np.minimum(own_gain[used[slot]], gain), 0.0)
             best = gain.argmax(axis=1)
             other = gain[np.arange(len(own)), best]
             loss = float((own_gain[own] - other).sum())
-            to = mark[np.arange(len(own)), best][other > 0.0]
-            out[k] = loss - self._price(own)
+            to = reflector[np.arange(len(own)), best][other > 0.0]
+            out[k] = loss - self._cost(own)
             if len(to):
                 j = int(np.bincount(to).argmax())
-                out[k] -= _entropy(self._look[own], self._look[order[ends[j] : ends[j + 1]]])
+                out[k] -= _entropy(
+                    self._frame_of[own], self._frame_of[order[ends[j] : ends[j + 1]]]
+                )
         return out
 
     @staticmethod
     def _gain_of(pairs: Pairs, at: Indices) -> Array:
-        """Of the answers (n,), 0 for none."""
-        hit = (pairs.mark == at[:, None]) & (at[:, None] >= 0)
+        """Of the associations (n,), 0 for none."""
+        hit = (pairs.reflector == at[:, None]) & (at[:, None] >= 0)
         return np.asarray(np.where(hit, pairs.gain, 0.0).sum(axis=1))
 
     def _gain(self, rows: Indices, point: Array) -> Array:
@@ -286,8 +302,8 @@ class BatchAssociation:
         weighted = (W @ self._points[rows][..., None]).sum(axis=0)[:, 0]
         return np.asarray(np.linalg.solve(W.sum(axis=0), weighted))
 
-    def _price(self, rows: Indices) -> float:
-        """Of the place that some detections tell: - log(density 2 pi sqrt det P)."""
+    def _cost(self, rows: Indices) -> float:
+        """Cost of a position with covariance P: - log(density 2 pi sqrt det P)."""
         logdet = float(np.linalg.slogdet(self._W[rows].sum(axis=0))[1])
         return 0.5 * logdet - math.log(2.0 * math.pi * self._density)
 
@@ -297,13 +313,13 @@ def _distance2(nu: Array, W: Array) -> Array:
     return np.asarray(np.einsum('...i,...ij,...j->...', nu, W, nu))
 
 
-def _assigned(mark: Indices, gain: Array) -> Indices:
-    """The likeliest of ``mark`` (k, NEAREST) for each of the detections of a look, each once."""
-    out = np.full(len(mark), -1)
-    names, column = np.unique(mark, return_inverse=True)
-    full = np.zeros((len(mark), len(names)))
-    rows = np.broadcast_to(np.arange(len(mark))[:, None], mark.shape)
-    np.maximum.at(full, (rows, column.reshape(mark.shape)), np.maximum(gain, 0.0))
+def _assigned(reflector: Indices, gain: Array) -> Indices:
+    """Likeliest of ``reflector`` (k, NEAREST) for each detection of a frame, each once."""
+    out = np.full(len(reflector), -1)
+    names, column = np.unique(reflector, return_inverse=True)
+    full = np.zeros((len(reflector), len(names)))
+    rows = np.broadcast_to(np.arange(len(reflector))[:, None], reflector.shape)
+    np.maximum.at(full, (rows, column.reshape(reflector.shape)), np.maximum(gain, 0.0))
     r, c = linear_sum_assignment(full, maximize=True)
     good = full[r, c] > 0.0
     out[r[good]] = names[c[good]]
@@ -318,10 +334,12 @@ def _entropy(a: Indices, b: Indices) -> float:
     return float(-(n * np.log(n / n.sum())).sum())
 
 
-def _numbered(marks: Marks, answers: Indices) -> tuple[Marks, Indices]:
-    """Only the reflectors that some detection is of, numbered anew."""
-    used = np.unique(answers)
+def _numbered(
+    reflectors: ReflectorPoints, associations: Indices
+) -> tuple[ReflectorPoints, Indices]:
+    """Only the reflectors with detections, renumbered."""
+    used = np.unique(associations)
     used = used[used >= 0]
-    new = np.full(len(marks.points) + 1, -1)
+    new = np.full(len(reflectors.points) + 1, -1)
     new[used] = np.arange(len(used))
-    return Marks(marks.points[used], marks.ids[used]), new[answers]
+    return ReflectorPoints(reflectors.points[used], reflectors.ids[used]), new[associations]

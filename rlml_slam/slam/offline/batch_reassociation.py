@@ -1,19 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run on reflectors and odometry alone, looked at again when it is over.
+"""Batch re-association after a run on reflectors without ids and odometry alone.
 
-While it goes on, a detection that fits several reflectors is used for none, and those that stand
-closer than can be told apart count as one. In the end the whole run tells which is which: every
-detection is matched once more to the reflectors as they turned out to be (:mod:`second_match`),
-and the path is smoothed by the new answers; in turns, until nothing changes. A path by answers
-that cannot tell two reflectors apart errs by as much as they are apart: the first turn grants each
-detection that much besides its noise, each later one half the variance of the one before
-(graduated assignment: Gold, Rangarajan 1996). So a look at a group finds all of it, where the path
-is off by one of its gaps, before what is left over may be a further reflector, and a wrong answer
-of the first turns is taken back later. At the end, two that are close, never seen together and not
-parted by a gap are one. The back end then goes through the run once more, as it should have been,
-and takes nothing for one that was told apart: its map is the only one.
+During the run an ambiguous detection is not used, and reflectors closer together than the error of
+the pose count as one. At the end every detection is associated again with the reflectors as
+estimated (batch_association.py), and the path is smoothed with the new associations, alternately
+until nothing changes. Wrong associations between two reflectors displace the path by up to their
+distance: in the first iteration each detection gets that much additional noise, in each later one
+half of the variance before (graduated assignment: Gold, Rangarajan 1996). At the end, two close
+reflectors that were never seen together and have no gap between their detections are merged. The
+back end then processes the run once more with these associations.
 
-With scans there is no need: they hold the path by themselves, and the graph has them.
+With scans it is not needed: they constrain the path, and the graph contains them.
 """
 
 from __future__ import annotations
@@ -31,18 +28,18 @@ from rlml_slam.estimation.smoother import Sight, Smoothed, Start, Step, smooth
 from rlml_slam.matching.reflectors.association import gate
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
-from rlml_slam.slam.offline.batch_association import BatchAssociation, Marks
+from rlml_slam.slam.offline.batch_association import BatchAssociation, ReflectorPoints
 from rlml_slam.types import ANONYMOUS, Frame, Observation, Reflectors
 
-TURNS = 20
-COLD = 10  # turns until what is granted is no more: 0.1 % of the first variance
-STEPS = 3  # Gauss-Newton steps of a turn: the next one corrects what is left
+MAX_ITERATIONS = 20
+ANNEALED = 10  # iterations with additional variance, the last one 0.1 % of the first
+SMOOTHER_STEPS = 3  # Gauss-Newton steps of an iteration
 
 Indices = NDArray[np.int64]
 
 
 class BatchReassociation:
-    """Keeps what was measured, as long as it is reflectors and odometry alone."""
+    """Keeps the measurements of a run, while they are reflectors and odometry alone."""
 
     def __init__(self, params: Parameters) -> None:
         self._p = params
@@ -52,12 +49,12 @@ class BatchReassociation:
         self._is_open = params.node.mode == 'mapping' and params.node.use_odom
 
     def close(self) -> None:
-        """There will be nothing to look back on: the graph knows better."""
+        """Drop the measurements: the graph contains more than these."""
         self._is_open = False
         self._frames, self._steps = [], []
 
     def add(self, observation: Observation, frame: Frame) -> None:
-        """Keep an observation and what the front end made of it; with a scan, none is kept."""
+        """Keep an observation and its frame; with a scan, nothing is kept any more."""
         if not self._is_open:
             return
         is_long = len(self._steps) >= self._p.back_end.max_trajectory_frames
@@ -73,41 +70,43 @@ class BatchReassociation:
         measured = dataclasses.replace(frame.observation, detections=observation.detections)
         self._frames.append(dataclasses.replace(frame, observation=measured))
 
-    def look_back(self, poses: Array, reflectors: Reflectors) -> list[Frame]:
-        """The frames as they should have been, from the graph's ``poses`` (n, 3) and reflectors.
+    def reassociate(self, poses: Array, reflectors: Reflectors) -> list[Frame]:
+        """Frames with new associations, from the graph's ``poses`` (n, 3) and reflectors.
 
-        Their local frame is that of the map; landmarks are numbered from 0. Empty if there is
-        nothing to look back on.
+        Their local frame is the map; landmarks are numbered from 0. Empty where nothing was kept.
         """
         if not self._is_open or not len(reflectors) or len(poses) != len(self._steps):
             return []
         match = BatchAssociation(
             [f.observation.detections for f in self._frames], self._p.reflector
         )
-        marks = Marks(reflectors.points, reflectors.ids)
-        answers: Indices = np.zeros(0, dtype=np.int64)
-        for turn in range(TURNS):
-            before = answers
-            granted = self._granted(turn) if match.is_open else 0.0
-            marks, answers = match.answer(poses, marks, granted)
-            if not len(marks.points):
+        estimate = ReflectorPoints(reflectors.points, reflectors.ids)
+        associations: Indices = np.zeros(0, dtype=np.int64)
+        for turn in range(MAX_ITERATIONS):
+            before = associations
+            extra_variance = self._extra_variance(turn) if match.is_ambiguous else 0.0
+            estimate, associations = match.associate(poses, estimate, extra_variance)
+            if not len(estimate.points):
                 return []
-            steps = self._sights(match, answers, poses, marks.points, granted)
-            smoothed = smooth(self._start(), steps, POINT, poses, STEPS)
-            poses, marks = smoothed.states[:, :3], Marks(smoothed.points, marks.ids)
-            if not granted and np.array_equal(before, answers):
+            steps = self._sights(match, associations, poses, estimate.points, extra_variance)
+            smoothed = smooth(self._start(), steps, POINT, poses, SMOOTHER_STEPS)
+            poses, estimate = (
+                smoothed.states[:, :3],
+                ReflectorPoints(smoothed.points, estimate.ids),
+            )
+            if not extra_variance and np.array_equal(before, associations):
                 break
-        marks, answers = match.joined(marks, answers)
-        steps = self._sights(match, answers, poses, marks.points, 0.0)
-        smoothed = smooth(self._start(), steps, POINT, poses, STEPS)
-        return self._told(smoothed, match.looks(answers))
+        estimate, associations = match.joined(estimate, associations)
+        steps = self._sights(match, associations, poses, estimate.points, 0.0)
+        smoothed = smooth(self._start(), steps, POINT, poses, SMOOTHER_STEPS)
+        return self._corrected(smoothed, match.by_frame(associations))
 
-    def _granted(self, turn: int) -> float:
-        """Variance per axis [m²] by which the path may err in a turn."""
-        return 0.5**turn * self._p.reflector.min_separation**2 if turn < COLD else 0.0
+    def _extra_variance(self, turn: int) -> float:
+        """Additional variance per axis [m²] of the detections in an iteration."""
+        return 0.5**turn * self._p.reflector.min_separation**2 if turn < ANNEALED else 0.0
 
     def _start(self) -> Start:
-        """Where the run began, which defines the map, and what is not known of gyro and wheels."""
+        """First pose, which defines the map, and the prior of bias and scale errors."""
         m = self._p.motion
         sigma = np.array([0.0, 0.0, 0.0, m.imu_bias_sigma, *m.scale_error_sigma])
         return Start(np.append(self._p.node.map_start_pose, np.zeros(3)), np.diag(sigma**2))
@@ -115,24 +114,24 @@ class BatchReassociation:
     def _sights(
         self,
         match: BatchAssociation,
-        answers: Indices,
+        associations: Indices,
         poses: Array,
         points: Array,
-        granted: float,
+        extra_variance: float,
     ) -> list[Step]:
-        """The steps with what each one saw; by Cauchy's loss, what is far off counts less.
+        """Steps with their sights, weighted by the Cauchy loss.
 
-        Answers that may be off by the variance ``granted`` tell the path no more than that.
+        ``extra_variance`` [m²] is added to the covariance of each detection.
         """
         steps = []
         for step, frame, at, pose in zip(
-            self._steps, self._frames, match.looks(answers), poses, strict=True
+            self._steps, self._frames, match.by_frame(associations), poses, strict=True
         ):
             d, used = frame.observation.detections, np.flatnonzero(at >= 0)
             if d is None or not len(used):
                 steps.append(step)
                 continue
-            z, R = to_polar(d.points[used], d.cov[used] + granted * np.eye(2))
+            z, R = to_polar(d.points[used], d.cov[used] + extra_variance * np.eye(2))
             nu = POINT.innovation(z, POINT.observe(pose, points[at[used]])[0])
             d2 = _distance2(nu, R)
             R *= (1.0 + d2 / self._p.reflector.robust_scale**2)[:, None, None]
@@ -140,11 +139,11 @@ class BatchReassociation:
             steps.append(dataclasses.replace(step, sights=sights))
         return steps
 
-    def _told(self, smoothed: Smoothed, looks: Sequence[Indices]) -> list[Frame]:
-        """The frames as they should have been: all that is measured is where the end has it.
+    def _corrected(self, smoothed: Smoothed, looks: Sequence[Indices]) -> list[Frame]:
+        """Frames whose measurements agree with the smoothed path and reflectors.
 
-        So the graph of them has its minimum where the run turned out to be. What it knows is as
-        much as was measured, for the covariances stay.
+        The graph of them has its minimum at the smoothed estimate; the covariances are those
+        of the measurements.
         """
         poses = np.concatenate([smoothed.start[None, :3], smoothed.states[:, :3]])
         out = []
@@ -156,7 +155,9 @@ class BatchReassociation:
                 used = np.flatnonzero(at >= 0)
                 points[used] = se2.transform(se2.inverse(b), smoothed.points[at[used]])
                 off = _distance2(d.points[used] - points[used], d.cov[used]) > self._limit
-                at[used[off & (d.ids[used] != ANONYMOUS)]] = -1  # told by an id, but elsewhere
+                at[
+                    used[off & (d.ids[used] != ANONYMOUS)]
+                ] = -1  # associated by its id, but outside the gate
                 observation = dataclasses.replace(
                     observation, detections=dataclasses.replace(d, points=points)
                 )

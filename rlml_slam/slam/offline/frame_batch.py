@@ -31,14 +31,16 @@ ARRAYS = tuple(
 )  # fmt: skip
 NO_POINTS = np.zeros((0, 2))
 NONE = np.zeros(0, dtype=np.int64)
-UNSENT = np.full((3, 3), np.nan)  # in place of poses in the map, which the back end tells itself
+UNSENT = np.full(
+    (3, 3), np.nan
+)  # in place of poses in the map, which the back end computes itself
 
 
 class Batch(NamedTuple):
     """Some frames: ``values`` and ``arrays`` (n, ...) by VALUES and ARRAYS.
 
     ``points`` (m, 2) and ``origins`` (s, 2) are those of the frames with a scan, in their order;
-    ``lengths`` (n,) tells how many points each frame has, -1 without a scan. ``detections`` are
+    ``lengths`` (n,) are the numbers of points of the frames, -1 without a scan. ``detections`` are
     there for those frames, by number, that looked for reflectors, with the keys of these.
     """
 

@@ -103,7 +103,7 @@ class Slam(SynchronizedSystem):
 
     def _look_back(self) -> None:
         """Make the map again from what the whole run tells, where that is more."""
-        frames = self.batch_reassociation.look_back(
+        frames = self.batch_reassociation.reassociate(
             self.back_end.trajectory()[1], self.back_end.reflectors()
         )
         if frames:

@@ -6,7 +6,7 @@ import pytest
 from made_worlds import detections_of
 
 from rlml_slam.params import Reflector
-from rlml_slam.slam.offline.batch_association import BatchAssociation, Marks
+from rlml_slam.slam.offline.batch_association import BatchAssociation, ReflectorPoints
 from rlml_slam.types import ANONYMOUS
 
 GAP = 0.18  # [m]
@@ -25,12 +25,12 @@ def seen(points, looks=LOOKS, sigma=0.02):
 
 
 def marks_at(points):
-    return Marks(points, np.full(len(points), ANONYMOUS))
+    return ReflectorPoints(points, np.full(len(points), ANONYMOUS))
 
 
-def answered(match, poses, marks, granted):
-    marks, answers = match.answer(poses, marks, granted)
-    return len(marks.points), answers.reshape(-1, len(ROW))
+def answered(match, poses, marks, extra_variance):
+    marks, associations = match.associate(poses, marks, extra_variance)
+    return len(marks.points), associations.reshape(-1, len(ROW))
 
 
 @pytest.mark.parametrize('aside', [-GAP, GAP])
@@ -39,18 +39,18 @@ def test_pass_that_is_off_by_a_gap_of_a_row_sees_as_many_as_there_are(aside):
     match = BatchAssociation(seen(ROW), Reflector())
     off = np.zeros((LOOKS, 3))
     off[LAST:, 1] = aside
-    count, answers = answered(match, off, marks_at(ROW), 0.0)
+    count, associations = answered(match, off, marks_at(ROW), 0.0)
     assert count == len(ROW) + 1  # the path is taken for true
-    count, answers = answered(match, off, marks_at(ROW), Reflector().min_separation ** 2)
+    count, associations = answered(match, off, marks_at(ROW), Reflector().min_separation ** 2)
     assert count == len(ROW)
-    assert (answers == np.arange(len(ROW))).all()
+    assert (associations == np.arange(len(ROW))).all()
 
 
 def test_one_more_than_there_are_marks_is_a_new_one_however_much_is_granted():
     match = BatchAssociation(seen(ROW), Reflector())
-    count, answers = answered(match, np.zeros((LOOKS, 3)), marks_at(ROW[:2]), 0.25**2)
+    count, associations = answered(match, np.zeros((LOOKS, 3)), marks_at(ROW[:2]), 0.25**2)
     assert count == len(ROW)
-    assert (np.sort(answers, axis=1) == np.arange(len(ROW))).all()
+    assert (np.sort(associations, axis=1) == np.arange(len(ROW))).all()
 
 
 def test_one_cloud_of_many_detections_is_one_reflector():
@@ -58,16 +58,16 @@ def test_one_cloud_of_many_detections_is_one_reflector():
     looks = 20_000
     far = np.array([[20.0, 0.0]])
     match = BatchAssociation(seen(ROW[:1], looks), Reflector())
-    marks, answers = match.answer(np.zeros((looks, 3)), marks_at(far), 0.0)
+    marks, associations = match.associate(np.zeros((looks, 3)), marks_at(far), 0.0)
     assert len(marks.points) == 1
-    assert (answers == 0).mean() > 0.99
+    assert (associations == 0).mean() > 0.99
     np.testing.assert_allclose(marks.points, ROW[:1], atol=0.001)
 
 
 def test_only_what_is_anonymous_is_open():
-    assert BatchAssociation(seen(ROW), Reflector()).is_open
+    assert BatchAssociation(seen(ROW), Reflector()).is_ambiguous
     told = [detections_of(ROW, 0, [1, 2, 3])]
-    assert not BatchAssociation(told, Reflector()).is_open
+    assert not BatchAssociation(told, Reflector()).is_ambiguous
 
 
 def test_a_ghost_that_nothing_repeats_is_no_reflector():
@@ -75,29 +75,31 @@ def test_a_ghost_that_nothing_repeats_is_no_reflector():
     ghosts = rng.uniform(-30.0, 30.0, (200, 1, 2))
     looks = [detections_of(np.vstack([ROW, g]), k, None, 0.02) for k, g in enumerate(ghosts)]
     match = BatchAssociation(looks, Reflector())
-    marks, answers = match.answer(np.zeros((len(looks), 3)), marks_at(ROW), 0.0)
+    marks, associations = match.associate(np.zeros((len(looks), 3)), marks_at(ROW), 0.0)
     assert len(marks.points) == len(ROW)
-    assert (answers.reshape(-1, 4)[:, 3] == -1).all()
+    assert (associations.reshape(-1, 4)[:, 3] == -1).all()
 
 
 def joined(groups, points, sigma=0.1, ids=None):
     """What is left of reflectors, of which each look sees those told; 0.02 m of noise is told."""
     rng, points = np.random.default_rng(0), np.array(points)
-    marks = Marks(points, np.full(len(points), ANONYMOUS) if ids is None else np.array(ids))
+    marks = ReflectorPoints(
+        points, np.full(len(points), ANONYMOUS) if ids is None else np.array(ids)
+    )
     looks = []
     for k, group in enumerate(map(list, groups)):
         seen = points[group] + sigma * rng.standard_normal((len(group), 2))
         looks.append(detections_of(seen, k, marks.ids[group], 0.02))
     match = BatchAssociation(looks, Reflector())
-    match.answer(np.zeros((len(looks), 3)), marks, 0.0)  # takes the detections to the map
+    match.associate(np.zeros((len(looks), 3)), marks, 0.0)  # takes the detections to the map
     return match.joined(marks, np.concatenate(groups))
 
 
 def test_a_cloud_that_no_look_has_two_of_is_one():
     """It lies where the detections of both say; all of them are its own."""
-    marks, answers = joined([[0], [1], [1], [1]] * 50, [[2.0, 1.0], [2.0, 1.2]])
+    marks, associations = joined([[0], [1], [1], [1]] * 50, [[2.0, 1.0], [2.0, 1.2]])
     np.testing.assert_allclose(marks.points, [[2.0, 1.15]], atol=0.03)
-    assert (answers == 0).all()
+    assert (associations == 0).all()
 
 
 @pytest.mark.parametrize(
@@ -109,9 +111,9 @@ def test_a_cloud_that_no_look_has_two_of_is_one():
     ],
 )
 def test_what_is_seen_together_or_far_apart_or_with_a_gap_between_stays_two(groups, gap, sigma):
-    marks, answers = joined(groups, [[2.0, 1.0], [2.0, 1.0 + gap]], sigma)
+    marks, associations = joined(groups, [[2.0, 1.0], [2.0, 1.0 + gap]], sigma)
     assert len(marks.points) == 2
-    assert set(answers.tolist()) == {0, 1}
+    assert set(associations.tolist()) == {0, 1}
 
 
 @pytest.mark.parametrize(
@@ -128,9 +130,9 @@ def test_what_becomes_near_by_joining_is_joined(points):
 
 def test_what_was_seen_with_a_part_is_not_joined_with_the_whole():
     points = [[2.0, 1.0], [2.0, 1.09], [2.0, 1.2]]
-    marks, answers = joined([[0], [1, 2]] * 50, points)
+    marks, associations = joined([[0], [1, 2]] * 50, points)
     assert len(marks.points) == 2
-    of = answers.reshape(-1, 3)
+    of = associations.reshape(-1, 3)
     assert (of[:, 0] != of[:, 2]).all()
     assert (of[:, 1] != of[:, 2]).all()
 
@@ -143,10 +145,10 @@ def test_ids_are_kept_and_not_mixed(ids, left):
 
 def test_without_any_nothing_is_joined():
     match = BatchAssociation([detections_of([[1.0, 1.0]], 0)], Reflector())
-    none = Marks(np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
-    marks, answers = match.joined(none, np.array([-1]))
+    none = ReflectorPoints(np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
+    marks, associations = match.joined(none, np.array([-1]))
     assert len(marks.points) == 0
-    assert answers.tolist() == [-1]
+    assert associations.tolist() == [-1]
 
 
 def test_a_cloud_that_scatters_more_than_it_tells_is_not_spread_over_many():
@@ -157,8 +159,8 @@ def test_a_cloud_that_scatters_more_than_it_tells_is_not_spread_over_many():
     match = BatchAssociation(
         [detections_of(p, k, None, 0.02) for k, p in enumerate(at)], Reflector()
     )
-    marks, answers = match.answer(np.zeros((num, 3)), marks_at(still), 0.0)
+    marks, associations = match.associate(np.zeros((num, 3)), marks_at(still), 0.0)
     before = len(marks.points) - 3
-    marks, _ = match.joined(marks, answers)
+    marks, _ = match.joined(marks, associations)
     assert before > 4
     assert len(marks.points) - 3 <= before // 2

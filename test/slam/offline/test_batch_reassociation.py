@@ -103,10 +103,10 @@ def test_rows_are_told_apart_though_the_path_is_off_by_their_gaps(seed):
     slam = Slam(Parameters())
     slam.process(made)
     slam.back_end.finish()
-    frames = slam.batch_reassociation.look_back(slam.back_end.trajectory()[1], slam.reflectors())
+    frames = slam.batch_reassociation.reassociate(slam.back_end.trajectory()[1], slam.reflectors())
     told, of = np.concatenate([f.landmarks for f in frames]), np.concatenate(truth)
     pairs = np.unique(np.stack([of, told])[:, told >= 0], axis=1, return_counts=True)[1]
-    assert np.sort(pairs)[-15:].sum() > 0.9 * len(of)  # one of the answers for each of the 15
+    assert np.sort(pairs)[-15:].sum() > 0.9 * len(of)  # one of the associations for each of the 15
 
 
 @pytest.mark.parametrize('seed', [0, 1, 2])
@@ -120,17 +120,17 @@ def test_reflector_by_itself_stays_one_however_it_scatters(seed):
 
 
 def test_what_is_told_apart_is_as_sure_as_it_was_measured():
-    """While it was taken for one, where it stands within its group was granted besides."""
+    """While it was taken for one, where it stands within its group was extra_variance besides."""
     place = world(SINGLE, SINGLE + 0.25 * BESIDE)
     made = observations(place, ROUND, rng=np.random.default_rng(1), scan=False, sigma=0.08)
     slam = Slam(Parameters())
-    granted = [
+    extra_variance = [
         np.abs(f.observation.detections.cov - o.detections.cov).max()
         for f, o in zip(slam.process(made), made, strict=True)
     ]
-    assert max(granted) > 0.05**2
+    assert max(extra_variance) > 0.05**2
     slam.back_end.finish()
-    told = slam.batch_reassociation.look_back(slam.back_end.trajectory()[1], slam.reflectors())
+    told = slam.batch_reassociation.reassociate(slam.back_end.trajectory()[1], slam.reflectors())
     for frame, o in zip(told, made, strict=True):
         np.testing.assert_array_equal(frame.observation.detections.cov, o.detections.cov)
 
@@ -147,10 +147,10 @@ def test_what_is_granted_the_path_its_answers_are_not_surer_than(monkeypatch):
     slam = run(world(SINGLE, SINGLE + 0.15 * BESIDE), 0, scan=False, sigma=0.03)
     monkeypatch.setattr(batch_reassociation, 'smooth', spy)
     slam.finish()
-    granted = Parameters().reflector.min_separation ** 2 * 0.5 ** np.arange(len(least))
-    granted[batch_reassociation.COLD :] = 0.0
-    assert len(least) > batch_reassociation.COLD
-    assert (np.array(least) >= granted).all()
+    extra_variance = Parameters().reflector.min_separation ** 2 * 0.5 ** np.arange(len(least))
+    extra_variance[batch_reassociation.ANNEALED :] = 0.0
+    assert len(least) > batch_reassociation.ANNEALED
+    assert (np.array(least) >= extra_variance).all()
     assert least[-1] < 2.0 * 0.03**2
 
 
@@ -220,7 +220,8 @@ def test_a_run_that_no_reflector_explains_keeps_its_map():
     slam.finish()
     assert len(slam.reflectors()) == 1
     assert (
-        slam.batch_reassociation.look_back(slam.back_end.trajectory()[1], slam.reflectors()) == []
+        slam.batch_reassociation.reassociate(slam.back_end.trajectory()[1], slam.reflectors())
+        == []
     )
 
 
@@ -233,7 +234,8 @@ def test_ids_are_kept():
 def test_with_scans_there_is_nothing_to_look_back_on():
     slam = run(ROOM, 4)
     assert (
-        slam.batch_reassociation.look_back(slam.back_end.trajectory()[1], slam.reflectors()) == []
+        slam.batch_reassociation.reassociate(slam.back_end.trajectory()[1], slam.reflectors())
+        == []
     )
 
 
@@ -249,4 +251,4 @@ def test_map_that_is_gone_on_with_stays_what_it_was():
     again.process([replace(o, stamp=o.stamp + 10**12) for o in made])
     again.finish()
     assert len(again.back_end.keyframes) >= keyframes
-    assert again.batch_reassociation.look_back(np.zeros((60, 3)), again.reflectors()) == []
+    assert again.batch_reassociation.reassociate(np.zeros((60, 3)), again.reflectors()) == []
