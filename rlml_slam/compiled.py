@@ -14,7 +14,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 from llvmlite import ir
-from numba.extending import intrinsic
+from numba.extending import intrinsic, register_jitable
 
 from rlml_slam.kernel_cache import remove_stale
 
@@ -41,6 +41,15 @@ def part(function: F) -> F:
     """A kernel that kernels alone call: without an entry from Python it compiles much faster."""
     options: dict[str, Any] = {'no_cpython_wrapper': True, 'no_cfunc_wrapper': True}
     return cast(F, numba.njit(cache=True, error_model='numpy', nogil=True, **options)(function))
+
+
+def formula(function: F) -> F:
+    """An expression of numbers that kernels inline; called from Python, NumPy evaluates it.
+
+    So that an equation is written once: kernels call it with scalars, batched code with arrays.
+    """
+    inlined: F = register_jitable(forceinline=True, error_model='numpy')(function)
+    return inlined
 
 
 def _load_word(_typing: Any, array: Any, _at: Any) -> Any:

@@ -15,14 +15,25 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rlml_slam.compiled import brief
+from rlml_slam.compiled import brief, formula
 
 Array = NDArray[np.float64]
 
 
+@formula
 def wrapped(angle: float) -> float:
-    """One angle [rad] moved to (-pi, pi], as :func:`wrap`."""
+    """One angle [rad] moved to (-pi, pi], as :func:`wrap`; for kernels too."""
     return math.pi - (math.pi - angle) % (2.0 * math.pi)
+
+
+@formula
+def wrapped_by_turns(angle: float) -> float:
+    """As :func:`wrapped`; an angle within (-pi, pi] keeps its bits, and there is no division.
+
+    For the inner loops of the solvers.
+    """
+    turns: float = np.ceil((angle - math.pi) / (2.0 * math.pi))
+    return angle - 2.0 * math.pi * turns
 
 
 def cos_sin(angle: float) -> tuple[float, float]:
@@ -92,13 +103,7 @@ def compose_belief(T_a_b: Array, T_b_c: Array, cov: Array) -> tuple[Array, Array
     """One T_a_c (3,), with the covariance (3, 3) of T_b_c turned from b's axes to a's."""
     c, s = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     x, y, turn = T_b_c[0], T_b_c[1], T_a_b[2] + T_b_c[2]
-    pose = np.array(
-        [
-            T_a_b[0] + c * x - s * y,
-            T_a_b[1] + s * x + c * y,
-            np.pi - (np.pi - turn) % (2.0 * np.pi),
-        ]
-    )
+    pose = np.array([T_a_b[0] + c * x - s * y, T_a_b[1] + s * x + c * y, wrapped(turn)])
     out = cov.copy()
     for k in range(3):
         u, v = out[0, k], out[1, k]

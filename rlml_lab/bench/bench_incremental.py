@@ -27,7 +27,7 @@ from rlml_lab.bench.rivals import Isam, single_thread, timed
 from rlml_slam import se2
 from rlml_slam.graph.batch.solver import optimize
 from rlml_slam.graph.incremental import incremental_solver
-from rlml_slam.graph.incremental.incremental_solver import Incremental
+from rlml_slam.graph.incremental.incremental_solver import IncrementalSolver
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.se2 import Array
 from rlml_slam.types import EdgeKind
@@ -95,7 +95,7 @@ class Ours:
     def __init__(self, source: Graph) -> None:
         self.source = source
         self.graph = Graph()
-        self.solver = Incremental(self.graph)
+        self.solver = IncrementalSolver(self.graph)
         self.landmark: dict[int, int] = {}
         self.work: list[Any] = []
 

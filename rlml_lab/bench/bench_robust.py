@@ -32,9 +32,9 @@ from rlml_lab.bench.robust_cases import (
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.errors import RlmlError
 from rlml_slam.graph.batch.solver import optimize
-from rlml_slam.graph.model.factor_table import FactorKind
+from rlml_slam.graph.model.factors import FactorKind, Losses
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.model.robust_loss import Loss, Losses, LossKind
+from rlml_slam.graph.model.robust_loss import Loss, LossKind
 from rlml_slam.graph.robust.closure_selection import select_closures
 from rlml_slam.graph.robust.graduated_non_convexity import graduate
 

@@ -23,7 +23,7 @@ from rlml_slam import params, se2
 from rlml_slam.errors import RlmlError
 from rlml_slam.graph.batch.initialization import initialize
 from rlml_slam.graph.batch.solver import optimize
-from rlml_slam.graph.model.factor_table import FactorKind
+from rlml_slam.graph.model.factors import FactorKind
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.maps.atomic_file import write_atomically
 from rlml_slam.se2 import Array

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from rlml_lab.bench.rivals import timed
 from rlml_lab.bench.robust_cases import Outcome
-from rlml_slam.graph.model.factor_table import FactorKind
+from rlml_slam.graph.model.factors import FactorKind
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.se2 import Array
 

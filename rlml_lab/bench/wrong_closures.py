@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.graph.model.factor_table import FactorKind
+from rlml_slam.graph.model.factors import FactorKind
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.se2 import Array
 from rlml_slam.types import EdgeKind

@@ -13,8 +13,9 @@ from rlml_slam import params
 from rlml_slam.errors import FileFormatError
 from rlml_slam.graph.batch.solver import Solution, optimize
 from rlml_slam.graph.g2o import read_graph, write_graph
+from rlml_slam.graph.model.factors import Losses
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.model.robust_loss import Loss, Losses, LossKind
+from rlml_slam.graph.model.robust_loss import Loss, LossKind
 from rlml_slam.graph.robust.closure_selection import select_closures
 from rlml_slam.graph.robust.graduated_non_convexity import graduate
 

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Graphs as text: g2o and TORO, plain or gzipped, 2D poses and landmarks.
+"""Pose-landmark graphs as text files: g2o and TORO, plain or gzipped.
 
 g2o    VERTEX_SE2 id x y th, VERTEX_XY id x y, FIX id ..., EDGE_SE2 i j dx dy dth I11 I12 I13 I22
-       I23 I33, EDGE_SE2_XY i j dx dy I11 I12 I22, EDGE_PRIOR_SE2, EDGE_PRIOR_XY
+       I23 I33, EDGE_SE2_XY i j dx dy I11 I12 I22, EDGE_PRIOR_SE2, EDGE_PRIOR_XY, and, which g2o
+       itself does not have, EDGE_RANGE_SE2_XY i j r I11: the distance of VERTEX_XY j from i
 TORO   VERTEX2 id x y th, EDGE2 i j dx dy dth I11 I12 I22 I33 I13 I23
 
 I is the information matrix of the residual (factors.py). What concerns no factor (DATA_*,
@@ -25,8 +26,8 @@ from numpy.typing import NDArray
 from rlml_slam.errors import FileFormatError
 from rlml_slam.graph.batch.initialization import initialize
 from rlml_slam.graph.model.factor_table import is_positive_definite
+from rlml_slam.graph.model.factors import FactorKind, Losses
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.model.robust_loss import Losses
 from rlml_slam.se2 import Array, rotation
 from rlml_slam.types import EdgeKind
 
@@ -39,7 +40,7 @@ UPPER_2 = ((0, 0), (0, 1), (1, 1))
 TAGS = {
     'VERTEX_SE2': (1, 3), 'VERTEX2': (1, 3), 'VERTEX_XY': (1, 2),
     'EDGE_SE2': (2, 9), 'EDGE2': (2, 9), 'EDGE_SE2_XY': (2, 5),
-    'EDGE_PRIOR_SE2': (1, 9), 'EDGE_PRIOR_XY': (1, 5),
+    'EDGE_PRIOR_SE2': (1, 9), 'EDGE_PRIOR_XY': (1, 5), 'EDGE_RANGE_SE2_XY': (2, 2),
 }  # fmt: skip
 ALIASES = {'VERTEX_POINT_XY': 'VERTEX_XY', 'EDGE_POINT_XY': 'EDGE_SE2_XY'}
 
@@ -229,6 +230,14 @@ def _add_sightings(
     info = _symmetric(v[:, 2:], UPPER_2, 2)
     _check(path, one, info, nodes[:, :1])
     graph.add_sightings(nodes, v[:, :2], info)
+    one = lines['EDGE_RANGE_SE2_XY']
+    nodes = _nodes(path, one, (poses, landmarks))
+    v = np.array(one.values, dtype=np.float64).reshape(-1, 2)
+    _check(path, one, v[:, 1:, None], nodes[:, :1])
+    if (v[:, 0] < 0.0).any():
+        number = one.numbers[int(np.argmax(v[:, 0] < 0.0))]
+        raise FileFormatError(f'{path}:{number}: the range is negative')
+    graph.add_ranges(nodes, v[:, 0], v[:, 1])
 
 
 def _add_priors(
@@ -283,7 +292,7 @@ def write_graph(
     path.write_bytes(gzip.compress(data, mtime=0) if path.suffix == '.gz' else data)
 
 
-def _row(tag: str, ids: Sequence[int], *values: Array) -> str:
+def _row(tag: str, ids: Sequence[int], *values: Array | np.float64) -> str:
     numbers = [repr(float(x)) for v in values for x in np.ravel(v)]
     return ' '.join([tag, *map(str, ids), *numbers])
 
@@ -305,6 +314,9 @@ def _g2o_lines(
         out.append(_row('EDGE_SE2', pose_ids[e.nodes[k]], e.measured[k], upper))
     for k in np.flatnonzero(s.enabled):
         ids = [pose_ids[s.nodes[k, 0]], landmark_ids[s.nodes[k, 1]]]
+        if s.kinds[k] == FactorKind.RANGE:
+            out.append(_row('EDGE_RANGE_SE2_XY', ids, s.measured[k, 0], s.information[k, 0, 0]))
+            continue
         out.append(_row('EDGE_SE2_XY', ids, s.measured[k], _pick(s.information[k], UPPER_2)))
     for k in np.flatnonzero(p.enabled):
         B = _axes(p.measured[k])

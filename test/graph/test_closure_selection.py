@@ -14,9 +14,9 @@ from rlml_slam.graph.batch.gauss_newton import gauss_newton
 from rlml_slam.graph.batch.marginals import Marginals
 from rlml_slam.graph.batch.solver import optimize
 from rlml_slam.graph.model import factors
-from rlml_slam.graph.model.factor_table import FactorKind
+from rlml_slam.graph.model.factors import FactorKind, Losses
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.model.robust_loss import Loss, Losses, LossKind
+from rlml_slam.graph.model.robust_loss import Loss, LossKind
 from rlml_slam.graph.robust import graduated_non_convexity
 from rlml_slam.graph.robust.closure_selection import ROUNDS, _Selector, select_closures
 from rlml_slam.graph.robust.graduated_non_convexity import graduate, truncated_weights

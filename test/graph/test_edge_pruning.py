@@ -10,12 +10,12 @@ from scipy import sparse
 
 from rlml_slam import se2
 from rlml_slam.graph.batch.marginals import Marginals
-from rlml_slam.graph.incremental.incremental_solver import Incremental
+from rlml_slam.graph.incremental.incremental_solver import IncrementalSolver
 from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.incremental.solver_state import IN_USE
-from rlml_slam.graph.model.factors import pose_landmark, relative_pose
+from rlml_slam.graph.model.factors import Losses, pose_landmark, relative_pose
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.model.robust_loss import Loss, Losses, LossKind
+from rlml_slam.graph.model.robust_loss import Loss, LossKind
 from rlml_slam.graph.reduction.edge_pruning import (
     AT_ONCE,
     leverages,
@@ -152,7 +152,7 @@ def test_factor_does_not_fill_however_long_edges_come_and_go():
 
 def room(graph):
     """Elements of the factor, ordered as a whole."""
-    solver = Incremental(graph)
+    solver = IncrementalSolver(graph)
     solver.update(whole=True)
     return int(solver._state.counts[IN_USE])
 

@@ -8,7 +8,8 @@ from made_graphs import loop_graph
 
 from rlml_slam.errors import SolverError
 from rlml_slam.graph.batch.solver import optimize
-from rlml_slam.graph.model.factor_table import Column, FactorKind, is_positive_definite
+from rlml_slam.graph.model.factor_table import Column, is_positive_definite
+from rlml_slam.graph.model.factors import FactorKind
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.types import EdgeKind
 
@@ -122,16 +123,16 @@ def test_a_copy_keeps_what_is_written_to_it_when_it_grows(copied, rows):
 def test_places_are_those_of_the_buffers_whatever_becomes_of_them():
     """A graph that has grown, let go of nodes or is a copy has others."""
     graph = loop_graph(0)[0]
-    first = graph.places()
-    assert graph.places() is first
+    first = graph.addresses()
+    assert graph.addresses() is first
     copies = [copy.deepcopy(graph), pickle.loads(pickle.dumps(graph))]
     graph.add_pose([0.0, 0.0, 0.0])
-    assert graph.places().at[0].tolist() == [graph.poses.ctypes.data, 31]
+    assert graph.addresses().at[0].tolist() == [graph.poses.ctypes.data, 31]
     graph.add_poses(np.zeros((99, 3)))
     kept = np.arange(130) < 20
     graph.keep(kept, np.ones(8, np.bool_))
     for one in (graph, *copies):
-        at, buffers = one.places()
+        at, buffers = one.addresses()
         t = one.tables()
         now = (
             one.poses, one.landmarks, t.fixed_poses, t.fixed_landmarks,

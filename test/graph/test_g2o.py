@@ -7,7 +7,7 @@ from made_graphs import loop_graph
 
 from rlml_slam.errors import FileFormatError
 from rlml_slam.graph.g2o import read_graph, write_graph
-from rlml_slam.graph.model.factor_table import FactorKind
+from rlml_slam.graph.model.factors import FactorKind
 from rlml_slam.graph.model.graph import Graph
 
 G2O = """\

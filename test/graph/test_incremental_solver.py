@@ -12,15 +12,15 @@ from rlml_lab.bench.generated_graphs import city, warehouse
 from rlml_slam import se2
 from rlml_slam.errors import SolverError
 from rlml_slam.graph.batch.solver import optimize
-from rlml_slam.graph.incremental.affected_subtree import WIDEST
+from rlml_slam.graph.incremental.affected_subtree import MAX_OWN_ROWS
 from rlml_slam.graph.incremental.incremental_solver import (
-    FILLED,
-    SCATTERED,
-    Incremental,
+    MAX_FILL_GROWTH,
+    MAX_FRAGMENTATION,
+    IncrementalSolver,
     Step,
     Thresholds,
 )
-from rlml_slam.graph.incremental.relinearization_test import NEAR, USUAL
+from rlml_slam.graph.incremental.relinearization_test import GROUP_SHARE, RESIDUAL_BOUND
 from rlml_slam.graph.incremental.solver_state import (
     CLIQUES,
     FACTORS,
@@ -31,11 +31,12 @@ from rlml_slam.graph.incremental.solver_state import (
     compacted,
     new_state,
 )
+from rlml_slam.graph.model.factors import Losses
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.model.robust_loss import Loss, Losses, LossKind
+from rlml_slam.graph.model.robust_loss import Loss, LossKind
 from rlml_slam.types import EdgeKind
 
-EXACT = Thresholds(due=1e-9, turn=1e-9, still=0.0)
+EXACT = Thresholds(linear=1e-9, turn=1e-9, wildfire=0.0)
 
 
 def driven(source: Graph) -> Ours:
@@ -111,27 +112,27 @@ def test_a_step_that_relinearizes_all_solves_the_linear_equations(whole: bool) -
     np.testing.assert_allclose(ours.graph.poses[:, :2], expected[:, :2], atol=1e-8)
 
 
-def test_a_pose_is_calm_for_as_long_as_its_factors_are_modelled_well() -> None:
-    """Turned by ``calm``, with residuals changed by USUAL sigmas, they are just off enough."""
+def test_linear_models_hold_up_to_the_valid_turn() -> None:
+    """Turned by it, with residuals changed by RESIDUAL_BOUND sigmas, they are just off enough."""
     solver = driven(loop_graph(3, poses=60, landmarks=12)[0]).solver
     z = solver._state.factors[: solver._state.counts[FACTORS]]
     z = z[z['a'] >= 0]
-    sigma, phi = 1.0 / np.sqrt(z['I00'] + z['I11']), z['calm']
+    sigma, phi = 1.0 / np.sqrt(z['I00'] + z['I11']), z['valid_turn']
     t = np.stack([z['dx'], z['dy']], -1)  # in axes in which the pose heads along x
     worst = np.zeros(len(z))
     for angle in np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False):
-        change = USUAL * sigma[:, None] * [np.cos(angle), np.sin(angle)]
+        change = RESIDUAL_BOUND * sigma[:, None] * [np.cos(angle), np.sin(angle)]
         turned = np.stack([np.zeros_like(phi), np.zeros_like(phi), phi], -1)
         now = se2.transform(turned, (t + change)[:, None])[:, 0]
         model = now + phi[:, None] * np.stack([t[:, 1], -t[:, 0]], -1)
         worst = np.maximum(worst, np.linalg.norm(t + change - model, axis=1) / sigma)
     limits = solver.thresholds
-    by_turn = phi == NEAR * limits.turn
+    by_turn = phi == GROUP_SHARE * limits.turn
     assert not by_turn.all()
     # half phi^2 of the change itself is not in the bound
-    assert (worst <= 1.01 * NEAR * limits.due).all()
-    assert (worst[~by_turn] >= 0.99 * NEAR * limits.due).all()
-    assert (phi <= NEAR * limits.turn).all()
+    assert (worst <= 1.01 * GROUP_SHARE * limits.linear).all()
+    assert (worst[~by_turn] >= 0.99 * GROUP_SHARE * limits.linear).all()
+    assert (phi <= GROUP_SHARE * limits.turn).all()
 
 
 def gauss_newton_step(graph: Graph) -> np.ndarray:
@@ -180,12 +181,12 @@ def test_a_step_factors_the_end_of_a_wide_root_and_not_all_of_it() -> None:
     # what all poses see, they tie to one clique
     for i in range(1, 9):
         see(0.1 * i, range(60))
-    solver = Incremental(graph)
+    solver = IncrementalSolver(graph)
     assert solver.update().refactored == 68
     for i in range(9, 12):
         see(0.1 * i, range(2))
         step = solver.update()
-    assert step.refactored <= WIDEST // 2 + 1
+    assert step.refactored <= MAX_OWN_ROWS // 2 + 1
     assert graph.chi2() == pytest.approx(batch_chi2(graph), rel=1e-3)
 
 
@@ -285,7 +286,7 @@ def test_priors_hold_a_graph_without_a_fixed_pose() -> None:
     graph.add_edge(EdgeKind.ODOMETRY, 0, 1, [1.0, 0.0, 0.1], np.eye(3))
     graph.add_sighting(1, 0, [0.0, 1.0], np.eye(2))
     graph.add_landmark_prior(0, [1.0, 1.5], np.eye(2))
-    solver = Incremental(graph, EXACT)
+    solver = IncrementalSolver(graph, EXACT)
     for _ in range(10):
         solver.update()
     before = graph.poses.copy()
@@ -295,7 +296,7 @@ def test_priors_hold_a_graph_without_a_fixed_pose() -> None:
 
 def test_a_landmark_that_was_seen_before_is_surveyed() -> None:
     graph, _, points = loop_graph(4)
-    solver = Incremental(graph, EXACT)
+    solver = IncrementalSolver(graph, EXACT)
 
     def at_the_optimum() -> None:
         for _ in range(10):
@@ -345,7 +346,7 @@ def test_memory_is_that_of_the_tree_whatever_came_and_went() -> None:
     """Blocks come and go with each closure; what they leave behind is given back."""
     rng = np.random.default_rng(0)
     graph = city(400)
-    solver = Incremental(graph)
+    solver = IncrementalSolver(graph)
     solver.update()
     closures = np.flatnonzero(graph.edges.kinds == 2)
     for _ in range(300):
@@ -353,9 +354,9 @@ def test_memory_is_that_of_the_tree_whatever_came_and_went() -> None:
         solver.update()
         in_use = int(solver._state.counts[IN_USE])
         # the quarter to spare, on what one more step may need besides
-        assert len(solver._pool) <= 1.25 * SCATTERED * (in_use + LITTLE)
+        assert len(solver._pool) <= 1.25 * MAX_FRAGMENTATION * (in_use + LITTLE)
     solver.update(whole=True)
-    assert in_use < FILLED * solver._state.counts[IN_USE] + LITTLE
+    assert in_use < MAX_FILL_GROWTH * solver._state.counts[IN_USE] + LITTLE
 
 
 def test_pool_without_gaps_holds_the_same_tree() -> None:
@@ -381,7 +382,7 @@ def test_clique_is_moved_once_whatever_lies_where_it_came_to() -> None:
     own = (1, 2, 1)
     state.unknowns['clique'] = -1
     for c in range(3):
-        state.cliques[c]['block'], state.cliques[c]['room'] = at[c], 0
+        state.cliques[c]['block'], state.cliques[c]['size_class'] = at[c], 0
         numbers[at[c] : at[c] + len(members[c])] = members[c]
         state.unknowns['clique'][members[c][: own[c]]] = c
     state.counts[UNKNOWNS], state.counts[CLIQUES], state.counts[IN_USE] = 40, 3, 48
@@ -396,7 +397,7 @@ def test_clique_is_moved_once_whatever_lies_where_it_came_to() -> None:
 def test_many_changes_at_a_time_do_not_fill_the_tree() -> None:
     """An order that keeps many for the end has fronts of all of them."""
     graph = warehouse(300, 40)
-    solver = Incremental(graph)
+    solver = IncrementalSolver(graph)
     solver.update(whole=True)
     before = int(solver._state.counts[IN_USE])
     graph.sightings.enabled[graph.sightings.nodes[:, 1] % 3 == 0] = False
@@ -406,7 +407,7 @@ def test_many_changes_at_a_time_do_not_fill_the_tree() -> None:
 
 def test_whether_an_update_is_due_is_told() -> None:
     graph = chain(12)
-    solver = Incremental(graph)
+    solver = IncrementalSolver(graph)
     assert not solver.is_current
     changes = (
         lambda: graph.add_pose([12.0, 0.0, 0.0]),

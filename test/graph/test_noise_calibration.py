@@ -10,8 +10,7 @@ from scipy import stats
 from test_closure_selection import laps, optimum
 
 from rlml_slam.graph.batch.marginals import Marginals
-from rlml_slam.graph.model.factor_table import FactorKind
-from rlml_slam.graph.model.factors import relative_pose
+from rlml_slam.graph.model.factors import FactorKind, relative_pose
 from rlml_slam.graph.robust.inlier_evidence import near_by, uniform
 from rlml_slam.graph.robust.noise_calibration import FREEDOMS, Calibration, calibrate
 from rlml_slam.graph.robust.relative_covariance import (

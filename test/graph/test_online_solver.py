@@ -14,8 +14,9 @@ from rlml_slam.graph.batch.marginals import Marginals
 from rlml_slam.graph.batch.solver import optimize
 from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.cost import total_cost
+from rlml_slam.graph.model.factors import Losses
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.model.robust_loss import Loss, Losses, LossKind, loss
+from rlml_slam.graph.model.robust_loss import Loss, LossKind, loss
 from rlml_slam.graph.reduction.marginalization import eliminate
 from rlml_slam.types import EdgeKind
 

@@ -12,9 +12,10 @@ from rlml_slam.graph.batch.marginals import Marginals
 from rlml_slam.graph.batch.second_start import restart
 from rlml_slam.graph.batch.solver import optimize
 from rlml_slam.graph.g2o import read_graph
+from rlml_slam.graph.model.factors import Losses
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.model.normal_equations import system_of
-from rlml_slam.graph.model.robust_loss import Loss, Losses, LossKind
+from rlml_slam.graph.model.normal_equations import build_system
+from rlml_slam.graph.model.robust_loss import Loss, LossKind
 from rlml_slam.types import EdgeKind
 
 TIGHT = params.Solver(relative_tolerance=1e-12, initialization='none')
@@ -272,7 +273,7 @@ def test_headings_that_are_hardly_known_do_not_hide_the_optimum(seed):
 def test_a_second_start_is_left_where_going_on_is_better():
     graph, _, _ = loop_graph(seed=2, start_noise=0.1)
     best = optimize(graph).chi2_final
-    found = restart(system_of(graph), graph.poses, graph.landmarks, 1, 1e-5, 0.0)
+    found = restart(build_system(graph), graph.poses, graph.landmarks, 1, 1e-5, 0.0)
     assert found.cost <= best
     assert graph.chi2() == pytest.approx(found.chi2, rel=1e-9)
 

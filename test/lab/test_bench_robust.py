@@ -15,7 +15,7 @@ from rlml_lab.main import main
 from rlml_slam import se2
 from rlml_slam.cli.main import main as rlml
 from rlml_slam.graph.g2o import read_graph, write_graph
-from rlml_slam.graph.model.factor_table import FactorKind
+from rlml_slam.graph.model.factors import FactorKind
 
 
 @pytest.fixture

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from rlml_slam import se2
+from rlml_slam.graph.model.factors import Losses
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.model.robust_loss import Losses
 from rlml_slam.types import EdgeKind
 
 SHARED_GRAPHS = Path(__file__).resolve().parents[2].parent / 'shared' / 'data' / 'graphs-2d'
@@ -58,4 +58,35 @@ def loop_graph(
         for k in np.flatnonzero(np.hypot(*seen.T) < 6.0):
             z = seen[k] + noise * 0.03 * rng.standard_normal(2)
             graph.add_sighting(i, int(k), z, np.eye(2) / 0.03**2)
+    return graph, truth, points
+
+
+def range_graph(
+    seed: int = 0,
+    poses: int = 30,
+    beacons: int = 2,
+    noise: float = 1.0,
+    start_noise: float = 0.0,
+    losses: Losses | None = None,
+) -> tuple[Graph, np.ndarray, np.ndarray]:
+    """A robot on two laps of an ellipse that hears beacons at a range: (graph, truth, truth)."""
+    rng = np.random.default_rng(seed)
+    phi = 4.0 * np.pi * np.arange(poses) / poses
+    truth = np.stack([5 * np.cos(phi), 3 * np.sin(phi), se2.wrap(phi + np.pi / 2)], -1)
+    points = np.array([[2.0, 1.0], [-6.0, 4.0], [7.0, -3.0], [0.0, -8.0]])[:beacons]
+    sigma, sigma_range = np.array([0.05, 0.05, 0.02]), 0.1
+    graph = Graph(losses)
+    start = truth + start_noise * rng.standard_normal(truth.shape) * [0.1, 0.1, 0.05]
+    start[0] = truth[0]
+    graph.add_poses(start)
+    graph.fixed_poses[0] = True
+    graph.add_landmarks(points + start_noise * 0.2 * rng.standard_normal(points.shape))
+    for i in range(poses - 1):
+        e = noise * sigma * rng.standard_normal(3)
+        delta = se2.compose(se2.between(truth[i], truth[i + 1]), e)
+        graph.add_edge(EdgeKind.ODOMETRY, i, i + 1, delta, np.diag(sigma**-2))
+    for i in range(poses):
+        for k in range(beacons):
+            r = np.hypot(*(points[k] - truth[i, :2])) + noise * sigma_range * rng.standard_normal()
+            graph.add_range(i, k, max(r, 0.0), sigma_range**-2.0)
     return graph, truth, points

@@ -61,7 +61,7 @@ def unknowns(graph: Graph) -> Unknowns:
         i = int(np.argmax(loose))
         name = f'pose {i}' if i < n else f'landmark {i - n}'
         raise SolverError(
-            f'{name} and what is connected to it is not tied to the map: '
+            f'{name} and what is connected to it is not anchored to the map: '
             'fix a pose, or add a prior or two fixed landmarks'
         )
     width = np.where(np.arange(n + m) < n, 3, 2) * (touched & ~fixed)
@@ -87,7 +87,7 @@ def normal_equations(graph: Graph, columns: Unknowns, weighted: bool = True) -> 
     a, k = s.nodes.T
     parts = [
         (e, factors.relative_pose(X[i], X[j], e.measured), (columns.poses[i], columns.poses[j])),
-        (s, factors.pose_landmark(X[a], m[k], s.measured),
+        (s, factors.pose_landmark(X[a], m[k], s.measured, s.kinds),
          (columns.poses[a], columns.landmarks[k])),
         (p, factors.pose_prior(X[p.nodes[:, 0]], p.measured), (columns.poses[p.nodes[:, 0]],)),
         (q, factors.landmark_prior(m[q.nodes[:, 0]], q.measured),

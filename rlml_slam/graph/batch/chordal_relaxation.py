@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chordal relaxation: a start for bad estimates, from linear least squares alone.
+"""Chordal relaxation: initial estimate from linear least squares alone.
 
 With r = (cos, sin) of a pose's heading taken as any complex number, t its position and m a
 landmark as complex numbers, the residuals
 
     edge       r_j - e^(i theta_delta) r_i   and   t_j - t_i - r_i t_delta
     sighting   m - t - r z
+    range      m - t, of little weight; such landmarks are trilaterated in the end
 
 are linear (Martinec & Pajdla 2007; Carlone, Tron, Daniilidis & Dellaert 2015). Weights are the
 information of the angle and the mean information of the position, because the axes of the
@@ -14,11 +15,11 @@ so the same fronts serve with two rows per unknown. Without sightings the headin
 alone; with sightings all at once, because then the landmarks are what ties them together.
 Positions follow with the headings back on the unit circle.
 
-What one fixed heading tells fades with the distance and the noise: relaxed headings get shorter
-from edge to edge, by orders of magnitude in large or noisy graphs, and follow the few edges on
-the way rather than all. So they are taken back to length 1 and solved for again, r <- H^-1 (w r /
-|r| - g) with the factor at hand, which turns them towards the maximum of r^H H^-1 r among those
-of length 1 (the generalised power method: Boumal 2016).
+The influence of one fixed heading fades with the distance and the noise: relaxed headings get
+shorter from edge to edge, by orders of magnitude in large or noisy graphs, and follow the few
+edges on the way rather than all. So they are normalised to length 1 and solved for again, r <-
+H^-1 (w r / |r| - g) with the same factor, which turns them towards the maximum of r^H H^-1 r among
+those of length 1 (the generalised power method: Boumal 2016).
 """
 
 from __future__ import annotations
@@ -28,55 +29,67 @@ import math
 import numpy as np
 
 from rlml_slam.compiled import kernel, part
-from rlml_slam.graph.model.packed_system import System, place
-from rlml_slam.graph.sparse.multifrontal import factorise, lay_out, room, solve_lower, solve_upper
+from rlml_slam.graph.batch.landmark_start import place_by_ranges
+from rlml_slam.graph.model.factors import relaxed
+from rlml_slam.graph.model.packed_system import System, assign_addresses
+from rlml_slam.graph.sparse.multifrontal import (
+    factorise,
+    layout_fronts,
+    reuse_or_allocate,
+    solve_lower,
+    solve_upper,
+)
 from rlml_slam.graph.sparse.symbolic_analysis import Records
 from rlml_slam.se2 import Array
 
-# Relaxed headings get shorter from node to node, the more the noisier the edges are. Where they
-# are shorter than this, they are worth TURNS solves more, or until none turns by SETTLED.
-WEAK = 1e-4
-TURNS = 10
-SETTLED = 0.01
+# Relaxed headings get shorter from node to node, the more the noisier the edges are. Where one is
+# shorter than SHORT, up to POWER_STEPS power iterations follow, until none turns by CONVERGED.
+SHORT = 1e-4
+POWER_STEPS = 10
+CONVERGED = 0.01  # sum of the changes of cosine and sine; half a degree is less than edges' noise
 
 
 @kernel
 def relax(system: System, poses: Array, landmarks: Array) -> bool:
     """Overwrite the free nodes by the relaxed solution; False if it cannot be solved.
 
-    The panels of the system serve as memory: it has to be linearised anew.
+    The panels of the system serve as memory: it has to be linearised from_relaxed.
     """
-    shift = len(system.sightings) > 0
-    return _relax(system, poses, landmarks, shift, True, TURNS, WEAK)
+    jointly = len(system.sightings) > 0
+    return _relax(system, poses, landmarks, jointly, True, POWER_STEPS, SHORT)
 
 
 @kernel
-def relax_jointly(system: System, poses: Array, landmarks: Array, anew: bool, turns: int) -> bool:
-    """As relax, but headings together with positions, and held to length 1 for ``turns``.
+def relax_jointly(
+    system: System, poses: Array, landmarks: Array, from_relaxed: bool, power_steps: int
+) -> bool:
+    """As relax, but headings together with positions, and always with ``power_steps``.
 
-    These begin with the headings at hand or, ``anew``, with the relaxed ones.
+    These begin with the relaxed headings, or with the current ones.
     """
-    return _relax(system, poses, landmarks, True, anew, turns, math.inf)
+    return _relax(system, poses, landmarks, True, from_relaxed, power_steps, math.inf)
 
 
 @part
 def _relax(
-    system: System, poses: Array, landmarks: Array, shift: bool, anew: bool, turns: int,
-    weak: float,
+    system: System, poses: Array, landmarks: Array, jointly: bool, from_relaxed: bool,
+    power_steps: int, short: float,
 ) -> bool:  # fmt: skip
     n, variables = len(poses), system.variables
     units = np.empty((n, 2))
     for i in range(n):
         units[i, 0], units[i, 1] = math.cos(poses[i, 2]), math.sin(poses[i, 2])
-    good = _headings(system, poses, landmarks, units, shift, anew, turns, weak)
+    good = _headings(system, poses, landmarks, units, jointly, from_relaxed, power_steps, short)
     if good:
         for a in range(len(variables)):
             i = variables[a]['node']
             if i < n:
                 poses[i, 2] = math.atan2(units[i, 1], units[i, 0])
         good = _positions(system, poses, landmarks)
-    place(system.structure, system.fronts, system.entries, variables, system.edges,
-          system.sightings)  # fmt: skip
+    place_by_ranges(system, poses, landmarks)
+    assign_addresses(
+        system.structure, system.fronts, system.entries, variables, system.edges, system.sightings
+    )
     return good
 
 
@@ -88,9 +101,9 @@ def _positions(system: System, poses: Array, landmarks: Array) -> bool:
     dims = np.empty(num, np.int64)
     for a in range(num):
         dims[a] = 1
-    fronts, entries, size = lay_out(system.structure, dims)
-    place(system.structure, fronts, entries, variables, edges, sightings)
-    v = room(system.values, fronts[len(fronts) - 1]['panel'])
+    fronts, entries, size = layout_fronts(system.structure, dims)
+    assign_addresses(system.structure, fronts, entries, variables, edges, sightings)
+    v = reuse_or_allocate(system.values, fronts[len(fronts) - 1]['panel'])
     for i in range(len(v)):
         v[i] = 0.0
     gx, gy = np.empty(num), np.empty(num)
@@ -100,13 +113,13 @@ def _positions(system: System, poses: Array, landmarks: Array) -> bool:
         if f < len(edges):
             z = edges[f]
             i, j, a, b, k = z['i'], z['j'], z['a'], z['b'], z['block']
-            w, x, y = 0.5 * (z['I00'] + z['I11']), z['x'], z['y']
+            w, x, y = relaxed(z['kind'], z['I00'], z['I11'], z['x'], z['y'])
             angle = poses[i, 2] + z['theta']  # the record holds R_delta^T t_delta
             tx, ty = poses[j, 0], poses[j, 1]
         else:
             q = sightings[f - len(edges)]
             i, j, a, b, k = q['i'], q['j'], q['a'], q['b'], q['block']
-            w, x, y = 0.5 * (q['I00'] + q['I11']), q['x'], q['y']
+            w, x, y = relaxed(q['kind'], q['I00'], q['I11'], q['x'], q['y'])
             angle = poses[i, 2]
             tx, ty = landmarks[j, 0], landmarks[j, 1]
         c, s = math.cos(angle), math.sin(angle)
@@ -132,7 +145,7 @@ def _positions(system: System, poses: Array, landmarks: Array) -> bool:
             gx[variables[a]['scalar']] += w * (x - p['x'])
             gy[variables[a]['scalar']] += w * (y - p['y'])
             v[variables[a]['address']] += w
-    left, right = room(system.left, size[0]), room(system.right, size[1])
+    left, right = reuse_or_allocate(system.left, size[0]), reuse_or_allocate(system.right, size[1])
     if factorise(fronts, entries, v, left, right, gx) >= 0:
         return False
     solve_lower(fronts, entries, v, gy)
@@ -151,10 +164,10 @@ def _positions(system: System, poses: Array, landmarks: Array) -> bool:
 
 @part
 def _headings(
-    system: System, poses: Array, landmarks: Array, units: Array, shift: bool, anew: bool,
-    turns: int, weak: float,
+    system: System, poses: Array, landmarks: Array, units: Array, jointly: bool,
+    from_relaxed: bool, power_steps: int, short: float,
 ) -> bool:  # fmt: skip
-    """Solve for the directions ``units`` (n, 2); with ``shift`` together with the positions."""
+    """Solve for the directions ``units`` (n, 2); with ``jointly`` together with the positions."""
     variables, edges, sightings = system.variables, system.edges, system.sightings
     n, num = len(poses), len(variables)
     state, points = np.empty((n, 4)), landmarks.copy()  # r and t
@@ -165,39 +178,39 @@ def _headings(
     rows = 0
     for a in range(num):
         i = variables[a]['node']
-        dims[a] = (2 if i < n else 0) + (2 if shift else 0)
+        dims[a] = (2 if i < n else 0) + (2 if jointly else 0)
         rows += dims[a]
-        # from 0 on, so that g is what the fixed nodes and the priors tell, and headings that get
-        # ever shorter keep their digits
+        # from 0 on, so that g is the pull of the fixed nodes and the priors alone, and headings
+        # that get ever shorter keep their digits
         if i < n:
             state[i, 0] = state[i, 1] = state[i, 2] = state[i, 3] = 0.0
         else:
             points[i - n, 0] = points[i - n, 1] = 0.0
-    fronts, entries, size = lay_out(system.structure, dims)
-    place(system.structure, fronts, entries, variables, edges, sightings)
-    values = room(system.values, fronts[len(fronts) - 1]['panel'])
+    fronts, entries, size = layout_fronts(system.structure, dims)
+    assign_addresses(system.structure, fronts, entries, variables, edges, sightings)
+    values = reuse_or_allocate(system.values, fronts[len(fronts) - 1]['panel'])
     for i in range(len(values)):
         values[i] = 0.0
     g, x = np.empty(rows), np.empty(rows)
     for i in range(rows):
         g[i] = 0.0
-    _edges(edges, variables, state, values, g, shift)
-    if shift:
+    _edges(edges, variables, state, values, g, jointly)
+    if jointly:
         _sightings(sightings, variables, state, points, values, g)
-    _priors(system.priors, variables, state, points, values, g, shift)
-    weight = 0.0  # of one turn, beside what is fixed
+    _priors(system.priors, variables, state, points, values, g, jointly)
+    weight = 0.0  # of the current direction in a power iteration: the mean of the diagonal
     for a in range(num):
         if variables[a]['node'] < n:
             weight += values[variables[a]['address']] / num
     for i in range(rows):
         x[i] = -g[i]
-    left, right = room(system.left, size[0]), room(system.right, size[1])
+    left, right = reuse_or_allocate(system.left, size[0]), reuse_or_allocate(system.right, size[1])
     if factorise(fronts, entries, values, left, right, x) >= 0:
         return False
     solve_upper(fronts, entries, values, x)
-    if anew and _directions(variables, x, units)[0] > weak:
+    if from_relaxed and _directions(variables, x, units)[0] > short:
         return True
-    for _ in range(turns):
+    for _ in range(power_steps):
         for i in range(rows):
             x[i] = -g[i]
         for a in range(num):
@@ -207,7 +220,7 @@ def _headings(
                 x[k + 1] += weight * units[i, 1]
         solve_lower(fronts, entries, values, x)
         solve_upper(fronts, entries, values, x)
-        if _directions(variables, x, units)[1] < SETTLED:
+        if _directions(variables, x, units)[1] < CONVERGED:
             break
     return True
 
@@ -240,7 +253,7 @@ def _add(v: Array, k: int, ld: int, re: float, im: float) -> None:
 
 @part
 def _edges(
-    edges: Records, variables: Records, state: Array, v: Array, g: Array, shift: bool
+    edges: Records, variables: Records, state: Array, v: Array, g: Array, jointly: bool
 ) -> None:
     for f in range(len(edges)):
         z = edges[f]
@@ -267,7 +280,7 @@ def _edges(
             _add(v, kb, lb, w, 0.0)
         if block >= 0:
             _add(v, block, ld, -w * c, -w * s if first else w * s)
-        if not shift:
+        if not jointly:
             continue
         w = 0.5 * (z['I00'] + z['I11'])
         # the record holds R_delta^T t_delta
@@ -301,7 +314,7 @@ def _sightings(
     for f in range(len(sightings)):
         z = sightings[f]
         i, j, a, b = z['i'], z['j'], z['a'], z['b']
-        w, x, y = 0.5 * (z['I00'] + z['I11']), z['x'], z['y']
+        w, x, y = relaxed(z['kind'], z['I00'], z['I11'], z['x'], z['y'])
         e0 = w * (landmarks[j, 0] - state[i, 2] - x * state[i, 0] + y * state[i, 1])
         e1 = w * (landmarks[j, 1] - state[i, 3] - y * state[i, 0] - x * state[i, 1])
         ga, gb, ld = 0, 0, 0
@@ -333,7 +346,7 @@ def _sightings(
 @part
 def _priors(
     priors: Records, variables: Records, state: Array, landmarks: Array, v: Array, g: Array,
-    shift: bool,
+    jointly: bool,
 ) -> None:  # fmt: skip
     n = len(state)
     for f in range(len(priors)):
@@ -353,7 +366,7 @@ def _priors(
             x, y = state[i, 2], state[i, 3]
         else:
             x, y = landmarks[i - n, 0], landmarks[i - n, 1]
-        if shift:
+        if jointly:
             w = 0.5 * (z['I00'] + z['I11'])
             g[gk] += w * (x - z['x'])
             g[gk + 1] += w * (y - z['y'])

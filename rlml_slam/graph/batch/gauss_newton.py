@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled Gauss-Newton.
+"""Gauss-Newton, compiled: H dx = -g, x <- x + dx.
 
-It may climb for a few steps, which is how it leaves the bad starts in which methods that must
-descend get stuck.
+The cost may rise for a few steps, which is how it leaves bad starts in which methods that must
+descend stay.
 
-When to stop costs no further factorisation. With q the error of the linear model r + J d, a step
-leaves the cost at |r + J d + q|^2 where |r + J d|^2 was promised, and what the next step can gain
-is the part of |q|^2 that its model reaches: as long as the cost is what was promised, little is
-left to gain. Where that does not tell, and with robust losses, which bring more than is promised,
-the old factor, at the price of half a solve, estimates the gain of a further step. Neither is a
+The stopping test needs no further factorization. With q the error of the linear model r + J d, a
+step leaves the cost at |r + J d + q|^2 where |r + J d|^2 was predicted, and what the next step can
+gain is the part of |q|^2 that its model reaches: as long as the cost is the predicted one, little
+is left to gain. Where it is not, and with robust losses, whose cost falls by more than predicted,
+the old factor, at the cost of half a solve, predicts the gain of a further step. Neither is a
 bound: of small graphs with landmarks one in ten gains up to twenty times the tolerance by one
-more step. The factor is not good for the step itself: lines of sight that turn by little couple
-what is stiff with what is soft.
+more step. The old factor is not good for the step itself: lines of sight that turn by little
+couple directions of high and of low information.
 """
 
 from __future__ import annotations
@@ -20,14 +20,15 @@ import math
 from typing import NamedTuple
 
 from rlml_slam.compiled import kernel, part
-from rlml_slam.graph.model.linearization import linearize, linearize_here, move
+from rlml_slam.graph.model.linearization import apply_step, linearize, linearize_again
 from rlml_slam.graph.model.packed_system import System
 from rlml_slam.graph.sparse.multifrontal import factorise, solve_lower, solve_upper
 from rlml_slam.se2 import Array
 
 # Gauss-Newton gives up after this many steps in a row without a new lowest cost
 PATIENCE = 4
-# after a step that promises more than this share of the cost, the old factor is not asked
+# After a step whose predicted decrease is more than this share of the cost, the old factor is not
+# used: it cannot predict the end of a descent that has just begun.
 FAR = 0.5
 
 
@@ -67,7 +68,7 @@ def factor(system: System) -> int:
 
 @kernel
 def newton_step(system: System) -> float:
-    """Step = -H^-1 g after ``factor``; returns the decrease that it promises, -g step."""
+    """Step = -H^-1 g after ``factor``; returns the predicted decrease, -g step."""
     decrease = _squares(system.step)
     solve_upper(system.fronts, system.entries, system.values, system.step)
     return decrease
@@ -78,9 +79,9 @@ def gauss_newton(
     system: System, poses: Array, landmarks: Array, cost: float, chi2: float,
     max_iterations: int, tolerance: float, floor: float,
 ) -> Progress:  # fmt: skip
-    """Gauss-Newton with patience; ends at the best estimate that it met.
+    """Gauss-Newton with patience; ends at the best estimate on the way.
 
-    The system is to be linearised at the start, where it has ``cost`` and ``chi2``. Converged
+    The system is to be linearized at the start, where it has ``cost`` and ``chi2``. Converged
     means that a further step is expected to lower the cost by less than ``tolerance`` of it plus
     ``floor``.
     """
@@ -91,16 +92,16 @@ def gauss_newton(
         robust = robust or system.losses[k, 0] != 0
     iterations, misses, converged = 0, 0, False
     while misses <= PATIENCE and math.isfinite(cost) and factor(system) < 0:
-        promised = _squares(system.step)
-        converged = promised <= tolerance * cost + floor
+        predicted = _squares(system.step)
+        converged = predicted <= tolerance * cost + floor
         if converged or iterations == max_iterations:
             break
         solve_upper(system.fronts, system.entries, system.values, system.step)
-        move(system.variables, system.step, poses, landmarks)
+        apply_step(system.variables, system.step, poses, landmarks)
         iterations += 1
-        model = cost - promised
-        # near the minimum the panels hold the old factor until it has been asked
-        far = not robust and promised > FAR * cost
+        model = cost - predicted
+        # near the minimum the panels hold the old factor until it has been used
+        far = not robust and predicted > FAR * cost
         cost, chi2 = linearize(system, poses, landmarks, far)
         if cost < best:
             best, best_chi2, misses = cost, chi2, 0
@@ -111,11 +112,11 @@ def gauss_newton(
         small = tolerance * cost + floor
         converged = not robust and abs(cost - model) <= small
         if not (converged or far):
-            converged = _promise(system) <= small
+            converged = _predicted_decrease(system) <= small
         if converged:
             break
         if not far:
-            linearize_here(system, poses, landmarks, True)
+            linearize_again(system, poses, landmarks, True)
     if not cost <= best:
         copy(kept, poses)
         copy(kept_landmarks, landmarks)
@@ -125,8 +126,8 @@ def gauss_newton(
 
 
 @part
-def _promise(system: System) -> float:
-    """What a step with the factor at hand would bring at the gradient at hand."""
+def _predicted_decrease(system: System) -> float:
+    """Decrease of the cost by a step with the old factor at the new gradient."""
     g, step = system.g, system.step
     for i in range(len(g)):
         step[i] = -g[i]

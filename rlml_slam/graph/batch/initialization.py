@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Starts from the factors alone: plain odometry, spanning tree, chordal relaxation."""
+"""Initial estimates from the factors alone: plain odometry, spanning tree, chordal relaxation."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from scipy import sparse
 
 from rlml_slam.errors import SolverError
 from rlml_slam.graph.batch.chordal_relaxation import relax
+from rlml_slam.graph.batch.landmark_start import place_landmarks
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.model.normal_equations import system_of
-from rlml_slam.se2 import Array, compose, inverse, transform
+from rlml_slam.graph.model.normal_equations import build_system
+from rlml_slam.se2 import Array, compose, inverse
 
 METHODS = ('none', 'odometry', 'spanning_tree', 'chordal')
 
@@ -21,7 +22,7 @@ def initialize(graph: Graph, method: str) -> None:
     if method not in METHODS:
         raise SolverError(f'initialization {method!r} is none of {", ".join(METHODS)}')
     if method == 'chordal':
-        relax(system_of(graph), graph.poses, graph.landmarks)
+        relax(build_system(graph), graph.poses, graph.landmarks)
     elif method != 'none' and len(graph.poses):
         spanning_tree(graph, consecutive_first=method == 'odometry')
 
@@ -79,18 +80,3 @@ def _compose_tree(
         delta = graph.edges.measured[k]
         forward = graph.edges.nodes[k, 0] == a
         graph.poses[b] = compose(graph.poses[a], delta if forward else inverse(delta))
-
-
-def place_landmarks(graph: Graph) -> None:
-    """Free landmarks at the mean of where their enabled sightings put them."""
-    s = graph.sightings
-    use = np.flatnonzero(s.enabled)
-    if not len(use):
-        return
-    a, k = s.nodes[use].T
-    points = transform(graph.poses[a], s.measured[use][:, None, :])[:, 0]
-    total = np.zeros_like(graph.landmarks)
-    np.add.at(total, k, points)
-    count = np.bincount(k, minlength=len(graph.landmarks))
-    move = (count > 0) & ~graph.fixed_landmarks
-    graph.landmarks[move] = total[move] / count[move, None]

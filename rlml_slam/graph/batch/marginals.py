@@ -13,7 +13,7 @@ from rlml_slam.graph.batch.gauss_newton import factor
 from rlml_slam.graph.batch.selected_inverse import columns, joint, selected_blocks
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.graph.model.linearization import linearize
-from rlml_slam.graph.model.normal_equations import system_of
+from rlml_slam.graph.model.normal_equations import build_system
 from rlml_slam.se2 import Array
 from rlml_slam.types import EdgeKind
 
@@ -26,7 +26,7 @@ class Marginals:
     """
 
     def __init__(self, graph: Graph) -> None:
-        self._system = system = system_of(graph)
+        self._system = system = build_system(graph)
         linearize(system, graph.poses, graph.landmarks, True)
         failed = factor(system)
         num_poses = len(graph.poses)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Second starts, for graphs in which Gauss-Newton gets lost from the first one.
+"""Second start, for graphs in which Gauss-Newton does not converge from the first one.
 
-Where the headings that edges measure are so poor that relaxed ones mean little, the positions
-know better: both are relaxed together then, and the headings held to length 1. That begins with
-the headings relaxed alone or with none; now the one, now the other ends in the right valley, most
-often the one of lower cost.
+Where the headings that edges measure are too noisy for a relaxation on their own, the positions
+determine them better: both are relaxed together, with power iterations. These begin with the
+headings relaxed alone or with the joint relaxation; which of the two leads to the global optimum
+differs, most often it is the one of lower cost.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rlml_slam.graph.model.linearization import linearize
 from rlml_slam.graph.model.packed_system import System
 from rlml_slam.se2 import Array
 
-# solves with headings held to length 1: from those relaxed alone, from none
+# power iterations: from headings relaxed alone, from the joint relaxation
 FEW, MANY = 3, 20
 
 Estimate = tuple[Array, Array]
@@ -27,7 +27,7 @@ def restart(
     system: System, poses: Array, landmarks: Array, max_iterations: int, tolerance: float,
     floor: float,
 ) -> Progress:  # fmt: skip
-    """Descend from a second start, or on from the estimate at hand where that is the lower one.
+    """Minimise from a second start, or from the current estimate where its cost is lower.
 
     The lowest estimate is left in ``poses`` and ``landmarks``.
     """
@@ -49,8 +49,9 @@ def restart(
 
 def _second_start(system: System, poses: Array, landmarks: Array) -> Estimate | None:
     starts = []
-    for anew, turns in ((False, FEW), (True, MANY)):
+    for from_relaxed, power_steps in ((False, FEW), (True, MANY)):
         estimate = poses.copy(), landmarks.copy()
-        if (anew or relax(system, *estimate)) and relax_jointly(system, *estimate, anew, turns):
+        alone = from_relaxed or relax(system, *estimate)
+        if alone and relax_jointly(system, *estimate, from_relaxed, power_steps):
             starts.append((linearize(system, *estimate, False)[0], estimate))
     return min(starts, key=lambda start: start[0])[1] if starts else None

@@ -14,7 +14,7 @@ import numpy as np
 
 from rlml_slam.compiled import kernel, part
 from rlml_slam.graph.model.packed_system import System
-from rlml_slam.graph.sparse.multifrontal import highest, lower_step, solve_lower, solve_upper
+from rlml_slam.graph.sparse.multifrontal import lower_step, max_height, solve_lower, solve_upper
 from rlml_slam.graph.sparse.symbolic_analysis import Ints, Records
 from rlml_slam.se2 import Array
 
@@ -173,7 +173,7 @@ def joint(system: System, which: Ints) -> Array:
         own = entries[fronts[s]['start']]['scalar']
         owner[own : own + fronts[s]['width']] = s
     Y = np.empty((k, len(system.g)))
-    work = np.empty(highest(fronts))
+    work = np.empty(max_height(fronts))
     met = np.empty(num, np.int64)  # the last column whose way to the root a front was on
     met[:] = -1
     out = np.empty((k, k))

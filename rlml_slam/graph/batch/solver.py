@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Least squares over a graph: minimise the sum of rho(e^T I e) over the enabled factors."""
+"""Batch solver: minimise the sum of rho(e^T I e) over the enabled factors of a graph."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from rlml_slam import params
 from rlml_slam.compiled import kernel, part
+from rlml_slam.graph.batch import landmark_start
 from rlml_slam.graph.batch.chordal_relaxation import relax
 from rlml_slam.graph.batch.gauss_newton import Progress, copy, gauss_newton
 from rlml_slam.graph.batch.initialization import initialize
@@ -20,33 +21,33 @@ from rlml_slam.graph.batch.trust_region import dog_leg, levenberg_marquardt
 from rlml_slam.graph.model.buffers import nodes_at, tables_at
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.graph.model.linearization import linearize
-from rlml_slam.graph.model.normal_equations import system_of
-from rlml_slam.graph.model.packed_system import System, set_up
+from rlml_slam.graph.model.normal_equations import build_system
+from rlml_slam.graph.model.packed_system import System, pack_system
 from rlml_slam.graph.sparse.symbolic_analysis import Ints
 from rlml_slam.se2 import Array
 from rlml_slam.types import EdgeKind
 
-# a start is bad, and one is computed from the edges, above this cost per residual: beyond three
-# sigmas in the root mean square. Nearer ones might be noise, and Gauss-Newton is there sooner.
+# A start is bad, and one is computed from the edges, above this cost per residual: three sigmas in
+# the root mean square. Below, it might be noise, and Gauss-Newton converges sooner.
 BAD_START = 9.0
-# steps of a descent from relaxed headings, after which another start is tried
-EASY = 12
-# costs below this per residual are rounding
-NOTHING = 1e-18
+# Gauss-Newton steps from relaxed headings, after which another start is tried
+MAX_RELAXED_STEPS = 12
+# costs below this per residual are rounding: (1e-9 sigma)^2
+ROUNDING = 1e-18
 
 
-class _Kept(threading.local):
-    """The memory that the last solves of a thread needed.
+class _Workspace(threading.local):
+    """Memory of a thread's solves, kept for the next one.
 
-    Taking memory anew from the operating system, a page at a time, would cost as much as a
-    factorisation of a small graph.
+    Allocating it again from the operating system, a page at a time, would cost as much as a
+    factorization of a small graph.
     """
 
     def __init__(self) -> None:
         self.memory = np.empty(0)
 
 
-_KEPT = _Kept()
+_WORKSPACE = _Workspace()
 DEFAULT = params.Solver()
 # when headings are relaxed first
 NEVER, IF_BAD, ALWAYS = 0, 1, 2
@@ -72,7 +73,7 @@ def optimize(graph: Graph, parameters: params.Solver = DEFAULT) -> Solution:
     """Move the free nodes of ``graph`` to a minimum of the cost.
 
     Nodes that no enabled factor touches stay. Raises SolverError if a value is not finite or a
-    part of the graph is not tied to the map.
+    part of the graph is not anchored to the map.
     """
     began = time.perf_counter()
     p = parameters
@@ -82,23 +83,23 @@ def optimize(graph: Graph, parameters: params.Solver = DEFAULT) -> Solution:
         start = _evaluate(graph)
         initialize(graph, p.initialization)
     if p.method in ('auto', 'gauss_newton'):
-        memory = _KEPT.memory
+        memory = _WORKSPACE.memory
         used, at, end = _gauss_newton(
-            graph.places().at, graph.losses.codes, memory, relaxing, p.max_iterations,
+            graph.addresses().at, graph.losses.codes, memory, relaxing, p.max_iterations,
             p.relative_tolerance,
         )  # fmt: skip
         if used < 0:
-            system_of(graph)  # tells what is wrong
+            build_system(graph)  # raises, and names the node
         elif used > len(memory):
-            _KEPT.memory = np.empty(used + used // 4)
+            _WORKSPACE.memory = np.empty(used + used // 4)
         if not end.converged and relaxing != NEVER:
             end = _restart(graph, at, end, p, relaxing)
         if p.method == 'auto' and not end.converged:
-            more = _descend(graph, at, p, NEVER)
+            more = _minimize_by_trust_region(graph, at, p, NEVER)
             end = more._replace(iterations=end.iterations + more.iterations)
     else:
         at = _evaluate(graph)
-        end = _descend(graph, at, p, relaxing)
+        end = _minimize_by_trust_region(graph, at, p, relaxing)
     start = start or at
     return Solution(
         start.chi2, end.chi2, start.cost, end.cost, end.iterations, end.converged,
@@ -109,24 +110,26 @@ def optimize(graph: Graph, parameters: params.Solver = DEFAULT) -> Solution:
 def _restart(
     graph: Graph, start: Progress, end: Progress, p: params.Solver, relaxing: int
 ) -> Progress:
-    """Another try, where the descent began with relaxed headings and got lost all the same."""
-    system = system_of(graph)
+    """Another start, where Gauss-Newton from relaxed headings did not converge."""
+    system = build_system(graph)
     num = num_residuals(system)
     if relaxing != ALWAYS and not start.cost > BAD_START * num:
         return end
-    limits = p.max_iterations, p.relative_tolerance, NOTHING * num
+    limits = p.max_iterations, p.relative_tolerance, ROUNDING * num
     more = restart(system, graph.poses, graph.landmarks, *limits)
     return more._replace(iterations=end.iterations + more.iterations)
 
 
-def _descend(graph: Graph, start: Progress, p: params.Solver, relaxing: int) -> Progress:
-    """Minimise by a method that never climbs."""
-    system, poses, landmarks = system_of(graph), graph.poses, graph.landmarks
+def _minimize_by_trust_region(
+    graph: Graph, start: Progress, p: params.Solver, relaxing: int
+) -> Progress:
+    """Minimise by a method that never raises the cost."""
+    system, poses, landmarks = build_system(graph), graph.poses, graph.landmarks
     if not len(system.variables):
         return start._replace(converged=True)
     method = levenberg_marquardt if p.method == 'levenberg_marquardt' else dog_leg
     num = num_residuals(system)
-    limits = p.max_iterations, p.relative_tolerance, NOTHING * num
+    limits = p.max_iterations, p.relative_tolerance, ROUNDING * num
     if relaxing == ALWAYS or (relaxing == IF_BAD and start.cost > BAD_START * num):
         before = poses.copy(), landmarks.copy()
         initialize(graph, 'chordal')
@@ -138,40 +141,40 @@ def _descend(graph: Graph, start: Progress, p: params.Solver, relaxing: int) -> 
 
 
 def _evaluate(graph: Graph) -> Progress:
-    """Cost and chi2 of the estimate at hand."""
-    cost, chi2 = linearize(system_of(graph), graph.poses, graph.landmarks, False)
+    """Cost and chi2 of the current estimate."""
+    cost, chi2 = linearize(build_system(graph), graph.poses, graph.landmarks, False)
     return Progress(cost, chi2, 0, False)
 
 
 @kernel
 def _gauss_newton(
-    places: Ints, losses: Array, memory: Array, relaxing: int, max_iterations: int,
+    addresses: Ints, losses: Array, memory: Array, relaxing: int, max_iterations: int,
     tolerance: float,
 ) -> tuple[int, Progress, Progress]:  # fmt: skip
     """(memory used or -1 if the graph cannot be solved, start, end) of Gauss-Newton.
 
-    The graph is the one at ``places``. All in one call, which saves the wrapping and unwrapping
-    of what lies between.
+    The graph has its buffers at ``addresses``. One call: passing arrays in and out of several
+    costs as much as the optimization of a small graph.
     """
-    poses, landmarks = nodes_at(places)
+    poses, landmarks = nodes_at(addresses)
     nothing = Progress(math.nan, math.nan, 0, False)
     if not (finite(poses) and finite(landmarks)):
         return -1, nothing, nothing
-    loose, system = set_up(tables_at(places, losses), memory)
-    if loose >= 0:
+    unanchored, system = pack_system(tables_at(addresses, losses), memory)
+    if unanchored >= 0:
         return -1, nothing, nothing
-    start, end = _descend_from(system, poses, landmarks, relaxing, max_iterations, tolerance)
+    start, end = _minimize(system, poses, landmarks, relaxing, max_iterations, tolerance)
     return len(system.values) + len(system.left) + len(system.right), start, end
 
 
 @part
-def _descend_from(
+def _minimize(
     system: System, poses: Array, landmarks: Array, relaxing: int, max_iterations: int,
     tolerance: float,
 ) -> tuple[Progress, Progress]:  # fmt: skip
-    """(Start, end); relaxed headings that lead nowhere better are taken back."""
+    """(Start, end); relaxed headings that lead to no lower cost are undone."""
     num = num_residuals(system)
-    floor = NOTHING * num
+    floor = ROUNDING * num
     cost, chi2 = linearize(system, poses, landmarks, True)
     start = Progress(cost, chi2, 0, len(system.variables) == 0)
     if start.converged:
@@ -181,7 +184,8 @@ def _descend_from(
         if relax(system, poses, landmarks):
             at = linearize(system, poses, landmarks, True)
             end = gauss_newton(
-                system, poses, landmarks, at[0], at[1], min(EASY, max_iterations), tolerance, floor
+                system, poses, landmarks, at[0], at[1], min(MAX_RELAXED_STEPS, max_iterations),
+                tolerance, floor,
             )  # fmt: skip
             if end.cost < cost:
                 return start, end
@@ -194,7 +198,7 @@ def _descend_from(
 
 @kernel
 def num_residuals(system: System) -> int:
-    """Number of scalar residuals, the expected chi2 of a good start."""
+    """Number of scalar residuals, the expected chi2 at the optimum; a range counts two."""
     return 3 * len(system.edges) + 2 * len(system.sightings) + 3 * len(system.priors)
 
 
@@ -216,6 +220,7 @@ def warm_up() -> None:
     graph.add_landmark([1.0, 1.0])
     graph.add_edges(EdgeKind.ODOMETRY, [[0, 1], [1, 2]], [[1.0, 0.1, 0.0]] * 2, [np.eye(3)] * 2)
     graph.add_sightings([[0, 0], [2, 0]], [[1.0, 1.0], [-1.0, 1.1]], [np.eye(2)] * 2)
+    landmark_start.warm_up()
     for method in ('auto', 'dog_leg'):
         optimize(graph, params.Solver(initialization='chordal', method=method))
-    restart(system_of(graph), graph.poses, graph.landmarks, 1, 0.0, 0.0)
+    restart(build_system(graph), graph.poses, graph.landmarks, 1, 0.0, 0.0)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Minimisation that never climbs: Levenberg-Marquardt and Powell's dog-leg.
+"""Trust-region methods, which never raise the cost: Levenberg-Marquardt and Powell's dog-leg.
 
-The loops are Python around the compiled linearisation, factorisation and solves. Steps are
+Nocedal and Wright, "Numerical Optimization", 2nd ed. (2006), chapter 4. The loops are Python
+around the compiled linearization, factorization and solves. Steps are
 measured in the norm of D, the diagonal of H, so metres and radians count by their information.
 """
 
@@ -14,14 +15,16 @@ import numpy as np
 
 from rlml_slam.compiled import kernel
 from rlml_slam.graph.batch.gauss_newton import Progress, factor, newton_step
-from rlml_slam.graph.model.linearization import linearize, move
+from rlml_slam.graph.model.linearization import apply_step, linearize
 from rlml_slam.graph.model.packed_system import System
-from rlml_slam.graph.sparse.multifrontal import highest
+from rlml_slam.graph.sparse.multifrontal import max_height
 from rlml_slam.graph.sparse.symbolic_analysis import Ints, Records
 from rlml_slam.se2 import Array
 
-# a step is accepted if it brings this share of what the model promises
-ENOUGH = 1e-4
+# A step is accepted if it brings this share of the predicted decrease (Nocedal & Wright, eq. 4.20:
+# anything from 0 to 1/4).
+MIN_RATIO = 1e-4
+# of LM at the start, as a share of the diagonal of H: nearly a Gauss-Newton step
 FIRST_DAMPING = 1e-4
 
 
@@ -29,7 +32,7 @@ FIRST_DAMPING = 1e-4
 def curvature(fronts: Records, entries: Records, values: Array, x: Array) -> float:
     """X^T H x with H, not its factor, in the panels."""
     total = 0.0
-    own = np.empty(highest(fronts))
+    own = np.empty(max_height(fronts))
     for s in range(len(fronts) - 1):
         width, height, at = fronts[s]['width'], fronts[s]['height'], fronts[s]['panel']
         end = fronts[s + 1]['start']
@@ -47,8 +50,8 @@ def curvature(fronts: Records, entries: Records, values: Array, x: Array) -> flo
 
 
 @dataclass
-class _State:
-    """An estimate with its cost; moving it is undone by putting the old one back."""
+class _Trial:
+    """Estimate with its cost, and the trial steps from it."""
 
     system: System
     poses: Array
@@ -73,13 +76,13 @@ class _State:
             self.linearize()
         return math.inf
 
-    def attempt(self, step: Array, promised: float) -> float:
-        """Move if that brings enough; the share of the promise that it brings."""
+    def try_step(self, step: Array, predicted: float) -> float:
+        """Take the step if the cost falls enough; the ratio of actual to predicted decrease."""
         before = self.poses.copy(), self.landmarks.copy(), self.system.g.copy()
-        move(self.system.variables, step, self.poses, self.landmarks)
+        apply_step(self.system.variables, step, self.poses, self.landmarks)
         cost, chi2 = linearize(self.system, self.poses, self.landmarks, False)
-        ratio = (self.cost - cost) / promised if promised > 0.0 else -1.0
-        if ratio > ENOUGH and math.isfinite(cost):
+        ratio = (self.cost - cost) / predicted if predicted > 0.0 else -1.0
+        if ratio > MIN_RATIO and math.isfinite(cost):
             self.cost, self.chi2 = cost, chi2
         else:
             self.poses[:], self.landmarks[:], self.system.g[:] = before
@@ -87,13 +90,13 @@ class _State:
         return ratio
 
 
-def _state(system: System, poses: Array, landmarks: Array) -> _State:
+def _trial(system: System, poses: Array, landmarks: Array) -> _Trial:
     v = system.variables
     diagonal = np.empty(len(system.g), dtype=np.int64)
     for r in range(3):
         has = v['size'] > r
         diagonal[v['scalar'][has] + r] = v['address'][has] + r * (v['stride'][has] + 1)
-    return _State(system, poses, landmarks, math.inf, math.inf, diagonal)
+    return _Trial(system, poses, landmarks, math.inf, math.inf, diagonal)
 
 
 def levenberg_marquardt(
@@ -105,29 +108,29 @@ def levenberg_marquardt(
     floor: float,
 ) -> Progress:
     """Steps of (H + damping D) dx = -g with Nielsen's rule for the damping."""
-    state = _state(system, poses, landmarks)
+    trial = _trial(system, poses, landmarks)
     damping, growth, iterations = FIRST_DAMPING, 2.0, 0
-    scale = state.linearize()
+    scale = trial.linearize()
     while iterations < max_iterations:
-        damping = state.factorise(scale, damping)
+        damping = trial.factorise(scale, damping)
         if damping > 1e12:
             break
         newton_step(system)
         step = system.step
         # model: -2 g dx - dx H dx = -g dx + damping dx D dx
-        promised = float(-system.g @ step + damping * step @ (scale * step))
-        if promised <= tolerance * state.cost + floor:
-            return Progress(state.cost, state.chi2, iterations, True)
+        predicted = float(-system.g @ step + damping * step @ (scale * step))
+        if predicted <= tolerance * trial.cost + floor:
+            return Progress(trial.cost, trial.chi2, iterations, True)
         iterations += 1
-        ratio = state.attempt(step, promised)
+        ratio = trial.try_step(step, predicted)
         if ratio > 0.0:
             damping *= max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
             growth = 2.0
         else:
             damping *= growth
             growth *= 2.0
-        scale = state.linearize()
-    return Progress(state.cost, state.chi2, iterations, False)
+        scale = trial.linearize()
+    return Progress(trial.cost, trial.chi2, iterations, False)
 
 
 def dog_leg(
@@ -139,64 +142,65 @@ def dog_leg(
     floor: float,
 ) -> Progress:
     """Powell's dog-leg: one factorisation per accepted step, none for a refused one."""
-    state = _state(system, poses, landmarks)
+    trial = _trial(system, poses, landmarks)
     radius, iterations = -1.0, 0
     while iterations < max_iterations:
-        scale = state.linearize()
-        steep = -system.g / scale
-        gain = float(-system.g @ steep)
-        bend = curvature(system.fronts, system.entries, system.values, steep)
-        if state.factorise(scale, 0.0) > 1e12:
+        scale = trial.linearize()
+        steepest = -system.g / scale
+        slope = float(-system.g @ steepest)
+        curve = curvature(system.fronts, system.entries, system.values, steepest)
+        if trial.factorise(scale, 0.0) > 1e12:
             break
-        promised = newton_step(system)
-        if promised <= tolerance * state.cost + floor:
-            return Progress(state.cost, state.chi2, iterations, True)
+        predicted = newton_step(system)
+        if predicted <= tolerance * trial.cost + floor:
+            return Progress(trial.cost, trial.chi2, iterations, True)
         newton = system.step.copy()
         if radius < 0.0:
             radius = math.sqrt(newton @ (scale * newton))
         ratio = 0.0
         while ratio <= 0.0 and iterations < max_iterations:
-            step, model = _leg(newton, steep, scale, radius, gain, bend, promised)
+            step, model = _dog_leg_step(newton, steepest, scale, radius, slope, curve, predicted)
             length = math.sqrt(step @ (scale * step))
             iterations += 1
-            ratio = state.attempt(step, model)
+            ratio = trial.try_step(step, model)
             if ratio < 0.25:
                 radius = 0.25 * length
             elif ratio > 0.75:
                 radius = max(radius, 3.0 * length)
-            if radius * radius <= 1e-3 * (tolerance * state.cost + floor):
-                return Progress(state.cost, state.chi2, iterations, True)
-    return Progress(state.cost, state.chi2, iterations, False)
+            if radius * radius <= 1e-3 * (tolerance * trial.cost + floor):
+                return Progress(trial.cost, trial.chi2, iterations, True)
+    return Progress(trial.cost, trial.chi2, iterations, False)
 
 
-def _leg(
+def _dog_leg_step(
     newton: Array,
-    steep: Array,
+    steepest: Array,
     scale: Array,
     radius: float,
-    gain: float,
-    bend: float,
-    promised: float,
+    slope: float,
+    curve: float,
+    predicted: float,
 ) -> tuple[Array, float]:
-    """(step within ``radius``, the decrease that it promises).
+    """(step within ``radius``, its predicted decrease).
 
     The Newton step if it fits, else the point where the path from the Cauchy point to it leaves
-    the trust region, else the clipped Cauchy step. ``gain`` = -g steep, ``bend`` = steep H steep.
+    the trust region, else the clipped Cauchy step. With steepest = -g / D, ``slope`` = -g steepest
+    and ``curve`` = steepest H steepest.
     """
     if newton @ (scale * newton) <= radius * radius:
-        return newton, promised
-    cauchy = gain / bend * steep
+        return newton, predicted
+    cauchy = slope / curve * steepest
     across = float(cauchy @ (scale * cauchy))
     if across >= radius * radius:
-        t = radius / math.sqrt(float(steep @ (scale * steep)))
-        return t * steep, 2.0 * t * gain - t * t * bend
+        t = radius / math.sqrt(float(steepest @ (scale * steepest)))
+        return t * steepest, 2.0 * t * slope - t * t * curve
     # |cauchy + b (newton - cauchy)| = radius
     rest = newton - cauchy
     a2, a1 = float(rest @ (scale * rest)), float(cauchy @ (scale * rest))
     b = (-a1 + math.sqrt(max(0.0, a1 * a1 + a2 * (radius * radius - across)))) / a2
-    # -2 g s - s H s for s = p steep + b newton, with H newton = -g
-    p = (1.0 - b) * gain / bend
-    model = 2.0 * (p * gain + b * promised) - (
-        p * p * bend + 2.0 * p * b * gain + b * b * promised
+    # -2 g s - s H s for s = p steepest + b newton, with H newton = -g
+    p = (1.0 - b) * slope / curve
+    model = 2.0 * (p * slope + b * predicted) - (
+        p * p * curve + 2.0 * p * b * slope + b * b * predicted
     )
     return cauchy + b * rest, model

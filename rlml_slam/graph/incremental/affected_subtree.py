@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which part of the tree a step makes anew, and its new structure.
+"""Affected part of the clique tree, and its new structure.
 
-Made anew are the cliques of the unknowns that were asked for and all cliques above them; what
-hangs below stays as it is and counts as eliminated: a node of size 0 that joins its separator.
+Replaced are the cliques of the affected unknowns and all cliques above them; the subtrees below
+stay as they are and count as eliminated: a node of size 0 that joins its separator.
 The unknowns with new factors are eliminated last, so that the next ones find them near the root;
 not where these are more than fit there: an order that keeps many for the end fills the tree.
 """
@@ -18,10 +18,10 @@ from rlml_slam.graph.incremental.solver_state import (
     SEEDS,
     STEP,
     State,
-    drop_clique,
+    free_clique,
 )
 from rlml_slam.graph.sparse.minimum_degree import minimum_degree
-from rlml_slam.graph.sparse.multifrontal import lay_out
+from rlml_slam.graph.sparse.multifrontal import layout_fronts
 from rlml_slam.graph.sparse.symbolic_analysis import (
     Ints,
     Records,
@@ -33,14 +33,14 @@ from rlml_slam.graph.sparse.symbolic_analysis import (
 # rows that a clique owns at most: what the next step touches is near the end of the root, and a
 # wide root in one piece would be factored as a whole for it. Wider ones save little: taking an
 # update matrix over costs some operations per number, making it as many as there are rows.
-WIDEST = 48
+MAX_OWN_ROWS = 48
 
 
-class Part(NamedTuple):
-    """Unknowns (m,) that are eliminated anew and cliques (k,) that stay below them.
+class AffectedPart(NamedTuple):
+    """Unknowns (m,) that are eliminated again and cliques (k,) that stay below them.
 
-    ``order``, ``position``, ``fronts`` and ``entries`` as in structure.Structure, for the nodes
-    0..m of the unknowns, m, which keeps the late ones last, and m + 1.. of the cliques.
+    ``order``, ``position``, ``fronts`` and ``entries`` as in symbolic_analysis.Structure. Nodes
+    are the unknowns, 0..m, a node m that keeps the newest ones last, and the cliques, m + 1..
     """
 
     unknowns: Ints
@@ -52,8 +52,8 @@ class Part(NamedTuple):
 
 
 @part
-def take_out(state: State, numbers: Ints) -> Part:
-    """Take the part to be made anew out of the tree and find its new structure.
+def extract_affected(state: State, numbers: Ints) -> AffectedPart:
+    """Remove the affected part from the tree and find its new structure.
 
     Sets ``local`` of its unknowns; the cliques that stay have no parent until they get a new one.
     """
@@ -79,11 +79,11 @@ def take_out(state: State, numbers: Ints) -> Part:
     for n in range(m):
         dims[n] = state.unknowns[unknowns[n]]['size']
         total += dims[n]
-        if state.unknowns[unknowns[n]]['late'] == step:
+        if state.unknowns[unknowns[n]]['last_change'] == step:
             late += dims[n]
     for n in range(m):
         v = unknowns[n]
-        if late <= WIDEST and state.unknowns[v]['late'] == step:
+        if late <= MAX_OWN_ROWS and state.unknowns[v]['last_change'] == step:
             pairs[w, 0], pairs[w, 1] = m, n
             w += 1
         # every factor between two unknowns starts from a pose
@@ -100,9 +100,9 @@ def take_out(state: State, numbers: Ints) -> Part:
     order = minimum_degree(start, neighbours, dims)
     dims[m] = 0
     order, parent, count = elimination_tree(start, neighbours, _eliminated_first(order, m))
-    structure = supernodes(start, neighbours, order, parent, count, pairs[:0], dims, WIDEST)
-    fronts, entries, _ = lay_out(structure, dims)
-    return Part(unknowns, below, structure.order, structure.position, fronts, entries)
+    structure = supernodes(start, neighbours, order, parent, count, pairs[:0], dims, MAX_OWN_ROWS)
+    fronts, entries, _ = layout_fronts(structure, dims)
+    return AffectedPart(unknowns, below, structure.order, structure.position, fronts, entries)
 
 
 @part
@@ -124,10 +124,10 @@ def _eliminated_first(order: Ints, m: int) -> Ints:
 
 @part
 def _affected(state: State, numbers: Ints) -> tuple[Ints, Ints]:
-    """(unknowns to be eliminated anew, cliques below them); the cliques between are given back."""
+    """(unknowns to be eliminated again, cliques below them); the cliques between are freed."""
     unknowns, cliques, step = state.unknowns, state.cliques, state.counts[STEP]
     most = 64
-    gone = np.empty(most, np.int64)
+    removed = np.empty(most, np.int64)
     num, num_unknowns, num_below = 0, 0, 0
     for n in range(state.counts[SEEDS]):
         c = unknowns[state.seeds[n]]['clique']
@@ -138,9 +138,9 @@ def _affected(state: State, numbers: Ints) -> tuple[Ints, Ints]:
             if num == most:
                 most *= 2
                 more = np.empty(most, np.int64)
-                more[:num] = gone
-                gone = more
-            gone[num] = c
+                more[:num] = removed
+                removed = more
+            removed[num] = c
             num += 1
             c = cliques[c]['parent']
     out = np.empty(num_unknowns, np.int64)
@@ -149,17 +149,17 @@ def _affected(state: State, numbers: Ints) -> tuple[Ints, Ints]:
         if unknowns[state.seeds[n]]['clique'] < 0:
             w = _add(state, state.seeds[n], out, w)
     for n in range(num):
-        first = cliques[gone[n]]['block']
-        for p in range(first, first + cliques[gone[n]]['own']):
+        first = cliques[removed[n]]['block']
+        for p in range(first, first + cliques[removed[n]]['own']):
             w = _add(state, numbers[p], out, w)
-        c = cliques[gone[n]]['child']
+        c = cliques[removed[n]]['child']
         while c >= 0:
             num_below += cliques[c]['mark'] != step
             c = cliques[c]['next']
     below = np.empty(num_below, np.int64)
     num_below = 0
     for n in range(num):
-        c = cliques[gone[n]]['child']
+        c = cliques[removed[n]]['child']
         while c >= 0:
             after = cliques[c]['next']
             if cliques[c]['mark'] != step:
@@ -168,13 +168,13 @@ def _affected(state: State, numbers: Ints) -> tuple[Ints, Ints]:
                 cliques[c]['parent'] = -1
             c = after
     for n in range(num):
-        drop_clique(state, numbers, gone[n])
+        free_clique(state, numbers, removed[n])
     return out[:w], below
 
 
 @part
 def _add(state: State, v: int, out: Ints, w: int) -> int:
-    """Note unknown v unless no factor is left on it."""
+    """Add unknown v to the part unless no factor is left on it."""
     u = state.unknowns[v]
     u['clique'] = -1
     if u['links'] == 0:

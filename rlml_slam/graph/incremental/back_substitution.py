@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Back-substitution down the tree, as far as it matters.
+"""Back-substitution down the clique tree, as far as the update exceeds the wildfire threshold.
 
 With L^T d = -y the cost that is lost where the own variables of a clique are not updated after its
 separator moved by D is |L21^T D|^2, at most the sum of h D^2 over the separator with the
@@ -13,25 +13,32 @@ every call would cost as much as the work.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from rlml_slam.compiled import fetch, part
-from rlml_slam.graph.incremental.relinearization_test import is_restless
-from rlml_slam.graph.incremental.solver_state import LINE, STEP, State
-from rlml_slam.graph.model.linearization import wrapped
+from rlml_slam.graph.incremental.relinearization_test import needs_test
+from rlml_slam.graph.incremental.solver_state import LINE, STEP, Problem, State
 from rlml_slam.graph.sparse.symbolic_analysis import Ints, Records
-from rlml_slam.se2 import Array
+from rlml_slam.se2 import Array, wrapped_by_turns
+
+
+class Pool(NamedTuple):
+    """The pool of the cliques' blocks, as floating-point numbers and as integers."""
+
+    values: Array
+    numbers: Ints
 
 
 @part
-def propagate(
-    state: State, pool: Array, numbers: Ints, of_front: Ints, robust: bool, poses: Array,
-    landmarks: Array, still: float, restless: Ints,
-) -> tuple[int, int, int]:  # fmt: skip
-    """Solve the new cliques and those below that feel it; numbers of unknowns.
+def back_substitute(
+    state: State, pool: Pool, of_front: Ints, problem: Problem, to_test: Ints
+) -> tuple[int, int, int]:
+    """Solve the new cliques and those below whose separator moved; numbers of unknowns.
 
-    These are of those solved, of those that moved by more than ``still`` sigmas, and of those of
-    the latter that have to be judged, with which ``restless`` is filled.
+    These are of those solved, of those that moved by more than the wildfire threshold, and of
+    those of the latter whose factors have to be tested, with which ``to_test`` is filled.
     """
     unknowns, cliques, step = state.unknowns, state.cliques, state.counts[STEP]
     solved, moved, num, most = 0, 0, 0, 1
@@ -40,7 +47,7 @@ def propagate(
             most = max(most, cliques[of_front[s]]['height'])
     work = np.empty(2 * most + 64)
     stack = np.empty(64, np.int64)
-    # the new ones, which bear this step's mark: parents come after their children
+    # the new ones, which have this step's mark: parents come after their children
     for s in range(len(of_front) - 1, -1, -1):
         c = of_front[s]
         depth = 0
@@ -48,19 +55,16 @@ def propagate(
             clique = cliques[c]
             if clique['height'] > len(work):
                 work = np.empty(2 * clique['height'])
-            # what the child below takes is on its way meanwhile
+            # prefetch the first child while this one is solved
             child = clique['child']
             if child >= 0:
-                _call(cliques[child], cliques, numbers)
-            some, num = _solve(
-                unknowns, clique, step, pool, numbers, poses, landmarks, still, robust, restless,
-                num, work,
-            )  # fmt: skip
+                _prefetch_block(cliques[child], cliques, pool.numbers)
+            some, num = _solve(unknowns, clique, step, pool, problem, to_test, num, work)
             moved += some
             solved += clique['own']
             while child >= 0:
                 below = cliques[child]
-                if below['mark'] != step and _feels(unknowns, below, numbers, step):
+                if below['mark'] != step and _separator_moved(unknowns, below, pool.numbers, step):
                     if depth == len(stack):
                         more = np.empty(2 * depth, np.int64)
                         more[:depth] = stack
@@ -76,15 +80,15 @@ def propagate(
 
 
 @part
-def _call(clique: np.void, cliques: Records, numbers: Ints) -> None:
-    """Have a clique's block come near, where it is long the first lines, and the one below it."""
+def _prefetch_block(clique: np.void, cliques: Records, numbers: Ints) -> None:
+    """Prefetch the first lines of a clique's block, and the record of the clique below."""
     fetch(cliques, clique['child'], 0)
     for k in range(0, 4 * LINE, LINE):
         fetch(numbers, clique['block'], k)
 
 
 @part
-def _feels(unknowns: Records, clique: np.void, numbers: Ints, step: int) -> bool:
+def _separator_moved(unknowns: Records, clique: np.void, numbers: Ints, step: int) -> bool:
     """Whether a variable of the separator has moved in this step."""
     first = clique['block']
     for p in range(first + clique['own'], first + clique['members']):
@@ -95,10 +99,12 @@ def _feels(unknowns: Records, clique: np.void, numbers: Ints, step: int) -> bool
 
 @part
 def _solve(
-    unknowns: Records, clique: np.void, step: int, pool: Array, numbers: Ints, poses: Array,
-    landmarks: Array, still: float, robust: bool, restless: Ints, num: int, x: Array,
+    unknowns: Records, clique: np.void, step: int, memory: Pool, problem: Problem, to_test: Ints,
+    num: int, x: Array,
 ) -> tuple[int, int]:  # fmt: skip
-    """Update the own variables of a clique; how many moved, and how many are restless so far."""
+    """Update the own variables of a clique; how many moved, and how many ``to_test`` has then."""
+    pool, numbers = memory.values, memory.numbers
+    poses, landmarks = problem.poses, problem.landmarks
     width, height = clique['width'], clique['height']
     first = clique['block']
     at, tall = first + clique['members'], height + 1
@@ -130,7 +136,7 @@ def _solve(
             t0 -= pool[a + i] * x[i]
             i += 1
         x[j] = ((t0 + t1) + (t2 + t3)) / pool[a + j]
-    w, moved = 0, 0
+    w, moved, wildfire = 0, 0, problem.thresholds.wildfire
     for p in range(first, first + clique['own']):
         v = numbers[p]
         u = unknowns[v]
@@ -141,15 +147,16 @@ def _solve(
             u['dtheta'] = x[w + 2]
             st = x[w + 2] - u['stheta']
             poses[k, 0], poses[k, 1] = u['x'] + u['dx'], u['y'] + u['dy']
-            poses[k, 2] = wrapped(u['theta'] + u['dtheta'])
+            poses[k, 2] = wrapped_by_turns(u['theta'] + u['dtheta'])
         else:
             landmarks[k, 0], landmarks[k, 1] = u['x'] + u['dx'], u['y'] + u['dy']
         w += u['size']
-        if (sx * sx + sy * sy) * u['stiff'] + st * st * u['turn'] > still * still:
+        sigmas2 = (sx * sx + sy * sy) * u['position_info'] + st * st * u['heading_info']
+        if sigmas2 > wildfire * wildfire:
             u['sx'], u['sy'], u['stheta'] = u['dx'], u['dy'], u['dtheta']
             u['moved'] = step
             moved += 1
-            if robust or is_restless(u):
-                restless[num] = v
+            if problem.robust or needs_test(u):
+                to_test[num] = v
                 num += 1
     return moved, num

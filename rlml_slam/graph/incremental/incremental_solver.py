@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Incremental least squares over a growing graph: each step costs what it changes.
 
-A step relinearises the factors whose linear model has become wrong, takes the cliques that they
-and the new factors touch out of the tree of the factorisation, with all cliques above them, orders
-and factors this part anew, and updates what feels it. In the limit of small thresholds a step is
-one of Gauss-Newton on the whole graph (Kaess et al., "iSAM2", IJRR 31 (2012)).
+A step relinearizes the factors whose linear model has become wrong, removes the cliques that they
+and the new factors touch from the clique tree, with all cliques above them, orders and factors
+this part again, and back-substitutes as far as variables move. In the limit of small thresholds a
+step is one of Gauss-Newton on the whole graph (Kaess et al., "iSAM2: Incremental smoothing and
+mapping using the Bayes tree", IJRR 31 (2012)).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,16 +17,16 @@ from numpy.typing import ArrayLike
 
 from rlml_slam.compiled import kernel, part
 from rlml_slam.errors import SolverError
-from rlml_slam.graph.incremental.affected_subtree import take_out
-from rlml_slam.graph.incremental.back_substitution import propagate
+from rlml_slam.graph.incremental.affected_subtree import extract_affected
+from rlml_slam.graph.incremental.back_substitution import Pool, back_substitute
 from rlml_slam.graph.incremental.joint_covariance import tree_joint
 from rlml_slam.graph.incremental.refactorization import (
     make_cliques,
     refactor,
     reserve,
 )
-from rlml_slam.graph.incremental.relinearization import differ, refer_all, take
-from rlml_slam.graph.incremental.relinearization_test import is_robust, judge
+from rlml_slam.graph.incremental.relinearization import differ, reset_references, synchronize
+from rlml_slam.graph.incremental.relinearization_test import find_stale_factors, is_robust
 from rlml_slam.graph.incremental.renumbering import renumber
 from rlml_slam.graph.incremental.solver_state import (
     CLIQUES,
@@ -34,21 +34,23 @@ from rlml_slam.graph.incremental.solver_state import (
     FIXED_LANDMARKS,
     FIXED_POSES,
     FREE_CLIQUE,
-    IN_ONE,
     IN_USE,
+    IN_USE_AT_ORDERING,
     LANDMARKS,
-    LISTED,
     LITTLE,
     POSES,
     ROWS,
     SEEDS,
+    STALE,
     STEP,
     TOP,
     UNKNOWNS,
+    Problem,
     State,
-    ask,
+    Thresholds,
     compacted,
-    grown,
+    grown_state,
+    mark_affected,
     new_state,
 )
 from rlml_slam.graph.model.buffers import nodes_at, tables_at
@@ -58,37 +60,22 @@ from rlml_slam.graph.sparse.symbolic_analysis import Ints
 from rlml_slam.se2 import Array
 from rlml_slam.types import EdgeKind
 
-# What comes of a step; an unknown from 0 on is one at which the equations are singular.
-DONE, OTHER, NO_ROOM = -1, -2, -3
-# Beyond this many times the room of the blocks in use, the pool is made anew without gaps: from
-# 5/4 of it, as much has been factored by then as that takes to copy.
-SCATTERED = 2.5
-# Parts that are ordered on their own fill the tree more than the whole does. Beyond this many
-# times the room that it took when it was ordered as a whole, or for a graph that has grown as
-# much, it is again: as much has been factored by then as that costs.
-FILLED = 2.0
-
-
-@dataclass(frozen=True)
-class Thresholds:
-    """How far off things may be before something is done about it.
-
-    A factor is relinearised when its linear model is off by ``due`` standard deviations, its pose
-    has turned by ``turn`` [rad] or its robust weight changed by that share, else only where it has
-    to be assembled anyway. A move of a variable by less than ``still`` standard deviations is not
-    passed on.
-    """
-
-    due: float = 0.05
-    turn: float = 0.1
-    still: float = 0.02
+# Status of a step; from 0 on it is an unknown at which the equations are singular.
+DONE, GAUGE_CHANGED, NO_CAPACITY = -1, -2, -3
+# The pool is compacted where it is this many times as large as the blocks in use. After that it is
+# 5/4 as large: until the next time, as much is factored as the copy takes.
+MAX_FRAGMENTATION = 2.5
+# Parts that are ordered on their own fill the tree more than the whole does. The whole is ordered
+# again where the tree is this many times as large as after the last time: until then, as much is
+# factored as that costs.
+MAX_FILL_GROWTH = 2.0
 
 
 class Step(NamedTuple):
     """What one update did, as counts: the work that it took.
 
-    ``relinearized`` factors that were due, ``factors`` assembled, ``refactored`` poses and
-    landmarks eliminated anew, ``kept`` subtrees below them, ``solved`` and ``moved`` nodes.
+    ``relinearized`` factors that were stale, ``factors`` assembled, ``refactored`` poses and
+    landmarks eliminated again, ``kept`` subtrees below them, ``solved`` and ``moved`` nodes.
     """
 
     relinearized: int
@@ -100,67 +87,66 @@ class Step(NamedTuple):
 
 
 @kernel
-def advance(
-    state: State, pool: Array, places: Ints, losses: Array, whole: bool, due: float, turn: float,
-    still: float,
-) -> tuple[Array, int, Step]:  # fmt: skip
-    """(pool, what came of it, what was done) of one step on a graph at ``places``.
+def update_tree(
+    state: State, pool: Array, addresses: Ints, losses: Array, whole: bool, thresholds: Thresholds
+) -> tuple[Array, int, Step]:
+    """(pool, status, work done) of one step on a graph with its buffers at ``addresses``.
 
-    What came of it is DONE, or the unknown at which the equations are singular, or why nothing
-    was done: OTHER nodes are fixed than before, or there is NO_ROOM for all that is in the graph.
+    The status is DONE, or the unknown at which the equations are singular, or why nothing was
+    done: GAUGE_CHANGED where other nodes are fixed than before, NO_CAPACITY where the state is
+    too small for the graph.
     """
     nothing = Step(0, 0, 0, 0, 0, 0)
-    tables = tables_at(places, losses)
-    if not _fits(state, tables):
-        return pool, NO_ROOM, nothing
+    tables = tables_at(addresses, losses)
+    if not _has_capacity(state, tables):
+        return pool, NO_CAPACITY, nothing
     count = state.counts
     if differ(state.on[FIXED_POSES], tables.fixed_poses, 0, count[POSES]) or differ(
         state.on[FIXED_LANDMARKS], tables.fixed_landmarks, 0, count[LANDMARKS]
     ):
-        return pool, OTHER, nothing
-    poses, landmarks = nodes_at(places)
+        return pool, GAUGE_CHANGED, nothing
+    poses, landmarks = nodes_at(addresses)
+    problem = Problem(poses, landmarks, losses, is_robust(losses), thresholds)
     count[STEP] += 1
     count[SEEDS] = 0
-    take(state, tables, poses, landmarks)
-    whole |= count[IN_USE] > FILLED * count[IN_ONE] + LITTLE
-    if not whole and len(pool) > SCATTERED * (count[IN_USE] + LITTLE):
+    synchronize(state, tables, poses, landmarks)
+    whole |= count[IN_USE] > MAX_FILL_GROWTH * count[IN_USE_AT_ORDERING] + LITTLE
+    if not whole and len(pool) > MAX_FRAGMENTATION * (count[IN_USE] + LITTLE):
         pool = compacted(state, pool)
     relinearized = 0
     if whole:
-        relinearized = _start_over(state, poses, landmarks)
-    for k in range(count[LISTED]):
-        f = state.due[k]
-        ask(state, state.factors[f]['a'])
-        ask(state, state.factors[f]['b'])
+        relinearized = _relinearize_all(state, poses, landmarks)
+    for k in range(count[STALE]):
+        f = state.stale[k]
+        mark_affected(state, state.factors[f]['a'])
+        mark_affected(state, state.factors[f]['b'])
         relinearized += 1
-    count[LISTED] = 0
+    count[STALE] = 0
     if count[SEEDS] == 0:
         return pool, DONE, nothing
-    anew = take_out(state, pool.view(np.int64))
-    pool = reserve(state, pool, anew)
+    affected = extract_affected(state, pool.view(np.int64))
+    pool = reserve(state, pool, affected)
     numbers = pool.view(np.int64)
-    of_front = make_cliques(state, numbers, anew)
-    failed, factors = refactor(
-        state, pool, numbers, anew, of_front, losses, poses, landmarks, due, turn
-    )
-    for n in range(len(anew.unknowns)):
-        state.unknowns[anew.unknowns[n]]['local'] = -1
-    if len(anew.unknowns) > 0 and len(anew.cliques) == 0:
-        count[IN_ONE] = count[IN_USE]
+    of_front = make_cliques(state, numbers, affected)
+    status, factors = refactor(state, pool, numbers, affected, of_front, problem)
+    for n in range(len(affected.unknowns)):
+        state.unknowns[affected.unknowns[n]]['local'] = -1
+    if len(affected.unknowns) > 0 and len(affected.cliques) == 0:
+        count[IN_USE_AT_ORDERING] = count[IN_USE]
     moved, solved = 0, 0
-    if failed == DONE:
-        who = np.empty(count[UNKNOWNS], np.int64)
-        solved, moved, restless = propagate(
-            state, pool, numbers, of_front, is_robust(losses), poses, landmarks, still, who
+    if status == DONE:
+        to_test = np.empty(count[UNKNOWNS], np.int64)
+        solved, moved, num = back_substitute(
+            state, Pool(pool, numbers), of_front, problem, to_test
         )
-        judge(state, who[:restless], losses, poses, landmarks, due, turn)
-    work = Step(relinearized, factors, len(anew.unknowns), len(anew.cliques), solved, moved)
-    return pool, failed, work
+        find_stale_factors(state, to_test[:num], problem)
+    refactored, kept = len(affected.unknowns), len(affected.cliques)
+    return pool, status, Step(relinearized, factors, refactored, kept, solved, moved)
 
 
 @part
-def _fits(state: State, tables: Tables) -> bool:
-    """Whether there is room for all that is in the graph."""
+def _has_capacity(state: State, tables: Tables) -> bool:
+    """Whether the state has capacity for all that is in the graph."""
     most, total = 0, 0
     for table in (tables.edges, tables.sightings, tables.pose_priors, tables.landmark_priors):
         most = max(most, len(table.nodes))
@@ -174,27 +160,27 @@ def _fits(state: State, tables: Tables) -> bool:
 
 
 @part
-def _start_over(state: State, poses: Array, landmarks: Array) -> int:
-    """Forget the tree and relinearise everything; how many factors."""
+def _relinearize_all(state: State, poses: Array, landmarks: Array) -> int:
+    """Discard the tree and relinearize everything; how many factors."""
     count = state.counts
-    refer_all(state, poses, landmarks)
-    count[CLIQUES] = count[TOP] = count[LISTED] = count[IN_USE] = 0
+    reset_references(state, poses, landmarks)
+    count[CLIQUES] = count[TOP] = count[STALE] = count[IN_USE] = 0
     count[FREE_CLIQUE] = -1
     for k in range(len(state.free)):
         state.free[k] = -1
     for v in range(count[UNKNOWNS]):
         state.unknowns[v]['clique'] = state.unknowns[v]['local'] = -1
         if state.unknowns[v]['links'] > 0:
-            ask(state, v)
+            mark_affected(state, v)
     return int(count[FACTORS])
 
 
-class Incremental:
-    """Keeps the estimate in ``graph`` at the minimum of its cost while the graph grows.
+class IncrementalSolver:
+    """Incremental solver: keeps the estimate of a growing ``graph`` at the minimum of its cost.
 
-    Add nodes and factors to the graph, or switch factors off and on (``enabled``), then call
-    ``update``. New nodes enter with the estimate that they were added with; from then on the
-    estimate is this object's to change. Nodes that no enabled factor touches stay.
+    Add nodes and factors to the graph, or disable and enable factors (``enabled``), then call
+    ``update``. New nodes enter with the estimate that they were added with; from then on only
+    this object changes the estimate. Nodes that no enabled factor touches stay.
     """
 
     def __init__(self, graph: Graph, thresholds: Thresholds | None = None) -> None:
@@ -207,12 +193,12 @@ class Incremental:
 
     @property
     def settled(self) -> bool:
-        """Whether no factor waits to be relinearised: another update would change nothing."""
-        return not self._whole and not self._state.counts[LISTED]
+        """Whether no factor has to be relinearized: another update would change nothing."""
+        return not self._whole and not self._state.counts[STALE]
 
     @property
     def is_current(self) -> bool:
-        """Whether the last update knew all that is in the graph now."""
+        """Whether nothing in the graph has changed since the last update."""
         graph, state = self.graph, self._state
         tables = graph.edges, graph.sightings, graph.pose_priors, graph.landmark_priors
         now = len(graph.poses), len(graph.landmarks), *map(len, tables)
@@ -231,35 +217,35 @@ class Incremental:
         )
 
     def start_over(self) -> None:
-        """The estimate in the graph was changed: the next update takes it as it is."""
+        """Discard the tree: the next update starts from the estimate in the graph."""
         self._whole = True
 
     def update(self, whole: bool = False) -> Step:
-        """One step; with ``whole`` everything is relinearised, ordered and factored anew.
+        """One step; with ``whole`` everything is relinearized, ordered and factored again.
 
         Raises SolverError, naming the node, if the equations are singular; the next update then
         starts over.
         """
-        graph, limits = self.graph, self.thresholds
+        graph = self.graph
         if graph.losses is not self._losses:
             self._losses, self._whole = graph.losses, True
-        places, failed = graph.places().at, NO_ROOM
-        while failed in (NO_ROOM, OTHER):
-            self._pool, failed, step = advance(
-                self._state, self._pool, places, graph.losses.codes, whole or self._whole,
-                limits.due, limits.turn, limits.still,
+        addresses, status = graph.addresses().at, NO_CAPACITY
+        while status in (NO_CAPACITY, GAUGE_CHANGED):
+            self._pool, status, step = update_tree(
+                self._state, self._pool, addresses, graph.losses.codes, whole or self._whole,
+                self.thresholds,
             )  # fmt: skip
-            if failed == OTHER:
+            if status == GAUGE_CHANGED:
                 self._forget()
-            elif failed == NO_ROOM:
-                self._make_room()
-        self._whole = failed >= 0
+            elif status == NO_CAPACITY:
+                self._grow()
+        self._whole = status >= 0
         if self._whole:
-            node = self._state.unknowns[failed]
+            node = self._state.unknowns[status]
             name = 'pose' if node['size'] == 3 else 'landmark'
             raise SolverError(
                 f'normal equations are singular near {name} {node["index"]}: what it is connected '
-                'to is not tied to the map, or has too few measurements'
+                'to is not anchored to the map, or has too few measurements'
             )
         return step
 
@@ -286,10 +272,10 @@ class Incremental:
         return out
 
     def renumber(self, new: Renumbering) -> None:
-        """The graph has let go of nodes and factors (Graph.keep).
+        """Follow a removal of nodes and factors from the graph (Graph.keep).
 
-        It is cheap where an update came between the last change and that, in which nothing that
-        goes had an enabled factor any more. Else the next update starts over.
+        The tree is kept where the last update came after the last change, and nothing removed had
+        an enabled factor then. Else the next update starts over.
         """
         known = not self._whole and renumber(
             self._state, new.poses, new.landmarks, new.edges, new.sightings, new.pose_priors,
@@ -299,11 +285,11 @@ class Incremental:
             self._forget()
 
     def _forget(self) -> None:
-        """Nothing is known of the graph."""
+        """Discard all that is known of the graph."""
         self._state, self._whole = new_state(64, 64, 64, 256), True
 
-    def _make_room(self) -> None:
-        """Make room for all that is in the graph, and for as much again where there was none."""
+    def _grow(self) -> None:
+        """Grow to hold all that is in the graph; what is too small is doubled at least."""
         graph, state = self.graph, self._state
         tables = graph.edges, graph.sightings, graph.pose_priors, graph.landmark_priors
         need = (
@@ -313,13 +299,13 @@ class Incremental:
             len(state.of_pose), len(state.of_landmark), state.of_row.shape[1], len(state.factors),
         )  # fmt: skip
         sizes = [h if n <= h else max(n, 2 * h) for n, h in zip(need, have, strict=True)]
-        self._state = grown(state, *sizes)
+        self._state = grown_state(state, *sizes)
 
 
 def warm_up() -> None:
-    """Compile every kernel of a graph that grows and lets go of nodes."""
+    """Compile every kernel of a graph that grows and has nodes removed."""
     graph = Graph()
-    solver = Incremental(graph)
+    solver = IncrementalSolver(graph)
     graph.add_pose([0.0, 0.0, 0.0], fixed=True)
     graph.add_landmark([1.0, 1.0])
     for k in range(2):

@@ -51,7 +51,7 @@ def tree_joint(state: State, pool: Array, which: Ints) -> Array:
             Y[a, row[which[n]] + r] = 1.0
             c = owner[a]
             while c >= 0:
-                _step(state, pool, numbers, c, first[c], row, Y[a], work)
+                _forward_step(state, pool, numbers, c, first[c], row, Y[a], work)
                 c = cliques[c]['parent']
             for b in range(a + 1):
                 total = 0.0
@@ -67,7 +67,7 @@ def tree_joint(state: State, pool: Array, which: Ints) -> Array:
 
 
 @part
-def _step(
+def _forward_step(
     state: State, pool: Array, numbers: Ints, c: int, first: int, row: Ints, x: Array, work: Array
 ) -> None:
     """Clique c's part in the forward solve; its own rows begin at ``first`` of x."""

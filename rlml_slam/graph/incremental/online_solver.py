@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from rlml_slam import params
 from rlml_slam.errors import SolverError
 from rlml_slam.graph.batch.solver import BAD_START, DEFAULT, optimize
-from rlml_slam.graph.incremental.incremental_solver import Incremental
+from rlml_slam.graph.incremental.incremental_solver import IncrementalSolver
 from rlml_slam.graph.model.cost import total_cost
 from rlml_slam.graph.model.graph import Graph, Renumbering
 from rlml_slam.se2 import Array
@@ -38,7 +38,7 @@ class OnlineSolver:
         self.graph = graph
         self.steps = self.batches = 0
         self._p = parameters
-        self._incremental = Incremental(graph)
+        self._incremental = IncrementalSolver(graph)
         self._at_rest = False  # the last solve ended, and no step came since
         # the estimate of the solver, where the graph shows an older one until the next solve
         self._ahead: tuple[Array, Array] | None = None

@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numeric factorisation of a part of the tree: assemble, take up the children, eliminate.
+"""Numeric factorization of the affected part: assemble, extend-add the children, eliminate.
 
 The right-hand side is the last row of every front, so the forward solve comes with the factor.
 
 Of an update matrix of k rows and k - 1 columns the lower triangle is kept: four columns at a time,
-as dense.rank_update takes them, each four from the row of their first one on.
+as dense_fronts.rank_update takes them, each four from the row of their first one on.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from rlml_slam.compiled import fetch, part
-from rlml_slam.graph.incremental.affected_subtree import Part
+from rlml_slam.graph.incremental.affected_subtree import AffectedPart
 from rlml_slam.graph.incremental.relinearization import linearize_factor
 from rlml_slam.graph.incremental.solver_state import (
     FACTOR_BYTES,
@@ -20,33 +22,41 @@ from rlml_slam.graph.incremental.solver_state import (
     LINE,
     STEP,
     TOP,
+    Problem,
     State,
-    hang,
-    room_of,
-    take_block,
-    take_clique,
-    with_room,
+    allocate_block,
+    allocate_clique,
+    attach_clique,
+    ensure_capacity,
+    size_class_of,
+)
+from rlml_slam.graph.model.factors import (
+    Information,
+    moment,
+    position_information,
+    rotate,
+    weighted,
 )
 from rlml_slam.graph.sparse.dense_fronts import partial_cholesky, rank_update
-from rlml_slam.graph.sparse.multifrontal import SINGULAR, highest
+from rlml_slam.graph.sparse.multifrontal import SINGULAR, max_height
 from rlml_slam.graph.sparse.symbolic_analysis import Ints
 from rlml_slam.se2 import Array
 
 
 @part
-def reserve(state: State, pool: Array, anew: Part) -> Array:
-    """The pool with room for all new cliques that do not fit into free blocks."""
+def reserve(state: State, pool: Array, affected: AffectedPart) -> Array:
+    """The pool with capacity for all new cliques that do not fit into free blocks."""
     numbers, need = pool.view(np.int64), 0
     free = state.free.copy()
-    for s in range(len(anew.fronts) - 1):
-        width, height = anew.fronts[s]['width'], anew.fronts[s]['height']
-        entries = anew.fronts[s + 1]['start'] - anew.fronts[s]['start']
-        room, elements = room_of(_size(width, height, entries))
-        if free[room] >= 0:
-            free[room] = numbers[free[room]]
+    for s in range(len(affected.fronts) - 1):
+        width, height = affected.fronts[s]['width'], affected.fronts[s]['height']
+        entries = affected.fronts[s + 1]['start'] - affected.fronts[s]['start']
+        size_class, elements = size_class_of(_size(width, height, entries))
+        if free[size_class] >= 0:
+            free[size_class] = numbers[free[size_class]]
         else:
             need += elements
-    return with_room(pool, state.counts[TOP], need)
+    return ensure_capacity(pool, state.counts[TOP], need)
 
 
 @part
@@ -70,10 +80,10 @@ def _column(below: int, j: int) -> int:
 
 
 @part
-def make_cliques(state: State, numbers: Ints, anew: Part) -> Ints:
+def make_cliques(state: State, numbers: Ints, affected: AffectedPart) -> Ints:
     """Records and blocks of the new cliques, linked; the clique of each front, or -1."""
-    fronts, entries, order = anew.fronts, anew.entries, anew.order
-    m, num = len(anew.unknowns), len(fronts) - 1
+    fronts, entries, order = affected.fronts, affected.entries, affected.order
+    m, num = len(affected.unknowns), len(fronts) - 1
     of_front = np.empty(num, np.int64)
     for s in range(num - 1, -1, -1):
         of_front[s] = -1
@@ -82,43 +92,56 @@ def make_cliques(state: State, numbers: Ints, anew: Part) -> Ints:
         width, height = fronts[s]['width'], fronts[s]['height']
         if width == 0:
             continue
-        c = of_front[s] = take_clique(state.cliques, state.counts)
+        c = of_front[s] = allocate_clique(state.cliques, state.counts)
         clique = state.cliques[c]
-        room, elements = room_of(_size(width, height, end - start))
-        clique['room'], clique['width'], clique['height'] = room, width, height
-        clique['block'] = take_block(state.free, state.counts, numbers, room, elements)
+        size_class, elements = size_class_of(_size(width, height, end - start))
+        clique['size_class'], clique['width'], clique['height'] = size_class, width, height
+        clique['block'] = allocate_block(state.free, state.counts, numbers, size_class, elements)
         state.counts[IN_USE] += elements
         clique['child'], clique['mark'] = -1, state.counts[STEP]
         parent = fronts[s]['parent'] if height > width else -1
-        hang(state.cliques, c, of_front[parent] if parent >= 0 else -1)
+        attach_clique(state.cliques, c, of_front[parent] if parent >= 0 else -1)
         w = first = clique['block']
         for p in range(start, end):
             n = order[entries[p]['position']]
             if n < m:
-                numbers[w] = anew.unknowns[n]
+                numbers[w] = affected.unknowns[n]
                 w += 1
                 if p < start + own:
                     clique['own'] = w - first
-                    state.unknowns[anew.unknowns[n]]['clique'] = c
+                    state.unknowns[affected.unknowns[n]]['clique'] = c
             elif n > m and p < start + own:
-                hang(state.cliques, anew.cliques[n - m - 1], c)
+                attach_clique(state.cliques, affected.cliques[n - m - 1], c)
         clique['members'] = w - first
     return of_front
 
 
+class Front(NamedTuple):
+    """Rows and columns of the front that is assembled.
+
+    ``row_of`` (n,) the first row of each node of the part, ``column`` (h,) where row 0 of each
+    column would be in the pool, ``rows`` memory for the rows of a child.
+    """
+
+    row_of: Ints
+    column: Ints
+    rows: Ints
+
+
 @part
 def refactor(
-    state: State, pool: Array, numbers: Ints, anew: Part, of_front: Ints,
-    losses: Array, poses: Array, landmarks: Array, due: float, turn: float,
+    state: State, pool: Array, numbers: Ints, affected: AffectedPart, of_front: Ints,
+    problem: Problem,
 ) -> tuple[int, int]:  # fmt: skip
     """Factor the new cliques: (unknown where that is impossible or -1, factors assembled)."""
-    fronts, entries = anew.fronts, anew.entries
-    most = highest(fronts) + 1
-    row_of = np.empty(len(anew.position), np.int64)
-    column = np.empty(most, np.int64)
-    rows = np.empty(most, np.int64)
+    fronts, entries = affected.fronts, affected.entries
+    most = max_height(fronts) + 1
+    front = Front(
+        np.empty(len(affected.position), np.int64), np.empty(most, np.int64),
+        np.empty(most, np.int64),
+    )  # fmt: skip
     floor = np.empty(most)
-    first = _by_elimination(state, anew)
+    first = _by_elimination(state, affected)
     assembled = 0
     for s in range(len(fronts) - 1):
         c = of_front[s]
@@ -130,23 +153,20 @@ def refactor(
         tall, below = height + 1, height + 1 - width
         update = at + width * tall
         for j in range(height):
-            column[j] = at + j * tall
+            front.column[j] = at + j * tall
             if j >= width:
-                column[j] = update + _column(below, j - width) - width
+                front.column[j] = update + _column(below, j - width) - width
         for k in range(at, update + _triangle(below)):
             pool[k] = 0.0
         for p in range(fronts[s]['start'], fronts[s + 1]['start']):
-            row_of[anew.order[entries[p]['position']]] = entries[p]['local']
+            front.row_of[affected.order[entries[p]['position']]] = entries[p]['local']
         for k in range(fronts[s]['first'], fronts[s + 1]['first']):
-            n = anew.order[k]
-            if n < len(anew.unknowns):
-                assembled += _assemble(
-                    state, pool, first[n], row_of, column, height, losses, poses, landmarks,
-                    due, turn,
-                )  # fmt: skip
+            n = affected.order[k]
+            if n < len(affected.unknowns):
+                assembled += _assemble(state, pool, first[n], front, height, problem)
         child = clique['child']
         while child >= 0:
-            _extend(state, pool, numbers, child, row_of, column, height, rows)
+            _extend_add(state, pool, numbers, child, front, height)
             child = state.cliques[child]['next']
         for j in range(width):
             floor[j] = SINGULAR * pool[at + j * (tall + 1)]
@@ -161,18 +181,18 @@ def refactor(
 
 
 @part
-def _by_elimination(state: State, anew: Part) -> Ints:
+def _by_elimination(state: State, affected: AffectedPart) -> Ints:
     """First factor (m,) of those of which each unknown of the part is eliminated first, or -1.
 
     The chains of the poses have all factors of the part but those on a landmark alone: that of a
     landmark, which may have been seen from all over the map, is left where these end.
     """
-    unknowns, position = state.unknowns, anew.position
-    out = np.empty(len(anew.unknowns), np.int64)
+    unknowns, position = state.unknowns, affected.position
+    out = np.empty(len(affected.unknowns), np.int64)
     for n in range(len(out)):
         out[n] = -1
     for n in range(len(out)):
-        u = unknowns[anew.unknowns[n]]
+        u = unknowns[affected.unknowns[n]]
         link = u['head']
         while link >= 0:
             f, end = link // 2, link % 2
@@ -196,22 +216,21 @@ def _by_elimination(state: State, anew: Part) -> Ints:
 
 @part
 def _assemble(
-    state: State, pool: Array, f: int, row_of: Ints, column: Ints, height: int,
-    losses: Array, poses: Array, landmarks: Array, due: float, turn: float,
-) -> int:  # fmt: skip
+    state: State, pool: Array, f: int, front: Front, height: int, problem: Problem
+) -> int:
     """Add the chain of factors from f on; how many."""
     unknowns, num = state.unknowns, 0
     while f >= 0:
         z = state.factors[f]
         for k in range(0, FACTOR_BYTES, LINE):
             fetch(state.factors, z['after'], k)
-        e = linearize_factor(state, f, losses, poses, landmarks, due, turn)
+        e = linearize_factor(state, f, problem)
         a, b, size = -1, -1, 3
         if z['a'] >= 0:
-            a = row_of[unknowns[z['a']]['local']]
+            a = front.row_of[unknowns[z['a']]['local']]
         if z['b'] >= 0:
-            b, size = row_of[unknowns[z['b']]['local']], unknowns[z['b']]['size']
-        _add_factor(z, e, pool, column, height, a, b, size)
+            b, size = front.row_of[unknowns[z['b']]['local']], unknowns[z['b']]['size']
+        _add_factor(z, e, pool, front.column, height, (a, b, size))
         num += 1
         f = z['after']
     return num
@@ -219,24 +238,26 @@ def _assemble(
 
 @part
 def _add_factor(
-    z: np.void, e: tuple[float, float, float], v: Array, column: Ints, height: int, a: int, b: int,
-    size: int,
+    z: np.void, e: tuple[float, float, float], v: Array, column: Ints, height: int,
+    rows: tuple[int, int, int],
 ) -> None:  # fmt: skip
-    """Add a factor at rows a and b (-1: none) of a front, with the formulas of linearize.py."""
+    """Add a factor at rows a and b (-1: none) of a front, with the blocks of linearization.py.
+
+    ``rows`` are a, b and the size of b.
+    """
+    a, b, size = rows
     c, s, dx, dy, w = z['C'], z['S'], z['dx'], z['dy'], z['weight']
-    I00, I01, I02 = w * z['I00'], w * z['I01'], w * z['I02']
-    I11, I12, I22 = w * z['I11'], w * z['I12'], w * z['I22']
-    e0, e1, e2 = e
-    q0 = I00 * e0 + I01 * e1 + I02 * e2
-    q1 = I01 * e0 + I11 * e1 + I12 * e2
-    u0, u1, u2 = c * q0 - s * q1, s * q0 + c * q1, I02 * e0 + I12 * e1 + I22 * e2
-    t00, t01 = I00 * c - I01 * s, I00 * s + I01 * c
-    t10, t11 = I01 * c - I11 * s, I01 * s + I11 * c
-    M00, M01, M11 = c * t00 - s * t10, c * t01 - s * t11, s * t01 + c * t11
-    M02, M12, M22 = c * I02 - s * I12, s * I02 + c * I12, I22
-    n0 = dx * M01 - dy * M00 + M02
-    n1 = dx * M11 - dy * M01 + M12
-    n2 = dx * M12 - dy * M02 + M22
+    W = Information(
+        w * z['I00'], w * z['I01'], w * z['I02'], w * z['I11'], w * z['I12'], w * z['I22']
+    )
+    q0, q1, u2 = weighted(W, e[0], e[1], e[2])
+    u0, u1 = rotate(c, s, q0, q1)
+    M00, M01, M11 = position_information(W, 1.0, c, s)
+    M02, M12 = rotate(c, s, W.I02, W.I12)
+    M22 = W.I22
+    n0 = moment(dx, dy, M00, M01) + M02
+    n1 = moment(dx, dy, M01, M11) + M12
+    n2 = moment(dx, dy, M02, M12) + M22
     if a >= 0:
         k, k1, k2 = column[a] + a, column[a + 1] + a, column[a + 2] + a
         v[k] += M00
@@ -244,11 +265,11 @@ def _add_factor(
         v[k + 2] += n0
         v[k1 + 1] += M11
         v[k1 + 2] += n1
-        v[k2 + 2] += dx * n1 - dy * n0 + n2
+        v[k2 + 2] += moment(dx, dy, n0, n1) + n2
         r = height - a
         v[k + r] -= u0
         v[k1 + r] -= u1
-        v[k2 + r] -= dx * u1 - dy * u0 + u2
+        v[k2 + r] -= moment(dx, dy, u0, u1) + u2
     if b >= 0:
         k, k1 = column[b] + b, column[b + 1] + b
         r = height - b
@@ -293,14 +314,14 @@ def _add_factor(
 
 
 @part
-def _extend(
-    state: State, pool: Array, numbers: Ints, c: int, row_of: Ints, column: Ints, height: int,
-    rows: Ints,
-) -> None:  # fmt: skip
-    """Add the update matrix of clique c to the front of its parent.
+def _extend_add(
+    state: State, pool: Array, numbers: Ints, c: int, front: Front, height: int
+) -> None:
+    """Add the update matrix of clique c to the front of its parent (extend-add).
 
     A clique that was there before may have its rows in another order than its new parent.
     """
+    row_of, column, rows = front.row_of, front.column, front.rows
     clique = state.cliques[c]
     first = clique['block']
     w, ascending = 0, True

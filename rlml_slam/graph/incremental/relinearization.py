@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Factors of the incremental solver: taken from the graph, and linearised.
+"""Factors of the incremental solver: synchronized with the graph, and linearized.
 
 The coordinates are the raw ones of factors.py, so a factor's linear model stays a function of the
-estimate itself and each factor has a linearisation point of its own.
+estimate itself and each factor has a linearization point of its own.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import numpy as np
 
 from rlml_slam.compiled import part
 from rlml_slam.graph.incremental.relinearization_test import (
-    calm,
-    narrow,
+    restrict_validity,
     squared,
+    valid_turn,
 )
 from rlml_slam.graph.incremental.solver_state import (
     EDGES,
@@ -29,75 +29,83 @@ from rlml_slam.graph.incremental.solver_state import (
     SIGHTINGS,
     STEP,
     UNKNOWNS,
+    Problem,
     State,
-    ask,
-    take_factor,
-    take_unknown,
+    allocate_factor,
+    allocate_unknown,
+    mark_affected,
 )
-from rlml_slam.graph.model.linearization import wrapped
+from rlml_slam.graph.model.factors import (
+    axes,
+    is_curved,
+    linear_change,
+    residual,
+    rotate,
+    rotate_back,
+)
 from rlml_slam.graph.model.packed_system import Factors, Flags, Tables
 from rlml_slam.graph.model.robust_loss import loss
-from rlml_slam.se2 import Array
+from rlml_slam.se2 import Array, wrapped_by_turns
 
 
 @part
-def take(state: State, tables: Tables, poses: Array, landmarks: Array) -> None:
-    """Take over what is new in the graph: nodes, factors, factors switched on or off."""
+def synchronize(state: State, tables: Tables, poses: Array, landmarks: Array) -> None:
+    """Add the new nodes and factors of the graph, and follow what was enabled or disabled."""
     count = state.counts
     for i in range(count[POSES], len(poses)):
         state.of_pose[i] = -1
         state.on[FIXED_POSES, i] = tables.fixed_poses[i]
         if not tables.fixed_poses[i]:
             state.of_pose[i] = _new_unknown(state, 3, i)
-            _refer(state, state.of_pose[i], poses[i, 0], poses[i, 1], poses[i, 2])
+            _set_reference(state, state.of_pose[i], poses[i, 0], poses[i, 1], poses[i, 2])
     count[POSES] = len(poses)
     for i in range(count[LANDMARKS], len(landmarks)):
         state.of_landmark[i] = -1
         state.on[FIXED_LANDMARKS, i] = tables.fixed_landmarks[i]
         if not tables.fixed_landmarks[i]:
             state.of_landmark[i] = _new_unknown(state, 2, i)
-            _refer(state, state.of_landmark[i], landmarks[i, 0], landmarks[i, 1], 0.0)
+            _set_reference(state, state.of_landmark[i], landmarks[i, 0], landmarks[i, 1], 0.0)
     count[LANDMARKS] = len(landmarks)
-    _take_factors(state, EDGES, tables.edges)
-    _take_factors(state, SIGHTINGS, tables.sightings)
-    _take_factors(state, POSE_PRIORS, tables.pose_priors)
-    _take_factors(state, LANDMARK_PRIORS, tables.landmark_priors)
+    _synchronize_factors(state, EDGES, tables.edges)
+    _synchronize_factors(state, SIGHTINGS, tables.sightings)
+    _synchronize_factors(state, POSE_PRIORS, tables.pose_priors)
+    _synchronize_factors(state, LANDMARK_PRIORS, tables.landmark_priors)
 
 
 @part
 def _new_unknown(state: State, size: int, index: int) -> int:
-    v = take_unknown(state.unknowns, state.counts)
+    v = allocate_unknown(state.unknowns, state.counts)
     u = state.unknowns[v]
     u['size'], u['index'] = size, index
     u['clique'] = u['head'] = u['local'] = -1
     u['links'] = 0
-    u['seeded'] = u['late'] = u['moved'] = 0
-    u['stiff'] = u['turn'] = 0.0
+    u['affected'] = u['last_change'] = u['moved'] = 0
+    u['position_info'] = u['heading_info'] = 0.0
     return v
 
 
 @part
-def _refer(state: State, v: int, x: float, y: float, theta: float) -> None:
-    """Measure d from this estimate on."""
+def _set_reference(state: State, v: int, x: float, y: float, theta: float) -> None:
+    """Make this estimate the reference, where d = 0."""
     u = state.unknowns[v]
     u['x'], u['y'], u['theta'] = x, y, theta
-    u['low'], u['high'] = -np.inf, np.inf
+    u['valid_low'], u['valid_high'] = -np.inf, np.inf
     u['dx'] = u['dy'] = u['dtheta'] = u['sx'] = u['sy'] = u['stheta'] = 0.0
 
 
 @part
-def refer_all(state: State, poses: Array, landmarks: Array) -> None:
-    """Measure all d from the estimate at hand."""
+def reset_references(state: State, poses: Array, landmarks: Array) -> None:
+    """Make the current estimate the reference of all unknowns."""
     for v in range(state.counts[UNKNOWNS]):
         i = state.unknowns[v]['index']
         if state.unknowns[v]['size'] == 3:
-            _refer(state, v, poses[i, 0], poses[i, 1], poses[i, 2])
+            _set_reference(state, v, poses[i, 0], poses[i, 1], poses[i, 2])
         else:
-            _refer(state, v, landmarks[i, 0], landmarks[i, 1], 0.0)
+            _set_reference(state, v, landmarks[i, 0], landmarks[i, 1], 0.0)
 
 
 @part
-def _take_factors(state: State, table: int, factors: Factors) -> None:
+def _synchronize_factors(state: State, table: int, factors: Factors) -> None:
     known: int = state.counts[ROWS + table]
     rows = len(factors.nodes)
     on = state.on[table]
@@ -108,20 +116,20 @@ def _take_factors(state: State, table: int, factors: Factors) -> None:
             for r in range(start, end):
                 if on[r] != factors.enabled[r]:
                     on[r] = not on[r]
-                    _switch(state, state.of_row[table, r], on[r])
+                    _set_enabled(state, state.of_row[table, r], on[r])
     for r in range(known, rows):
-        f = take_factor(state.factors, state.counts)
+        f = allocate_factor(state.factors, state.counts)
         state.of_row[table, r] = f
-        _copy(state, f, table, factors, r)
+        _pack_factor(state, f, table, factors, r)
         on[r] = factors.enabled[r]
         if on[r]:
-            _switch(state, f, True)
+            _set_enabled(state, f, True)
     state.counts[ROWS + table] = rows
 
 
 @part
 def differ(a: Flags, b: Flags, start: int, end: int) -> bool:
-    """Whether flags between two places are not the same."""
+    """Whether flags between two indices differ."""
     different = False
     for r in range(start, end):
         different |= a[r] != b[r]
@@ -129,13 +137,13 @@ def differ(a: Flags, b: Flags, start: int, end: int) -> bool:
 
 
 @part
-def _copy(state: State, f: int, table: int, factors: Factors, r: int) -> None:
+def _pack_factor(state: State, f: int, table: int, factors: Factors, r: int) -> None:
     """Row r of a table into record f."""
     z, nodes = state.factors[f], factors.nodes
     measured, info = factors.measured, factors.information
     z['table'], z['kind'] = table, factors.kinds[r]
     z['next_a'] = z['next_b'] = z['i'] = z['a'] = -1
-    z['checked'] = 0
+    z['tested'] = 0
     z['j'] = nodes[r, nodes.shape[1] - 1]
     if table in (EDGES, SIGHTINGS):
         z['i'] = nodes[r, 0]
@@ -151,12 +159,13 @@ def _copy(state: State, f: int, table: int, factors: Factors, r: int) -> None:
         z['theta'] = measured[r, 2]
     if table == EDGES:
         c, s = math.cos(z['theta']), math.sin(z['theta'])
-        z['c'], z['s'], z['x'], z['y'] = c, s, c * x + s * y, c * y - s * x
+        z['c'], z['s'] = c, s
+        z['x'], z['y'] = rotate_back(c, s, x, y)
 
 
 @part
-def _switch(state: State, f: int, on: bool) -> None:
-    """Let a factor take part, or no longer."""
+def _set_enabled(state: State, f: int, on: bool) -> None:
+    """Enable or disable a factor."""
     z = state.factors[f]
     for end in range(2):
         v = z['a'] if end == 0 else z['b']
@@ -170,12 +179,12 @@ def _switch(state: State, f: int, on: bool) -> None:
             _unlink(state, v, 2 * f + end)
             u['links'] -= 1
         sign = 1.0 if on else -1.0
-        stiff = z['I00'] + z['I11']
+        info = z['I00'] + z['I11']
         arm = z['x'] * z['x'] + z['y'] * z['y'] if end == 0 else 0.0
-        u['stiff'] += sign * stiff
-        u['turn'] += sign * (z['I22'] + arm * stiff)
-        u['late'] = state.counts[STEP]
-        ask(state, v)
+        u['position_info'] += sign * info
+        u['heading_info'] += sign * (z['I22'] + arm * info)
+        u['last_change'] = state.counts[STEP]
+        mark_affected(state, v)
 
 
 @part
@@ -226,36 +235,34 @@ def _set_next(state: State, link: int, after: int) -> None:
 
 
 @part
-def linearize_factor(
-    state: State, f: int, losses: Array, poses: Array, landmarks: Array, due: float, turn: float
-) -> tuple[float, float, float]:
-    """Linearise a factor at the estimate at hand; its residual where all d are zero."""
+def linearize_factor(state: State, f: int, problem: Problem) -> tuple[float, float, float]:
+    """Linearize a factor at the current estimate; its residual e - J d, where all d are zero."""
     z, unknowns = state.factors[f], state.unknowns
-    i, j, a, b = z['i'], z['j'], z['a'], z['b']
+    poses, landmarks, losses = problem.poses, problem.landmarks, problem.losses
+    i, j, a, b, kind = z['i'], z['j'], z['a'], z['b'], z['kind']
     on_landmark = z['table'] in (SIGHTINGS, LANDMARK_PRIORS)
     dx, dy = (landmarks[j, 0], landmarks[j, 1]) if on_landmark else (poses[j, 0], poses[j, 1])
     c, s, theta = z['c'], z['s'], 0.0
     if i >= 0:
         theta = poses[i, 2]
-        cos, sin = math.cos(theta), math.sin(theta)
-        c, s = cos * z['c'] - sin * z['s'], sin * z['c'] + cos * z['s']
+        c, s = rotate(c, s, math.cos(theta), math.sin(theta))
         dx -= poses[i, 0]
         dy -= poses[i, 1]
-    e0, e1 = c * dx + s * dy - z['x'], c * dy - s * dx - z['y']
-    e2 = 0.0 if on_landmark else wrapped(poses[j, 2] - theta - z['theta'])
+    c, s = axes(kind, c, s, dx, dy)
+    e0, e1 = residual(c, s, dx, dy, z['x'], z['y'])
+    e2 = 0.0 if on_landmark else wrapped_by_turns(poses[j, 2] - theta - z['theta'])
     z['C'], z['S'], z['dx'], z['dy'] = c, s, dx, dy
     z['from'] = unknowns[a]['theta'] + unknowns[a]['dtheta'] if a >= 0 else theta
-    z['calm'] = calm(z, losses, due, turn)
+    z['valid_turn'] = valid_turn(z, problem.robust, problem.thresholds)
     if a >= 0:
-        narrow(unknowns[a], z)
-    z['weight'] = loss(losses[z['kind'], 0], losses[z['kind'], 1], squared(z, e0, e1, e2))[1]
-    # e + J d is linear, so where all d are zero it is e - J d
-    x = y = t = 0.0
+        restrict_validity(unknowns[a], z)
+    if b >= 0 and is_curved(kind):
+        restrict_validity(unknowns[b], z)
+    z['weight'] = loss(losses[kind, 0], losses[kind, 1], squared(z, e0, e1, e2))[1]
+    step_i = step_j = (0.0, 0.0, 0.0)
+    if a >= 0:
+        step_i = unknowns[a]['dx'], unknowns[a]['dy'], unknowns[a]['dtheta']
     if b >= 0:
-        x, y, t = unknowns[b]['dx'], unknowns[b]['dy'], unknowns[b]['dtheta']
-    if a >= 0:
-        t_a = unknowns[a]['dtheta']
-        x -= unknowns[a]['dx'] - dy * t_a
-        y -= unknowns[a]['dy'] + dx * t_a
-        t -= t_a
-    return e0 - (c * x + s * y), e1 - (c * y - s * x), 0.0 if on_landmark else e2 - t
+        step_j = unknowns[b]['dx'], unknowns[b]['dy'], unknowns[b]['dtheta']
+    l0, l1, l2 = linear_change(c, s, (dx, dy), step_i, step_j)
+    return e0 - l0, e1 - l1, 0.0 if on_landmark else e2 - l2

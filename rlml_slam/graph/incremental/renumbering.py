@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The incremental solver goes on with a graph that has let go of nodes and factors."""
+"""Renumbering of the incremental solver after nodes and factors were removed from its graph."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ def renumber(
     state: State, poses: Ints, landmarks: Ints, edges: Ints, sightings: Ints, pose_priors: Ints,
     landmark_priors: Ints,
 ) -> bool:  # fmt: skip
-    """Take over where nodes and factors are now, -1 for those that are gone.
+    """Apply the new indices of nodes and factors, -1 for those removed.
 
-    False, and nothing was done, where the graph has gained something that the solver does not
-    know, or where something that is gone still takes part in the tree.
+    False, and nothing was done, where the graph has something new that the solver does not know,
+    or where something removed is still part of the tree.
     """
     count = state.counts
     if not (
-        _alone(state, state.of_pose, count[POSES], poses)
-        and _alone(state, state.of_landmark, count[LANDMARKS], landmarks)
-        and _off(state, EDGES, edges)
-        and _off(state, SIGHTINGS, sightings)
-        and _off(state, POSE_PRIORS, pose_priors)
-        and _off(state, LANDMARK_PRIORS, landmark_priors)
+        _are_free(state, state.of_pose, count[POSES], poses)
+        and _are_free(state, state.of_landmark, count[LANDMARKS], landmarks)
+        and _are_disabled(state, EDGES, edges)
+        and _are_disabled(state, SIGHTINGS, sightings)
+        and _are_disabled(state, POSE_PRIORS, pose_priors)
+        and _are_disabled(state, LANDMARK_PRIORS, landmark_priors)
     ):
         return False
     count[POSES] = _move_nodes(state, state.of_pose, FIXED_POSES, poses)
@@ -51,8 +51,8 @@ def renumber(
 
 
 @part
-def _alone(state: State, of: Ints, known: int, new: Ints) -> bool:
-    """Whether all nodes are known, and no factor is on those that are gone."""
+def _are_free(state: State, of: Ints, known: int, new: Ints) -> bool:
+    """Whether all nodes are known, and no enabled factor is on those removed."""
     if known != len(new):
         return False
     for i in range(known):
@@ -64,8 +64,8 @@ def _alone(state: State, of: Ints, known: int, new: Ints) -> bool:
 
 
 @part
-def _off(state: State, table: int, new: Ints) -> bool:
-    """Whether all rows of a table are known, and those that are gone take no part."""
+def _are_disabled(state: State, table: int, new: Ints) -> bool:
+    """Whether all rows of a table are known, and those removed are disabled."""
     if state.counts[ROWS + table] != len(new):
         return False
     off = True
@@ -76,7 +76,7 @@ def _off(state: State, table: int, new: Ints) -> bool:
 
 @part
 def _move_nodes(state: State, of: Ints, fixed: int, new: Ints) -> int:
-    """Unknowns of nodes and which are fixed; these only ever move up. How many nodes there are."""
+    """Move the unknowns and the flags of nodes to lower indices. How many nodes there are."""
     num = 0
     for i in range(len(new)):
         v = of[i]

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the incremental solver keeps from step to step, in growing arrays, and its memory.
+"""State of the incremental solver: unknowns, linearized factors, the clique tree, and its memory.
 
-The factor is a tree of cliques (the Bayes tree of Kaess et al., "iSAM2: Incremental smoothing and
-mapping using the Bayes tree", IJRR 31 (2012)): the fronts of structure.py, each with its panel
-and its update matrix, linked instead of listed, so that a part can be taken out and made anew.
+The Cholesky factor is a tree of cliques (the Bayes tree of Kaess et al., "iSAM2: Incremental
+smoothing and mapping using the Bayes tree", IJRR 31 (2012)): fronts as in sparse/, each with its
+panel and its update matrix, linked instead of listed, so that a part can be replaced.
 """
 
 from __future__ import annotations
@@ -21,35 +21,38 @@ from rlml_slam.se2 import Array
 LINE = 64
 
 # An unknown pose or landmark (``size`` 3 or 2) at ``index`` of its table. The estimate is x, y,
-# theta + d; ``s`` is the d that the cliques below know; ``moved`` is the last step that moved it.
-# ``stiff`` [1/m^2] and ``turn`` [1/rad^2] bound the information on it of all factors. While the
-# heading is between ``low`` and ``high`` the factors from a pose are modelled well. It is an own
-# variable of ``clique`` (-1: of none); ``head`` starts its chain of factor ends, 2 * factor + end,
-# and ``links`` counts them. ``local`` is its number in the part at work, -1 outside of it;
-# ``seeded`` and ``late`` are the last steps that asked for it and that brought a factor to it. In
-# the chain of a pose the factors from it come first, in that of a landmark those on it alone.
+# theta + d; ``s`` is the d that the cliques below were solved with; ``moved`` is the last step
+# that moved it. ``position_info`` [1/m^2] and ``heading_info`` [1/rad^2] bound the information on
+# it of all factors. While the heading is between ``valid_low`` and ``valid_high`` the linear
+# models of the factors from a pose hold. It is an own variable of ``clique`` (-1: of none);
+# ``head`` starts its chain of factor ends, 2 * factor + end, and ``links`` counts them. ``local``
+# is its number in the affected part, -1 outside of it; ``affected`` and ``last_change`` are the
+# last steps that eliminated it again and that brought a factor to it. In the chain of a pose the
+# factors from it come first, in that of a landmark those on it alone.
 UNKNOWN = np.dtype(
     # two lines that the back-substitution reads, and one that it does not
     [('size', np.int64), ('moved', np.int64)]
     + [(k, np.float64) for k in ('dx', 'dy', 'dtheta', 'x', 'y', 'theta')]
-    + [(k, np.float64) for k in ('sx', 'sy', 'stheta', 'stiff', 'turn', 'low', 'high')]
-    + [(k, np.int64) for k in ('index', 'head', 'clique', 'links', 'local', 'seeded', 'late')]
+    + [(k, np.float64) for k in ('sx', 'sy', 'stheta', 'position_info', 'heading_info')]
+    + [(k, np.float64) for k in ('valid_low', 'valid_high')]
+    + [(k, np.int64) for k in ('index', 'head', 'clique', 'links', 'local')]
+    + [(k, np.int64) for k in ('affected', 'last_change')]
     + [('unused', np.int64, 2)]
 )
 
 # A factor of any table, in the form of an edge from i to j with unknowns a and b (-1: none): a
 # sighting has no information on the angle, a prior has no i. c to theta and I00 to I22 as in
-# system.EDGE. Its linearisation: ``from`` theta_i, ``C`` and ``S`` cosine and sine of theta_i +
-# theta_delta, dx and dy t_j - t_i, the robust weight; ``calm`` is the turn [rad] up to which it
-# needs no closer look. ``checked`` is the last step that judged it, ``after`` the next one to be
-# assembled.
+# packed_system.EDGE. Its linearization: ``from`` theta_i, ``C`` and ``S`` cosine and sine of its
+# axes, dx and dy t_j - t_i, the robust weight; ``valid_turn`` is the turn of its pose [rad] up to
+# which the linear model holds. ``tested`` is the last step that tested it, ``after`` the next one
+# to be assembled.
 FACTOR = np.dtype(
-    # what judging it takes comes first
+    # what the relinearization test reads comes first
     [('next_a', np.int64), ('next_b', np.int64)]
-    + [(k, np.float64) for k in ('from', 'calm', 'weight')]
+    + [(k, np.float64) for k in ('from', 'valid_turn', 'weight')]
     + [(k, np.int32) for k in ('a', 'b', 'i', 'j', 'table', 'kind')]
     + [(k, np.float64) for k in ('C', 'S', 'dx', 'dy', 'I00', 'I01', 'I11')]
-    + [('checked', np.int32), ('after', np.int32)]
+    + [('tested', np.int32), ('after', np.int32)]
     + [(k, np.float64) for k in ('c', 's', 'x', 'y', 'theta', 'I02', 'I12', 'I22')]
 )
 FACTOR_BYTES = FACTOR.itemsize
@@ -58,34 +61,33 @@ EDGES, SIGHTINGS, POSE_PRIORS, LANDMARK_PRIORS = 0, 1, 2, 3
 # A clique: its place in the tree (-1: none), ``own`` of its ``members`` variables, ``width`` own
 # of ``height`` rows. At ``block`` of the pool lie the members, as integers, then the panel, of
 # ``width`` columns of ``height`` + 1 rows, of which the last is the right-hand side, then the
-# update matrix of ``height`` - ``width`` + 1 rows (refactor.py). ``room`` is the size class of
+# update matrix of ``height`` - ``width`` + 1 rows (refactorization.py). ``size_class`` is that of
 # the block, ``mark`` the step that made or dropped it.
 CLIQUE = np.dtype(
-    [(k, np.int64) for k in ('block', 'room', 'own', 'members', 'width', 'height')]
+    [(k, np.int64) for k in ('block', 'size_class', 'own', 'members', 'width', 'height')]
     + [(k, np.int32) for k in ('child', 'next', 'parent', 'mark')]
 )
 
-# places in State.counts: what is known of the graph's tables (poses, landmarks, rows of the four
+# indices of State.counts: what is known of the graph's tables (poses, landmarks, rows of the four
 # tables), what is in use here, the number of the step, where the lists of free records start, the
 # elements of the blocks in use, and of those when the tree was ordered as a whole
 POSES, LANDMARKS, ROWS, UNKNOWNS, FACTORS, CLIQUES = 0, 1, 2, 6, 7, 8
-FIXED_POSES, FIXED_LANDMARKS = 4, 5  # places in State.on, after those of the tables
-FREE_CLIQUE, TOP, STEP, SEEDS, LISTED, FREE_UNKNOWN, FREE_FACTOR, IN_USE, IN_ONE, COUNTS = range(
-    9, 19
-)
+FIXED_POSES, FIXED_LANDMARKS = 4, 5  # indices of State.on, after those of the tables
+FREE_CLIQUE, TOP, STEP, SEEDS, STALE, FREE_UNKNOWN = range(9, 15)
+FREE_FACTOR, IN_USE, IN_USE_AT_ORDERING, COUNTS = range(15, 19)
 
 CLASSES = 256  # size classes of blocks: four to an octave
-LITTLE = 1 << 14  # elements that are not worth a thought
+LITTLE = 1 << 14  # elements [128 kB] below which memory is not compacted
 
 
 class State(NamedTuple):
     """All but the pool of numbers, which grows in the kernels.
 
     ``of_pose`` and ``of_landmark`` are the unknowns of the nodes (-1: fixed), ``of_row`` (4, k)
-    and ``on`` (6, k) the factor of each row of the tables and whether it takes part; the last two
-    of ``on`` tell which poses and landmarks are fixed. ``seeds``
-    are the unknowns whose cliques have to be made anew, ``due`` the factors to be relinearised.
-    ``free`` starts the list of free blocks of each class.
+    and ``on`` (6, k) the factor of each row of the tables and whether it is enabled; the last two
+    of ``on`` are the flags of the fixed poses and landmarks. ``seeds`` are the unknowns whose
+    cliques have to be replaced, ``stale`` the factors to be relinearized. ``free`` starts the
+    list of free blocks of each class.
     """
 
     unknowns: Records
@@ -96,9 +98,33 @@ class State(NamedTuple):
     of_row: Ints
     on: NDArray[np.bool_]
     seeds: Ints
-    due: Ints
+    stale: Ints
     free: Ints
     counts: Ints
+
+
+class Thresholds(NamedTuple):
+    """Thresholds of relinearization and of back-substitution.
+
+    A factor is relinearized when its linear model is off by ``linear`` standard deviations, its
+    axes have turned by ``turn`` [rad] or its robust weight changed by that share, else only where
+    it has to be assembled anyway. A move of a variable by less than ``wildfire`` standard
+    deviations is not passed on to the cliques below (the wildfire threshold of iSAM2).
+    """
+
+    linear: float = 0.05
+    turn: float = 0.1
+    wildfire: float = 0.02
+
+
+class Problem(NamedTuple):
+    """What is minimised: the estimate, the losses (7, 2), whether any is robust, thresholds."""
+
+    poses: Array
+    landmarks: Array
+    losses: Array
+    robust: bool
+    thresholds: Thresholds
 
 
 def new_state(poses: int, landmarks: int, rows: int, factors: int) -> State:
@@ -121,7 +147,7 @@ def _records(num: int, kind: np.dtype[np.void]) -> Records:
     return memory[first : first + num * kind.itemsize].view(kind)
 
 
-def grown(state: State, poses: int, landmarks: int, rows: int, factors: int) -> State:
+def grown_state(state: State, poses: int, landmarks: int, rows: int, factors: int) -> State:
     """The state with more room."""
     new = new_state(poses, landmarks, rows, factors)
     for old, to in zip(state, new, strict=True):
@@ -130,8 +156,8 @@ def grown(state: State, poses: int, landmarks: int, rows: int, factors: int) -> 
 
 
 @part
-def room_of(size: int) -> tuple[int, int]:
-    """(class, elements) of the smallest block that holds ``size`` elements."""
+def size_class_of(size: int) -> tuple[int, int]:
+    """(size class, elements) of the smallest block that holds ``size`` elements."""
     octave, least = 0, 16
     while 2 * least <= size:
         least *= 2
@@ -142,11 +168,11 @@ def room_of(size: int) -> tuple[int, int]:
 
 
 @part
-def take_block(free: Ints, count: Ints, numbers: Ints, room: int, elements: int) -> int:
-    """Address of a block of a class; ``numbers`` is the pool seen as integers."""
-    at: int = free[room]
+def allocate_block(free: Ints, count: Ints, numbers: Ints, size_class: int, elements: int) -> int:
+    """Index of a block of a size class; ``numbers`` is the pool seen as integers."""
+    at: int = free[size_class]
     if at >= 0:
-        free[room] = numbers[at]
+        free[size_class] = numbers[at]
     else:
         at = count[TOP]
         count[TOP] += elements
@@ -154,7 +180,7 @@ def take_block(free: Ints, count: Ints, numbers: Ints, room: int, elements: int)
 
 
 @part
-def with_room(pool: Array, top: int, need: int) -> Array:
+def ensure_capacity(pool: Array, top: int, need: int) -> Array:
     """The pool, or a copy of it that holds ``need`` more elements above ``top``."""
     if top + need <= len(pool):
         return pool
@@ -165,10 +191,10 @@ def with_room(pool: Array, top: int, need: int) -> Array:
 
 
 @part
-def elements_of(room: int) -> int:
+def elements_of_class(size_class: int) -> int:
     """Elements of a block of a class."""
-    least = 16 << (room // 4)
-    return int(least + room % 4 * (least // 4))
+    least = 16 << (size_class // 4)
+    return int(least + size_class % 4 * (least // 4))
 
 
 @kernel
@@ -183,7 +209,7 @@ def compacted(state: State, pool: Array) -> Array:
         if c < 0 or moved[c]:
             continue
         moved[c] = True
-        first, elements = cliques[c]['block'], elements_of(cliques[c]['room'])
+        first, elements = cliques[c]['block'], elements_of_class(cliques[c]['size_class'])
         for k in range(elements):
             more[top + k] = pool[first + k]
         cliques[c]['block'] = top
@@ -195,7 +221,7 @@ def compacted(state: State, pool: Array) -> Array:
 
 
 @part
-def take_clique(cliques: Records, count: Ints) -> int:
+def allocate_clique(cliques: Records, count: Ints) -> int:
     """A record for a clique."""
     c: int = count[FREE_CLIQUE]
     if c >= 0:
@@ -207,7 +233,7 @@ def take_clique(cliques: Records, count: Ints) -> int:
 
 
 @part
-def take_unknown(unknowns: Records, count: Ints) -> int:
+def allocate_unknown(unknowns: Records, count: Ints) -> int:
     """A record for an unknown; the free ones are linked by ``head``."""
     v: int = count[FREE_UNKNOWN]
     if v >= 0:
@@ -219,7 +245,7 @@ def take_unknown(unknowns: Records, count: Ints) -> int:
 
 
 @part
-def take_factor(factors: Records, count: Ints) -> int:
+def allocate_factor(factors: Records, count: Ints) -> int:
     """A record for a factor; the free ones are linked by ``after``."""
     f: int = count[FREE_FACTOR]
     if f >= 0:
@@ -231,19 +257,19 @@ def take_factor(factors: Records, count: Ints) -> int:
 
 
 @part
-def drop_clique(state: State, numbers: Ints, c: int) -> None:
-    """Give back a clique and its block."""
+def free_clique(state: State, numbers: Ints, c: int) -> None:
+    """Free a clique and its block."""
     clique = state.cliques[c]
-    state.counts[IN_USE] -= elements_of(clique['room'])
-    numbers[clique['block']] = state.free[clique['room']]
-    state.free[clique['room']] = clique['block']
+    state.counts[IN_USE] -= elements_of_class(clique['size_class'])
+    numbers[clique['block']] = state.free[clique['size_class']]
+    state.free[clique['size_class']] = clique['block']
     clique['next'] = state.counts[FREE_CLIQUE]
     state.counts[FREE_CLIQUE] = c
 
 
 @part
-def hang(cliques: Records, c: int, parent: int) -> None:
-    """Put clique c below ``parent`` (-1: a root)."""
+def attach_clique(cliques: Records, c: int, parent: int) -> None:
+    """Link clique c below ``parent`` (-1: a root)."""
     cliques[c]['parent'] = parent
     cliques[c]['next'] = -1
     if parent >= 0:
@@ -252,9 +278,9 @@ def hang(cliques: Records, c: int, parent: int) -> None:
 
 
 @part
-def ask(state: State, v: int) -> None:
-    """The clique of unknown v has to be made anew in this step."""
-    if v >= 0 and state.unknowns[v]['seeded'] != state.counts[STEP]:
-        state.unknowns[v]['seeded'] = state.counts[STEP]
+def mark_affected(state: State, v: int) -> None:
+    """The clique of unknown v has to be replaced in this step."""
+    if v >= 0 and state.unknowns[v]['affected'] != state.counts[STEP]:
+        state.unknowns[v]['affected'] = state.counts[STEP]
         state.seeds[state.counts[SEEDS]] = v
         state.counts[SEEDS] += 1

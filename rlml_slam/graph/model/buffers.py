@@ -65,7 +65,7 @@ _array: Any = carray
 
 @part
 def nodes_at(at: Ints) -> tuple[Array, Array]:
-    """Poses (n, 3) and landmarks (m, 2) of a graph with its buffers ``at`` (Graph.places)."""
+    """Poses (n, 3) and landmarks (m, 2) of a graph with its buffers ``at`` (Graph.addresses)."""
     poses = _array(_pointer(at[0, 0]), (at[0, 1], 3), np.float64)
     landmarks = _array(_pointer(at[1, 0]), (at[1, 1], 2), np.float64)
     return poses, landmarks

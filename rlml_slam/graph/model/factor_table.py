@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Growing columns: appending costs amortised O(1), reading is a view on the buffer."""
+"""Factor tables: growing columns, appended to in amortised O(1), read as views of the buffer."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -13,19 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from rlml_slam.compiled import brief
 from rlml_slam.errors import SolverError
+from rlml_slam.graph.model.factors import NUM_RESIDUALS, FactorKind
 from rlml_slam.graph.model.packed_system import Factors
 from rlml_slam.se2 import Array
-
-
-class FactorKind(IntEnum):
-    """What a factor stands for; the first three are types.EdgeKind."""
-
-    ODOMETRY = 0
-    SCAN = 1
-    CLOSURE = 2
-    REFLECTOR = 3
-    POSE_PRIOR = 4
-    LANDMARK_PRIOR = 5
 
 
 class Column:
@@ -65,7 +54,7 @@ class Column:
         self.view = self._buffer[:size]
 
     def keep(self, kept: NDArray[np.bool_]) -> None:
-        """Let go of the other rows, and of room that would be empty for long."""
+        """Remove the other rows, and shrink the buffer to twice what is left."""
         rows = self.view[kept]
         self._buffer = np.zeros((max(16, 2 * len(rows)), *rows.shape[1:]), dtype=rows.dtype)
         self.view = self._buffer[: len(rows)]
@@ -75,7 +64,8 @@ class Column:
 class FactorTable:
     """Factors of one form: nodes (n, a), measured (n, d), information (n, d, d), kinds, enabled.
 
-    ``node_names`` says what the indices point at, for messages ('pose', 'landmark').
+    A table is for the nodes that its factors join: ``node_names``, for messages ('pose',
+    'landmark'). Kinds with fewer residuals than ``dimension`` have no information on the rest.
     """
 
     def __init__(self, node_names: tuple[str, ...], dimension: int) -> None:
@@ -127,9 +117,9 @@ class FactorTable:
         )  # fmt: skip
 
     def keep(self, kept: NDArray[np.bool_], new: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
-        """Let go of the other factors; where each one is then (n,), -1 for those that are gone.
+        """Remove the other factors; the new index of each one (n,), -1 if removed.
 
-        ``new`` has the indices of the nodes from then on, per column.
+        ``new`` has the new indices of the nodes, per column.
         """
         for column in self.columns:
             column.keep(kept)
@@ -191,7 +181,10 @@ class FactorTable:
         same = np.zeros(len(nodes), dtype=np.bool_)
         if self.node_names == ('pose', 'pose'):
             same = nodes[:, 0] == nodes[:, 1]
-        regular = is_positive_definite(np.ascontiguousarray(information))
+        # kinds with fewer residuals have no information on the rest: any will do for the test
+        unused = np.arange(self.dimension) >= NUM_RESIDUALS[codes][:, None]
+        filled = information + unused[:, :, None] * np.eye(self.dimension)
+        regular = is_positive_definite(filled)
         bad = ~known.all(-1) | nonfinite | ~regular | same
         if not bad.any():
             return
@@ -209,7 +202,7 @@ class FactorTable:
 
 
 def renumbered(kept: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Where each of the kept ones is, when the others are gone; -1 for those (n,)."""
+    """New index of each of the kept ones, -1 for those removed (n,)."""
     return np.where(kept, np.cumsum(kept) - 1, -1)
 
 

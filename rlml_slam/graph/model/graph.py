@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The graph: poses, landmarks and the factors between them, in growing arrays.
+"""Pose-landmark graph: poses, landmarks and the factors between them, in growing arrays.
 
 Nodes and factors are named by their index, in the order they were added: a factor that turned out
-wrong is disabled, and only ``keep`` lets go of nodes and factors, and numbers the others anew.
-Fixed nodes are the gauge. All poses and landmarks are in the map frame.
+wrong is disabled, and only ``keep`` removes nodes and factors, and renumbers the others. Fixed
+nodes are the gauge. All poses and landmarks are in the map frame.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from rlml_slam.errors import SolverError
 from rlml_slam.graph.model import factors
 from rlml_slam.graph.model.buffers import Buffers, buffers_of
-from rlml_slam.graph.model.factor_table import Column, FactorKind, FactorTable, renumbered
+from rlml_slam.graph.model.factor_table import Column, FactorTable, renumbered
+from rlml_slam.graph.model.factors import FactorKind, Losses
 from rlml_slam.graph.model.packed_system import Tables
-from rlml_slam.graph.model.robust_loss import Losses
 from rlml_slam.se2 import Array, compose, transform, wrap
 from rlml_slam.types import EdgeKind
 
@@ -43,7 +43,7 @@ class Residuals:
 
 @dataclass(frozen=True)
 class Renumbering:
-    """Where nodes and factors are after ``Graph.keep`` (n,), -1 for those that are gone."""
+    """New index of every node and factor after ``Graph.keep`` (n,), -1 for those removed."""
 
     poses: NDArray[np.int64]
     landmarks: NDArray[np.int64]
@@ -56,7 +56,8 @@ class Renumbering:
 class Graph:
     """Poses (n, 3), landmarks (m, 2) and four tables of factors.
 
-    ``edges`` relative poses, ``sightings`` landmarks seen from poses, ``pose_priors`` and
+    A table holds the factors between nodes of one sort: ``edges`` between poses, ``sightings``
+    from poses to landmarks (seen as a point, or heard at a range), ``pose_priors`` and
     ``landmark_priors``. ``losses`` holds the robust loss per kind and may be replaced.
     """
 
@@ -75,11 +76,11 @@ class Graph:
             self._poses, self._landmarks, self._fixed_poses, self._fixed_landmarks,
             *(column for table in tables for column in table.columns),
         )  # fmt: skip
-        self._places: Buffers | None = None
+        self._addresses: Buffers | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but addresses, which are others in a copy."""
-        return {**self.__dict__, '_places': None}
+        """All but the addresses, which differ in a copy."""
+        return {**self.__dict__, '_addresses': None}
 
     @property
     def poses(self) -> Array:
@@ -157,6 +158,27 @@ class Graph:
         sizes = (len(self._poses), len(self._landmarks))
         return self.sightings.append(FactorKind.REFLECTOR, nodes, z, informations, sizes)
 
+    def add_range(self, i: int, k: int, distance: float, information: float) -> int:
+        """Add the distance [m] of landmark k (a beacon) from pose i; information 1 / sigma^2."""
+        return int(self.add_ranges([[i, k]], [distance], [information])[0])
+
+    def add_ranges(
+        self, nodes: ArrayLike, distances: ArrayLike, informations: ArrayLike
+    ) -> NDArray[np.int64]:
+        """Add ranges (k, 2) of (pose, landmark), (k,) [m], (k,) [1/m^2]; returns their indices.
+
+        They are rows of ``sightings``: measured (r, 0), information diag(1 / sigma^2, 0). Fewer
+        than three do not determine a landmark; from poses in a line, its mirror image fits too.
+        """
+        r = np.asarray(distances, dtype=np.float64).reshape(-1)
+        if (r < 0.0).any():
+            raise SolverError(f'range {r.min()} m is negative')
+        measured, information = np.zeros((len(r), 2)), np.zeros((len(r), 2, 2))
+        measured[:, 0] = r
+        information[:, 0, 0] = np.asarray(informations, dtype=np.float64).reshape(-1)
+        sizes = (len(self._poses), len(self._landmarks))
+        return self.sightings.append(FactorKind.RANGE, nodes, measured, information, sizes)
+
     def add_pose_prior(self, i: int, pose: ArrayLike, information: ArrayLike) -> int:
         """Add a prior on pose i; information (3, 3) of (x, y, theta) in the map's axes."""
         kind, sizes = FactorKind.POSE_PRIOR, (len(self._poses),)
@@ -168,9 +190,9 @@ class Graph:
         return int(self.landmark_priors.append(kind, [[k]], point, information, sizes)[0])
 
     def move(self, T: Array) -> None:
-        """Put all poses and landmarks elsewhere, as one: what lay at the origin lies at T (3,).
+        """Transform all poses and landmarks by T (3,), the new pose of the old origin.
 
-        Factors between them hold as before; priors stay what they are.
+        Factors between nodes hold as before; priors are not transformed.
         """
         self.poses[:] = compose(T, self.poses)
         self.landmarks[:] = transform(T, self.landmarks)
@@ -181,11 +203,11 @@ class Graph:
         landmarks: NDArray[np.bool_],
         disabled: NDArray[np.bool_] | None = None,
     ) -> Renumbering:
-        """Let go of all other poses and landmarks with their factors, and of disabled factors.
+        """Remove all other poses and landmarks with their factors, and disabled sightings.
 
-        Of the disabled edges those of ``disabled`` (e,) stay, for they may be enabled again, all
-        of them by default. What was made of the graph has to be made anew, or to be told, as an
-        Incremental is by its ``renumber``.
+        Of the disabled edges those of ``disabled`` (e,) stay, for they may be enabled again; by
+        default all do. A solver of this graph has to be rebuilt, or renumbered, as an
+        IncrementalSolver is by its ``renumber``.
         """
         new_poses, new_landmarks = renumbered(poses), renumbered(landmarks)
         e, s = self.edges.nodes, self.sightings.nodes
@@ -216,20 +238,20 @@ class Graph:
             self.losses.codes,
         )  # fmt: skip
 
-    def places(self) -> Buffers:
-        """Where the buffers lie, of poses, landmarks and in the order of Tables.
+    def addresses(self) -> Buffers:
+        """Addresses of the buffers: poses, landmarks, then in the order of Tables.
 
-        They are looked up again only where one of them has changed its place or its length.
+        They are looked up again only where a buffer has moved or changed its length.
         """
-        last = self._places
+        last = self._addresses
         if last is not None:
             for column, buffer in zip(self._columns, last.buffers, strict=True):
                 if column.view is not buffer:
                     break
             else:
                 return last
-        self._places = buffers_of(tuple(column.view for column in self._columns), last)
-        return self._places
+        self._addresses = buffers_of(tuple(column.view for column in self._columns), last)
+        return self._addresses
 
     def residuals(self) -> Residuals:
         """Squared Mahalanobis norms of all factors at the current estimate."""
@@ -237,7 +259,8 @@ class Graph:
         e, s, p, q = self.edges, self.sightings, self.pose_priors, self.landmark_priors
         i, j = e.nodes.T
         r_e = factors.relative_pose(X[i], X[j], e.measured)[0]
-        r_s = factors.pose_landmark(X[s.nodes[:, 0]], m[s.nodes[:, 1]], s.measured)[0]
+        i, k = s.nodes.T
+        r_s = factors.pose_landmark(X[i], m[k], s.measured, s.kinds)[0]
         r_p = factors.pose_prior(X[p.nodes[:, 0]], p.measured)[0]
         r_q = factors.landmark_prior(m[q.nodes[:, 0]], q.measured)[0]
         return Residuals(

@@ -1,34 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled linearisation: factors scattered straight into the panels of the fronts.
+"""Compiled linearization: factors scattered straight into the panels of the fronts.
 
-The same factors as factors.py, which the tests hold this against. With R = R(theta_i +
-theta_delta) and d = t_j - t_i the residual of an edge is e = (R^T d - R_delta^T t_delta, wrapped
-angle) and its Jacobians are J_j = diag(R^T, 1) and J_i = -J_j A with A = [1 0 -d_y; 0 1 d_x;
-0 0 1], so that with M = J_j^T W J_j and u = J_j^T W e
+With the axes R of a factor and d = t_j - t_i (factors.py), M = J_j^T W J_j and u = J_j^T W e, and
+J_i = -J_j A, the blocks of H = J^T W J and of g = J^T W e are
 
     H_jj = M, H_ij = -A^T M, H_ii = A^T M A, g_j = u, g_i = -A^T u.
 
-A sighting has the same form with J_m = R(theta)^T and A = [1 0 -d_y; 0 1 d_x].
+Robust losses weigh W by d rho / d s (iteratively reweighted least squares).
 """
 
 from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from rlml_slam.compiled import kernel, part
+from rlml_slam.graph.model.factors import (
+    Information,
+    axes,
+    moment,
+    position_information,
+    residual,
+    rotate,
+    weighted,
+)
 from rlml_slam.graph.model.packed_system import System
 from rlml_slam.graph.model.robust_loss import loss
 from rlml_slam.graph.sparse.symbolic_analysis import Records
-from rlml_slam.se2 import Array
-
-
-@part
-def wrapped(angle: float) -> float:
-    """Angle moved to (-pi, pi]."""
-    turns: float = np.ceil((angle - math.pi) / (2.0 * math.pi))
-    return angle - 2.0 * math.pi * turns
+from rlml_slam.se2 import Array, wrapped_by_turns
 
 
 @kernel
@@ -38,67 +36,54 @@ def linearize(system: System, poses: Array, landmarks: Array, fill: bool) -> tup
     for i in range(len(poses)):
         angle = poses[i, 2]
         rotations[i, 0], rotations[i, 1] = math.cos(angle), math.sin(angle)
-    return linearize_here(system, poses, landmarks, fill)
+    return linearize_again(system, poses, landmarks, fill)
 
 
 @part
-def linearize_here(
+def linearize_again(
     system: System, poses: Array, landmarks: Array, fill: bool
 ) -> tuple[float, float]:
     """As linearize, at the estimate of its last call: the rotations are those."""
     g, values = system.g, system.values
-    fill = bool(fill)  # not of a literal's type, for which all below would be compiled anew
+    fill = bool(fill)  # not of a literal's type, for which all below would be compiled again
     for i in range(len(g)):
         g[i] = 0.0
     if fill:
         for i in range(len(values)):
             values[i] = 0.0
-    losses, variables, rotations = system.losses, system.variables, system.rotations
-    c0, s0 = _edges(system.edges, variables, losses, poses, rotations, values, g, fill)
-    c1, s1 = _sightings(
-        system.sightings, variables, losses, poses, rotations, landmarks, values, g, fill
-    )
-    c2, s2 = _priors(system.priors, variables, losses, poses, landmarks, values, g, fill)
+    c0, s0 = _edges(system, poses, values, g, fill)
+    c1, s1 = _sightings(system, poses, landmarks, values, g, fill)
+    c2, s2 = _priors(system, poses, landmarks, values, g, fill)
     return c0 + c1 + c2, s0 + s1 + s2
 
 
 @part
-def _edges(
-    edges: Records,
-    variables: Records,
-    losses: Array,
-    poses: Array,
-    rotations: Array,
-    v: Array,
-    g: Array,
-    fill: bool,
-) -> tuple[float, float]:
+def _edges(system: System, poses: Array, v: Array, g: Array, fill: bool) -> tuple[float, float]:
+    """Relative poses: (cost, chi2); 3 by 3 blocks."""
+    edges, variables = system.edges, system.variables
+    losses, rotations = system.losses, system.rotations
     cost, chi2 = 0.0, 0.0
     for f in range(len(edges)):
         z = edges[f]
         i, j, kind = z['i'], z['j'], z['kind']
-        c = rotations[i, 0] * z['c'] - rotations[i, 1] * z['s']
-        s = rotations[i, 1] * z['c'] + rotations[i, 0] * z['s']
+        c, s = rotate(z['c'], z['s'], rotations[i, 0], rotations[i, 1])
         dx, dy = poses[j, 0] - poses[i, 0], poses[j, 1] - poses[i, 1]
-        e0 = c * dx + s * dy - z['x']
-        e1 = c * dy - s * dx - z['y']
-        e2 = wrapped(poses[j, 2] - poses[i, 2] - z['theta'])
-        I00, I01, I02 = z['I00'], z['I01'], z['I02']
-        I11, I12, I22 = z['I11'], z['I12'], z['I22']
-        q0 = I00 * e0 + I01 * e1 + I02 * e2
-        q1 = I01 * e0 + I11 * e1 + I12 * e2
-        q2 = I02 * e0 + I12 * e1 + I22 * e2
+        e0, e1 = residual(c, s, dx, dy, z['x'], z['y'])
+        e2 = wrapped_by_turns(poses[j, 2] - poses[i, 2] - z['theta'])
+        W = Information(z['I00'], z['I01'], z['I02'], z['I11'], z['I12'], z['I22'])
+        q0, q1, q2 = weighted(W, e0, e1, e2)
         squared = e0 * q0 + e1 * q1 + e2 * q2
         rho, w = loss(losses[kind, 0], losses[kind, 1], squared)
         cost += rho
         chi2 += squared
-        u0, u1, u2 = w * (c * q0 - s * q1), w * (s * q0 + c * q1), w * q2
+        u0, u1 = rotate(c, s, q0, q1)
+        u0, u1, u2 = w * u0, w * u1, w * q2
         a, b = z['a'], z['b']
         if a >= 0:
             k = variables[a]['scalar']
             g[k] -= u0
             g[k + 1] -= u1
-            g[k + 2] -= dx * u1 - dy * u0 + u2
+            g[k + 2] -= moment(dx, dy, u0, u1) + u2
         if b >= 0:
             k = variables[b]['scalar']
             g[k] += u0
@@ -106,13 +91,12 @@ def _edges(
             g[k + 2] += u2
         if not fill:
             continue
-        t00, t01 = w * (I00 * c - I01 * s), w * (I00 * s + I01 * c)
-        t10, t11 = w * (I01 * c - I11 * s), w * (I01 * s + I11 * c)
-        M00, M01, M11 = c * t00 - s * t10, c * t01 - s * t11, s * t01 + c * t11
-        M02, M12, M22 = w * (c * I02 - s * I12), w * (s * I02 + c * I12), w * I22
-        n0 = dx * M01 - dy * M00 + M02
-        n1 = dx * M11 - dy * M01 + M12
-        n2 = dx * M12 - dy * M02 + M22
+        M00, M01, M11 = position_information(W, w, c, s)
+        M02, M12 = rotate(c, s, W.I02, W.I12)
+        M02, M12, M22 = w * M02, w * M12, w * W.I22
+        n0 = moment(dx, dy, M00, M01) + M02
+        n1 = moment(dx, dy, M01, M11) + M12
+        n2 = moment(dx, dy, M02, M12) + M22
         if a >= 0:
             k, ld = variables[a]['address'], variables[a]['stride']
             v[k] += M00
@@ -120,7 +104,7 @@ def _edges(
             v[k + 2] += n0
             v[k + ld + 1] += M11
             v[k + ld + 2] += n1
-            v[k + 2 * ld + 2] += dx * n1 - dy * n0 + n2
+            v[k + 2 * ld + 2] += moment(dx, dy, n0, n1) + n2
         if b >= 0:
             k, ld = variables[b]['address'], variables[b]['stride']
             v[k] += M00
@@ -152,40 +136,40 @@ def _edges(
 
 @part
 def _sightings(
-    sightings: Records, variables: Records, losses: Array, poses: Array, rotations: Array,
-    landmarks: Array, v: Array, g: Array, fill: bool,
-) -> tuple[float, float]:  # fmt: skip
+    system: System, poses: Array, landmarks: Array, v: Array, g: Array, fill: bool
+) -> tuple[float, float]:
+    """Landmarks from poses, sighted or heard at a range: (cost, chi2); 3 by 2 blocks."""
+    sightings, variables = system.sightings, system.variables
+    losses, rotations = system.losses, system.rotations
     cost, chi2 = 0.0, 0.0
     for f in range(len(sightings)):
         z = sightings[f]
         i, j, kind = z['i'], z['j'], z['kind']
-        c, s = rotations[i, 0], rotations[i, 1]
         dx, dy = landmarks[j, 0] - poses[i, 0], landmarks[j, 1] - poses[i, 1]
-        e0 = c * dx + s * dy - z['x']
-        e1 = c * dy - s * dx - z['y']
-        I00, I01, I11 = z['I00'], z['I01'], z['I11']
-        q0, q1 = I00 * e0 + I01 * e1, I01 * e0 + I11 * e1
+        c, s = axes(kind, rotations[i, 0], rotations[i, 1], dx, dy)
+        e0, e1 = residual(c, s, dx, dy, z['x'], z['y'])
+        W = Information(z['I00'], z['I01'], 0.0, z['I11'], 0.0, 0.0)
+        q0, q1, _ = weighted(W, e0, e1, 0.0)
         squared = e0 * q0 + e1 * q1
         rho, w = loss(losses[kind, 0], losses[kind, 1], squared)
         cost += rho
         chi2 += squared
-        u0, u1 = w * (c * q0 - s * q1), w * (s * q0 + c * q1)
+        u0, u1 = rotate(c, s, q0, q1)
+        u0, u1 = w * u0, w * u1
         a, b = z['a'], z['b']
         if a >= 0:
             k = variables[a]['scalar']
             g[k] -= u0
             g[k + 1] -= u1
-            g[k + 2] -= dx * u1 - dy * u0
+            g[k + 2] -= moment(dx, dy, u0, u1)
         if b >= 0:
             k = variables[b]['scalar']
             g[k] += u0
             g[k + 1] += u1
         if not fill:
             continue
-        t00, t01 = w * (I00 * c - I01 * s), w * (I00 * s + I01 * c)
-        t10, t11 = w * (I01 * c - I11 * s), w * (I01 * s + I11 * c)
-        M00, M01, M11 = c * t00 - s * t10, c * t01 - s * t11, s * t01 + c * t11
-        n0, n1 = dx * M01 - dy * M00, dx * M11 - dy * M01
+        M00, M01, M11 = position_information(W, w, c, s)
+        n0, n1 = moment(dx, dy, M00, M01), moment(dx, dy, M01, M11)
         if a >= 0:
             k, ld = variables[a]['address'], variables[a]['stride']
             v[k] += M00
@@ -193,7 +177,7 @@ def _sightings(
             v[k + 2] += n0
             v[k + ld + 1] += M11
             v[k + ld + 2] += n1
-            v[k + 2 * ld + 2] += dx * n1 - dy * n0
+            v[k + 2 * ld + 2] += moment(dx, dy, n0, n1)
         if b >= 0:
             k, ld = variables[b]['address'], variables[b]['stride']
             v[k] += M00
@@ -220,23 +204,24 @@ def _sightings(
 
 @part
 def _priors(
-    priors: Records, variables: Records, losses: Array, poses: Array, landmarks: Array,
-    v: Array, g: Array, fill: bool,
-) -> tuple[float, float]:  # fmt: skip
+    system: System, poses: Array, landmarks: Array, v: Array, g: Array, fill: bool
+) -> tuple[float, float]:
+    """Values of nodes in the axes of the map: (cost, chi2); H_jj = W."""
+    priors, variables, losses = system.priors, system.variables, system.losses
     cost, chi2 = 0.0, 0.0
     for f in range(len(priors)):
         z = priors[f]
         i, a, kind = z['i'], z['a'], z['kind']
         is_pose = i < len(poses)
         if is_pose:
-            e0, e1 = poses[i, 0] - z['x'], poses[i, 1] - z['y']
-            e2 = wrapped(poses[i, 2] - z['theta'])
+            e0, e1 = residual(1.0, 0.0, poses[i, 0], poses[i, 1], z['x'], z['y'])
+            e2 = wrapped_by_turns(poses[i, 2] - z['theta'])
         else:
             k = i - len(poses)
-            e0, e1, e2 = landmarks[k, 0] - z['x'], landmarks[k, 1] - z['y'], 0.0
-        q0 = z['I00'] * e0 + z['I01'] * e1 + z['I02'] * e2
-        q1 = z['I01'] * e0 + z['I11'] * e1 + z['I12'] * e2
-        q2 = z['I02'] * e0 + z['I12'] * e1 + z['I22'] * e2
+            e0, e1 = residual(1.0, 0.0, landmarks[k, 0], landmarks[k, 1], z['x'], z['y'])
+            e2 = 0.0
+        W = Information(z['I00'], z['I01'], z['I02'], z['I11'], z['I12'], z['I22'])
+        q0, q1, q2 = weighted(W, e0, e1, e2)
         squared = e0 * q0 + e1 * q1 + e2 * q2
         rho, w = loss(losses[kind, 0], losses[kind, 1], squared)
         cost += rho
@@ -250,25 +235,25 @@ def _priors(
             g[k + 2] += w * q2
         if fill:
             k, ld = variables[a]['address'], variables[a]['stride']
-            v[k] += w * z['I00']
-            v[k + 1] += w * z['I01']
-            v[k + ld + 1] += w * z['I11']
+            v[k] += w * W.I00
+            v[k + 1] += w * W.I01
+            v[k + ld + 1] += w * W.I11
             if is_pose:
-                v[k + 2] += w * z['I02']
-                v[k + ld + 2] += w * z['I12']
-                v[k + 2 * ld + 2] += w * z['I22']
+                v[k + 2] += w * W.I02
+                v[k + ld + 2] += w * W.I12
+                v[k + 2 * ld + 2] += w * W.I22
     return cost, chi2
 
 
 @kernel
-def move(variables: Records, step: Array, poses: Array, landmarks: Array) -> None:
+def apply_step(variables: Records, step: Array, poses: Array, landmarks: Array) -> None:
     """Add ``step`` (in the order of elimination) to the free nodes; angles stay wrapped."""
     for a in range(len(variables)):
         i, k = variables[a]['node'], variables[a]['scalar']
         if i < len(poses):
             poses[i, 0] += step[k]
             poses[i, 1] += step[k + 1]
-            poses[i, 2] = wrapped(poses[i, 2] + step[k + 2])
+            poses[i, 2] = wrapped_by_turns(poses[i, 2] + step[k + 2])
         else:
             landmarks[i - len(poses), 0] += step[k]
             landmarks[i - len(poses), 1] += step[k + 1]

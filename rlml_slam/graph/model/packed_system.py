@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The normal equations as the kernels see them: factors packed with the places they add to.
+"""Normal equations H dx = -g in memory: variables, packed factors and the addresses they add to.
 
 One record per enabled factor holds all that its linearisation reads, so that the inner loop
 walks through memory in order; the measured rotation is turned into sine and cosine once.
@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.compiled import kernel, part
+from rlml_slam.graph.model.factors import rotate_back
 from rlml_slam.graph.sparse.elimination_order import elimination_order
-from rlml_slam.graph.sparse.multifrontal import lay_out, room
+from rlml_slam.graph.sparse.multifrontal import layout_fronts, reuse_or_allocate
 from rlml_slam.graph.sparse.symbolic_analysis import (
     Ints,
     Records,
@@ -43,7 +44,7 @@ EDGE = np.dtype(
     + [(k, np.float64) for k in ('c', 's', 'x', 'y', 'theta')]
     + [(k, np.float64) for k in ('I00', 'I01', 'I02', 'I11', 'I12', 'I22')]
 )
-# Sighting: z and information.
+# Landmark seen from a pose (sighting or range): z and information.
 SIGHTING = np.dtype(LINK + [(k, np.float64) for k in ('x', 'y', 'I00', 'I01', 'I11')])
 # Prior on node i (landmark k is n + k): value and information; a landmark's last ones are zero.
 PRIOR = np.dtype(
@@ -64,7 +65,7 @@ class Factors(NamedTuple):
 
 
 class Tables(NamedTuple):
-    """The graph: flags of the fixed nodes, the factors, and (kind, scale) of each loss (6, 2)."""
+    """The graph: flags of the fixed nodes, the factors, and (kind, scale) of each loss (7, 2)."""
 
     fixed_poses: Flags
     fixed_landmarks: Flags
@@ -100,14 +101,14 @@ class System(NamedTuple):
 
 
 @kernel
-def set_up(tables: Tables, memory: Array) -> tuple[int, System]:
-    """(-1, system) of a graph; or (node, ...), a node that nothing ties to the map.
+def pack_system(tables: Tables, memory: Array) -> tuple[int, System]:
+    """(-1, system) of a graph; or (node, ...), a node that nothing anchors to the map.
 
     ``memory`` is where the panels and update matrices go if it holds them.
 
     Solved for are the nodes that are not fixed and that an enabled factor touches. A connected
-    part is tied to the map by a fixed pose, a pose prior, or two landmarks that are fixed or have
-    priors (one, if the part has no poses). Landmark k is node n + k.
+    part is anchored to the map by a fixed pose, a pose prior, or two landmarks that are fixed or
+    have priors (one, if the part has no poses). Landmark k is node n + k.
     """
     edges, sightings, priors = _pack(tables)
     n = len(tables.fixed_poses)
@@ -140,25 +141,25 @@ def set_up(tables: Tables, memory: Array) -> tuple[int, System]:
     start, neighbours = adjacency(pairs, num)
     order = elimination_order(start, neighbours, dims)
     order, parent, count = elimination_tree(start, neighbours, order)
-    loose = _loose_node(n, variables, edges, sightings, priors, order, parent)
+    unanchored = _unanchored_node(n, variables, edges, sightings, priors, order, parent)
     structure = supernodes(start, neighbours, order, parent, count, pairs, dims, 3 * num)
-    fronts, entries, stack = lay_out(structure, dims)
-    place(structure, fronts, entries, variables, edges, sightings)
+    fronts, entries, stack = layout_fronts(structure, dims)
+    assign_addresses(structure, fronts, entries, variables, edges, sightings)
     rows = 0
     for a in range(num):
         rows += dims[a]
     size = fronts[len(fronts) - 1]['panel']
-    memory = room(memory, size + stack[0] + stack[1])
+    memory = reuse_or_allocate(memory, size + stack[0] + stack[1])
     values, left = memory[:size], memory[size : size + stack[0]]
     right = memory[size + stack[0] : size + stack[0] + stack[1]]
-    return loose, System(
+    return unanchored, System(
         variables, edges, sightings, priors, tables.losses, structure, fronts, entries,
         values, left, right, np.empty(rows), np.empty(rows), np.empty((n, 2)),
     )  # fmt: skip
 
 
 @part
-def place(
+def assign_addresses(
     structure: Structure, fronts: Records, entries: Records, variables: Records, edges: Records,
     sightings: Records,
 ) -> None:  # fmt: skip
@@ -222,7 +223,7 @@ def _pack(tables: Tables) -> tuple[Records, Records, Records]:
         x, y, theta = measured[f, 0], measured[f, 1], measured[f, 2]
         c, s = math.cos(theta), math.sin(theta)
         e['c'], e['s'], e['theta'] = c, s, theta
-        e['x'], e['y'] = c * x + s * y, c * y - s * x
+        e['x'], e['y'] = rotate_back(c, s, x, y)
         e['I00'], e['I01'], e['I02'] = info[f, 0, 0], info[f, 0, 1], info[f, 0, 2]
         e['I11'], e['I12'], e['I22'] = info[f, 1, 1], info[f, 1, 2], info[f, 2, 2]
         w += 1
@@ -281,53 +282,54 @@ def _touched(total: int, n: int, edges: Records, sightings: Records, priors: Rec
 
 
 @part
-def _loose_node(
+def _unanchored_node(
     n: int, variables: Records, edges: Records, sightings: Records, priors: Records, order: Ints,
     parent: Ints,
 ) -> int:  # fmt: skip
-    """A node that is solved for and whose connected part is not tied to the map, or -1.
+    """A node that is solved for and whose connected part is not anchored to the map, or -1.
 
     The parts are the trees of the elimination forest.
     """
     num = len(variables)
     root, of = np.empty(num, np.int64), np.empty(num, np.int64)
-    ties, known = np.empty(num, np.int64), np.empty(num, np.int64)  # 2 for a pose; per part
+    # per part: 1 anchored by the landmark ``known``, 2 by a pose or by two landmarks
+    anchors, known = np.empty(num, np.int64), np.empty(num, np.int64)
     has_pose = np.empty(num, np.bool_)
     for k in range(num - 1, -1, -1):
         root[k] = root[parent[k]] if parent[k] >= 0 else k
         of[order[k]] = root[k]
-        ties[k], known[k], has_pose[k] = 0, -1, False
+        anchors[k], known[k], has_pose[k] = 0, -1, False
     for a in range(num):
         if variables[a]['node'] < n:
             has_pose[of[a]] = True
     for f in range(len(edges)):
         a, b = edges[f]['a'], edges[f]['b']
         if a < 0 and b >= 0:
-            ties[of[b]] = 2
+            anchors[of[b]] = 2
         elif b < 0 and a >= 0:
-            ties[of[a]] = 2
+            anchors[of[a]] = 2
     for f in range(len(sightings)):
         a, b = sightings[f]['a'], sightings[f]['b']
         if a < 0 and b >= 0:
-            ties[of[b]] = 2
+            anchors[of[b]] = 2
         elif b < 0 and a >= 0:
-            _tie(ties, known, of[a], n + sightings[f]['j'])
+            _anchor(anchors, known, of[a], n + sightings[f]['j'])
     for f in range(len(priors)):
         i, a = priors[f]['i'], priors[f]['a']
         if a >= 0 and i < n:
-            ties[of[a]] = 2
+            anchors[of[a]] = 2
         elif a >= 0:
-            _tie(ties, known, of[a], i)
+            _anchor(anchors, known, of[a], i)
     for a in range(num):
-        if ties[of[a]] < (2 if has_pose[of[a]] else 1):
+        if anchors[of[a]] < (2 if has_pose[of[a]] else 1):
             return int(variables[a]['node'])
     return -1
 
 
 @part
-def _tie(ties: Ints, known: Ints, s: int, landmark: int) -> None:
-    """Part s is tied by a landmark whose place is known: a second one ties it for good."""
-    if ties[s] == 0:
-        ties[s], known[s] = 1, landmark
+def _anchor(anchors: Ints, known: Ints, s: int, landmark: int) -> None:
+    """Note an anchor of part s: a landmark whose position is known counts 1, a second one 2."""
+    if anchors[s] == 0:
+        anchors[s], known[s] = 1, landmark
     elif known[s] != landmark:
-        ties[s] = 2
+        anchors[s] = 2

@@ -19,7 +19,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import cached_property
 
 import numpy as np
 
@@ -50,30 +49,6 @@ class Loss:
         """Refuse a scale that is not positive."""
         if not (math.isfinite(self.scale) and self.scale > 0.0):
             raise SolverError(f'scale {self.scale!r} of loss {self.kind.name.lower()} is not > 0')
-
-
-@dataclass(frozen=True)
-class Losses:
-    """The loss of each kind of factor, in the order of FactorKind."""
-
-    odometry: Loss = Loss()
-    scan: Loss = Loss()
-    closure: Loss = Loss()
-    reflector: Loss = Loss()
-    pose_prior: Loss = Loss()
-    landmark_prior: Loss = Loss()
-
-    @cached_property
-    def codes(self) -> Array:
-        """(kind, scale) by FactorKind (6, 2), as the kernels take them."""
-        return np.array([(one.kind, one.scale) for one in self.in_order()])
-
-    def in_order(self) -> tuple[Loss, ...]:
-        """The losses by FactorKind."""
-        return (
-            self.odometry, self.scan, self.closure,
-            self.reflector, self.pose_prior, self.landmark_prior,
-        )  # fmt: skip
 
 
 @kernel

@@ -97,7 +97,10 @@ def sighting_leverages(live: OnlineSolver, pose: int, sightings: NDArray[np.int6
     who, at = np.unique(seen, return_inverse=True)
     joint = live.joint([pose], who)
     residual, J_x, J_m = pose_landmark(
-        graph.poses[np.full(len(seen), pose)], graph.landmarks[seen], s.measured[sightings]
+        graph.poses[np.full(len(seen), pose)],
+        graph.landmarks[seen],
+        s.measured[sightings],
+        s.kinds[sightings],
     )
     J = np.concatenate([J_x, J_m], axis=2)
     rows = np.concatenate(

@@ -22,7 +22,7 @@ from rlml_slam import params, se2
 from rlml_slam.graph.batch.marginals import Marginals
 from rlml_slam.graph.batch.solver import optimize
 from rlml_slam.graph.model import factors
-from rlml_slam.graph.model.factor_table import FactorKind
+from rlml_slam.graph.model.factors import FactorKind
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.graph.model.robust_loss import Loss
 from rlml_slam.graph.robust.inlier_evidence import evidence, extent2, near_by, uniform

@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 from rlml_slam import params
 from rlml_slam.graph.batch.gauss_newton import gauss_newton
 from rlml_slam.graph.batch.initialization import initialize
-from rlml_slam.graph.batch.solver import NOTHING, optimize
-from rlml_slam.graph.model.factor_table import FactorKind
+from rlml_slam.graph.batch.solver import ROUNDING, optimize
+from rlml_slam.graph.model.factors import FactorKind
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.graph.model.linearization import linearize
-from rlml_slam.graph.model.normal_equations import system_of
+from rlml_slam.graph.model.normal_equations import build_system
 from rlml_slam.graph.model.robust_loss import Loss
 from rlml_slam.se2 import Array
 
@@ -85,11 +85,11 @@ def _anneal(
     graph: Graph, parameters: params.Solver, edges: NDArray[np.int64], scale: float
 ) -> tuple[Array, int]:
     start = graph.poses.copy(), graph.landmarks.copy()
-    system = system_of(graph)
+    system = build_system(graph)
     row = np.searchsorted(np.flatnonzero(graph.edges.enabled), edges)
     full = {name: system.edges[name][row].copy() for name in INFORMATION}
     weights, mu = np.ones(len(edges)), 0.0
-    floor = NOTHING * 3.0 * len(system.edges)
+    floor = ROUNDING * 3.0 * len(system.edges)
     for rounds in range(1, ROUNDS + 1):
         for name in INFORMATION:
             system.edges[name][row] = np.maximum(weights, LEAST) * full[name]

@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Multifrontal block Cholesky factorisation, solves and the inverse on the sparsity pattern."""
+"""Multifrontal block Cholesky factorization H = L L^T, and the solves with L.
+
+Duff and Reid, "The multifrontal solution of indefinite sparse symmetric linear equations", ACM
+TOMS 9 (1983); Liu, "The multifrontal method for sparse matrix solution", SIAM Review 34 (1992);
+Davis, "Direct Methods for Sparse Linear Systems", SIAM (2006), chapter 4.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +20,7 @@ SINGULAR = 1e-14
 
 
 @part
-def lay_out(structure: Structure, dims: Ints) -> tuple[Records, Records, Ints]:
+def layout_fronts(structure: Structure, dims: Ints) -> tuple[Records, Records, Ints]:
     """(fronts, entries, sizes of the two stacks) for ``dims`` (n,) rows per variable.
 
     A stack holds the update matrices of finished subtrees, those of children and of parents on
@@ -67,13 +72,13 @@ def lay_out(structure: Structure, dims: Ints) -> tuple[Records, Records, Ints]:
 
 
 @part
-def room(memory: Array, size: int) -> Array:
-    """``size`` numbers of the memory at hand, or new ones where that is too small."""
+def reuse_or_allocate(memory: Array, size: int) -> Array:
+    """The first ``size`` numbers of ``memory``, or newly allocated ones where it is too small."""
     return memory[:size] if size <= len(memory) else np.empty(size)
 
 
 @part
-def highest(fronts: Records) -> int:
+def max_height(fronts: Records) -> int:
     """Rows of the largest front."""
     rows = 0
     for s in range(len(fronts)):
@@ -87,14 +92,14 @@ def factorise(
 ) -> int:
     """Cholesky factor in place of the matrix in ``values``; -1, or the supernode that failed.
 
-    ``left`` and ``right`` are memory of the sizes that lay_out tells. ``x`` becomes L^-1 x on the
-    way, each front at once while it is at hand.
+    ``left`` and ``right`` are memory of the sizes that layout_fronts returns. ``x`` becomes L^-1 x
+    on the way, front by front.
     """
     num = len(fronts) - 1
     pending = np.empty((2, num + 1), np.int64)
     base = np.empty((2, num + 1), np.int64)
     count, top = np.zeros(2, np.int64), np.zeros(2, np.int64)
-    most = highest(fronts)
+    most = max_height(fronts)
     floor, work = np.empty(most), np.empty(most)
     runs = np.empty((2, most + 1), np.int64)
     for s in range(num):
@@ -186,8 +191,8 @@ def _extend_below(
 
 @part
 def solve_lower(fronts: Records, entries: Records, values: Array, x: Array) -> None:
-    """X becomes L^-1 x, by positions."""
-    work = np.empty(highest(fronts))
+    """Forward substitution: x becomes L^-1 x, in the order of elimination."""
+    work = np.empty(max_height(fronts))
     for s in range(len(fronts) - 1):
         lower_step(fronts, entries, values, s, x, work)
 
@@ -221,8 +226,8 @@ def lower_step(
 
 @part
 def solve_upper(fronts: Records, entries: Records, values: Array, x: Array) -> None:
-    """X becomes L^-T x, by positions."""
-    work = np.empty(highest(fronts))
+    """Back-substitution: x becomes L^-T x, in the order of elimination."""
+    work = np.empty(max_height(fronts))
     for s in range(len(fronts) - 2, -1, -1):
         width, height, at = fronts[s]['width'], fronts[s]['height'], fronts[s]['panel']
         start, end = fronts[s]['start'], fronts[s + 1]['start']

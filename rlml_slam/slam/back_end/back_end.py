@@ -13,9 +13,9 @@ from rlml_slam import se2
 from rlml_slam.errors import MapError
 from rlml_slam.estimation.correction import ReferencePose
 from rlml_slam.graph.incremental.online_solver import OnlineSolver
-from rlml_slam.graph.model.factors import relative_information
+from rlml_slam.graph.model.factors import Losses, relative_information
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.model.robust_loss import Loss, Losses, LossKind
+from rlml_slam.graph.model.robust_loss import Loss, LossKind
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.survey import Survey, same
 from rlml_slam.params import Parameters

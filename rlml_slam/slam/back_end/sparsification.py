@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from rlml_slam import se2
 from rlml_slam.errors import SolverError
 from rlml_slam.graph.incremental.online_solver import OnlineSolver
-from rlml_slam.graph.model.factor_table import FactorKind
+from rlml_slam.graph.model.factors import FactorKind
 from rlml_slam.graph.model.graph import Renumbering
 from rlml_slam.graph.reduction.edge_pruning import prune
 from rlml_slam.graph.reduction.marginalization import Ties, eliminate

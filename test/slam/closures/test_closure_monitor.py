@@ -15,8 +15,9 @@ from rlml_slam.cli.main import main
 from rlml_slam.errors import InputError, MapError, SolverError
 from rlml_slam.graph.batch.solver import optimize
 from rlml_slam.graph.incremental.online_solver import OnlineSolver
+from rlml_slam.graph.model.factors import Losses
 from rlml_slam.graph.model.graph import Graph, Renumbering
-from rlml_slam.graph.model.robust_loss import Loss, Losses, LossKind
+from rlml_slam.graph.model.robust_loss import Loss, LossKind
 from rlml_slam.params import Parameters
 from rlml_slam.slam.closures import closure_records
 from rlml_slam.slam.closures.closure_monitor import ClosureMonitor
