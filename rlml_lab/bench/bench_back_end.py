@@ -3,9 +3,9 @@
 
 Every graph is solved from the start in its file and from its odometry. A solver's figure is the
 CPU time of the call that optimises, structure and ordering included, median of the runs; chi2 is
-computed by one evaluator. The order of the solvers is drawn anew for every run, and the heap is
-put in order before each: else one of them would always find the caches and the free lists as the
-same other one leaves them, which on graphs of 100 poses is half of its time.
+computed by one evaluator. The order of the solvers is random in every run, and the heap is
+sorted before each: else one of them would always find the caches and the free lists as the same
+other one leaves them, which on graphs of 100 poses is half of its time.
 
 A rival that has no stopping rule (g2o) is given the fewest iterations that bring it within 0.1 %
 of the best chi2, which no user could know beforehand.

@@ -3,9 +3,9 @@
 
 Every solver starts from odometry. An error is the ATE, aligned, against the optimum of the graph
 without wrong closures: 0 is a solver that found exactly the right ones. Beside it stands the chi2
-of the right edges at the poses found, as a multiple of their least. GTSAM's GNC is told that
+of the right edges at the poses found, as a multiple of their least. GTSAM's GNC is given that
 odometry is right, and has its truncation at 99 %, as ours. A rival that takes longer than it may
-is stopped, and told apart from those that came to an end.
+is stopped, and listed apart from those that came to an end.
 """
 
 from __future__ import annotations

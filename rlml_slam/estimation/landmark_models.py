@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the filter knows of a landmark: how it is measured and how a measurement places it.
+"""Landmark measurement models of EKF-SLAM, and their inverses.
 
 All functions are batched and return values with their Jacobians; the equations are those of the
 note with its slips corrected (docs/ekf_slam.md lists them, the tests show each).
@@ -75,8 +75,8 @@ def line_model(origin: Array) -> Model:
 
     A line is measured by distance and direction (rho, alpha) of the perpendicular from the robot.
     The note turns the fixed point's nearest point on the line into range and bearing "using the
-    robot's position"; that measurement moves with the robot's error along the line, so it would
-    tell the filter a position that nobody measured. rho and alpha are what a line does tell.
+    robot's position"; that measurement moves with the robot's error along the line, so the filter
+    would use a position that was not measured. A line measures rho and alpha alone.
     """
     o = np.asarray(origin, dtype=np.float64)
 

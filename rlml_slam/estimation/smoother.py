@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the robot was by all that was measured, before and after: the filter's steps, smoothed.
+"""Fixed-interval smoother of the EKF: the most probable path by all measurements, Gauss-Newton.
 
-The most probable path of the filter's own model: motions with their lasting errors, and each
-measurement of a landmark as the filter took it, with its answer to which one it was. The first
+The residuals are those of the filter's own model: motions with their random-walk errors, and each
+measurement of a landmark with the association that the filter chose. The first
 Gauss-Newton step about the filter's path is the fixed-interval (Rauch-Tung-Striebel) smoother of
 the linearised model; the others linearise about the smoothed path (iterated smoother: Bell 1994),
-which takes out what the filter's early linearisations cost. The normal equations are sparse, so
+which removes the errors of the filter's early linearisations. The normal equations are sparse, so
 memory grows with the steps and measurements alone.
 """
 
@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
     from scipy.sparse.linalg import SuperLU
 
-BIAS, SPEED, TURN, ROBOT = 3, 4, 5, 6  # after the pose, what gyro and wheels err by; the size
+BIAS, SPEED, TURN, ROBOT = 3, 4, 5, 6  # after the pose: gyro bias, scale errors; size of the state
 ITERATIONS = 20
-SETTLED = 1e-6  # [m], [rad] of the largest correction
-LEAST = 1e-3  # share of a step below which a better one is not looked for
-AT_ONCE = 32  # landmarks whose covariances are solved for together
-FLOOR = 1e-6  # least sigma of anything: what is surer is taken for this, to be divided by
+CONVERGED = 1e-6  # [m], [rad] of the largest correction
+MIN_SHARE = 1e-3  # of a step, at which the line search ends
+BATCH = 32  # landmarks whose covariances are solved for together
+MIN_SIGMA = 1e-6  # [m], [rad] added to every residual, so that covariances can be inverted
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Sight:
 
 @dataclass(frozen=True)
 class Step:
-    """What the filter used of one observation: its ``motion`` and what it saw after it.
+    """One step of the filter: its ``motion`` and the landmarks measured after it.
 
     ``walk`` and ``kept`` as :meth:`Filter.predict` takes them.
     """
@@ -93,7 +93,7 @@ class _Rows:
     def add(self, cov: Array, e: Array, *blocks: tuple[NDArray[np.int64], Array]) -> None:
         """Errors e (k, r) of covariances (k, r, r), with (columns (k, c), J (k, r, c)) of each."""
         k, r = e.shape
-        L = np.linalg.cholesky(cov + FLOOR**2 * np.eye(r))
+        L = np.linalg.cholesky(cov + MIN_SIGMA**2 * np.eye(r))
         rows = self._n + np.arange(k * r).reshape(k, r)
         self._e.append(np.linalg.solve(L, e[..., None]).ravel())
         for columns, J in blocks:
@@ -127,8 +127,8 @@ class _Rows:
         """
         normal = _factor(self.jacobian(width))
         out = np.empty(((width - first) // 2, 2, 2))
-        for at in range(0, len(out), AT_ONCE):
-            columns = first + 2 * at + np.arange(2 * min(AT_ONCE, len(out) - at))
+        for at in range(0, len(out), BATCH):
+            columns = first + 2 * at + np.arange(2 * min(BATCH, len(out) - at))
             unit = np.zeros((width, len(columns)))
             unit[columns, np.arange(len(columns))] = 1.0
             block = normal.solve(unit)[columns]
@@ -164,10 +164,10 @@ class _Problem:
         self._cov = np.array([m.cov for m in motions])
         self._kept = np.array([s.kept for s in steps])
         self._walk = np.array([s.walk for s in steps])
-        # what IMU and wheels say of the bias, where they do
-        self._told = np.flatnonzero([np.isfinite(m.bias_var) for m in motions])
+        # measurements of the gyro bias by standstill and wheels, where there are any
+        self._with_bias = np.flatnonzero([np.isfinite(m.bias_var) for m in motions])
         self._bias, self._bias_var, self._bias_turn = (
-            np.array([getattr(motions[k], name) for k in self._told])
+            np.array([getattr(motions[k], name) for k in self._with_bias])
             for name in ('bias', 'bias_var', 'bias_turn')
         )
 
@@ -181,12 +181,12 @@ class _Problem:
         e[2] = se2.wrap(e[2])
         out.add(self._start.P[None], e[None], (at[:1], np.eye(ROBOT)[None]))
         self._motions(out, x, at)
-        self._lasting(out, x, at)
-        self._sights(out, x, points, at)
+        self._walks(out, x, at)
+        self._measurements(out, x, points, at)
         return out
 
     def _motions(self, out: _Rows, x: Array, at: NDArray[np.int64]) -> None:
-        """How each motion differs from the wheels', corrected by what they err by."""
+        """Residuals of the motions: odometry corrected by bias and scale errors."""
         before, after = x[:-1], x[1:]
         delta = (
             self._delta
@@ -203,8 +203,8 @@ class _Problem:
         J = np.concatenate([J_a, -gains], axis=-1)
         out.add(self._cov, e, (at[:-1], J), (at[1:, :3], J_b))
 
-    def _lasting(self, out: _Rows, x: Array, at: NDArray[np.int64]) -> None:
-        """The gyro's bias walks, what the wheels err by fades and is renewed."""
+    def _walks(self, out: _Rows, x: Array, at: NDArray[np.int64]) -> None:
+        """Residuals of the random walks: gyro bias; scale errors as first-order Gauss-Markov."""
         before, after = x[:-1], x[1:]
         one = np.ones((len(before), 1, 1))
         out.add(
@@ -218,15 +218,15 @@ class _Problem:
                 new[:, None, None], e[:, None],
                 (at[:-1, k, None], -self._kept[:, None, None]), (at[1:, k, None], one),
             )  # fmt: skip
-        told = self._told
-        if not len(told):
+        rows = self._with_bias
+        if not len(rows):
             return
-        H = np.stack([np.ones(len(told)), self._bias_turn], axis=-1)[:, None]
-        columns = at[told][:, [BIAS, TURN]]
-        e = (H[:, 0] * x[told][:, [BIAS, TURN]]).sum(axis=1) - self._bias
+        H = np.stack([np.ones(len(rows)), self._bias_turn], axis=-1)[:, None]
+        columns = at[rows][:, [BIAS, TURN]]
+        e = (H[:, 0] * x[rows][:, [BIAS, TURN]]).sum(axis=1) - self._bias
         out.add(self._bias_var[:, None, None], e[:, None], (columns, H))
 
-    def _sights(self, out: _Rows, x: Array, points: Array, at: NDArray[np.int64]) -> None:
+    def _measurements(self, out: _Rows, x: Array, points: Array, at: NDArray[np.int64]) -> None:
         first = ROBOT * len(x)
         for k, step in enumerate(self._steps, 1):
             if not step.sights:
@@ -262,16 +262,16 @@ def smooth(
             if new <= cost * (1.0 + 1e-9):
                 break
             share *= 0.5
-            if share < LEAST:  # nothing on the way is better, or it is no number
+            if share < MIN_SHARE:  # no lower cost along the step, or it is not finite
                 return _smoothed(problem, best, x, points)
         x, points, cost = moved, placed, new
-        if np.abs(share * dx).max() < SETTLED:
+        if np.abs(share * dx).max() < CONVERGED:
             break
     return _smoothed(problem, rows, x, points)
 
 
 def _smoothed(problem: _Problem, rows: _Rows, x: Array, points: Array) -> Smoothed:
-    """The result, and how sure its landmarks are by the ``rows`` there."""
+    """The result, with the landmarks' covariances by the ``rows`` there."""
     covs = rows.covariances(x.size + points.size, x.size)
     return Smoothed(x[0], x[1:], problem.keys, points, covs)
 
@@ -279,7 +279,7 @@ def _smoothed(problem: _Problem, rows: _Rows, x: Array, points: Array) -> Smooth
 def _first_points(
     keys: NDArray[np.int64], steps: Sequence[Step], model: Model, poses: Array
 ) -> Array:
-    """Each landmark where it was last seen from."""
+    """Start of each landmark by its last measurement."""
     out = np.zeros((len(keys), 2))
     for pose, step in zip(poses, steps, strict=True):
         for q in step.sights:

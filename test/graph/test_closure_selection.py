@@ -289,7 +289,7 @@ def test_closures_that_take_turns_are_judged_a_bounded_number_of_times(monkeypat
         self._left[:] = 2  # as many times as they like
         return np.ones(len(self._edges), np.bool_), np.where(self._accepted, -1e3, 1e3)
 
-    monkeypatch.setattr(_Selector, '_judge_again', turns)
+    monkeypatch.setattr(_Selector, '_evaluate_all', turns)
     selection = select_closures(laps())
     assert len(judged) == ROUNDS + 1
     assert judged[0] > 0

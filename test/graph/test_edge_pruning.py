@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Edges go that tell what is known without them, and nothing becomes surer by it."""
+"""Pruning removes redundant edges, and no covariance gets smaller by it."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from rlml_slam.graph.model.factors import Losses, pose_landmark, relative_pose
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.graph.model.robust_loss import Loss, LossKind
 from rlml_slam.graph.reduction.edge_pruning import (
-    AT_ONCE,
+    MAX_LEVERAGE,
     leverages,
-    prune,
+    prune_edges,
     prune_sightings,
     sighting_leverages,
 )
@@ -91,11 +91,11 @@ def test_what_goes_makes_nothing_surer_and_takes_less_than_its_share(seed):
     graph = crowd(np.random.default_rng(seed))
     most = len(graph.edges) - 1
     before = Marginals(graph).joint(np.arange(1, 40))
-    (gone,) = prune(graph, everything(graph), most)
+    (removed,) = prune_edges(graph, everything(graph), most)
     after = Marginals(graph).joint(np.arange(1, 40))
     scale = np.sqrt(np.diag(before))
     assert np.linalg.eigvalsh((after - before) / np.outer(scale, scale)).min() > -1e-9
-    i, j = graph.edges.nodes[gone]
+    i, j = graph.edges.nodes[removed]
     X = graph.poses
     J = np.hstack(relative_pose(X[i], X[j], se2.between(X[i], X[j]))[1:])
     at = np.concatenate([3 * (i - 1) + np.arange(3), 3 * (j - 1) + np.arange(3)])
@@ -111,14 +111,14 @@ def test_graph_stays_in_one_piece_however_few_edges_are_asked_for(seed):
     rng = np.random.default_rng(seed)
     graph = crowd(rng, 20, 40)
     for _ in range(200):
-        if not len(prune(graph, everything(graph), 0)):
+        if not len(prune_edges(graph, everything(graph), 0)):
             break
     nodes = graph.edges.nodes[graph.edges.enabled]
     links = sparse.csr_matrix((np.ones(len(nodes)), nodes.T), (20, 20))
     assert sparse.csgraph.connected_components(links, directed=False)[0] == 1
     # until each of them has a good part of some direction to itself
     h = np.linalg.eigvals(leverages(graph)).real.max(axis=1)
-    assert h.min() >= AT_ONCE
+    assert h.min() >= MAX_LEVERAGE
     assert len(nodes) < 59
 
 
@@ -127,7 +127,7 @@ def test_number_of_edges_is_held_where_others_come_all_the_time():
     graph = crowd(rng, 40, 120)
     for _ in range(30):
         add(graph, rng, 2)
-        prune(graph, everything(graph), 160)
+        prune_edges(graph, everything(graph), 160)
     assert graph.edges.enabled.sum() == 160
 
 
@@ -141,7 +141,7 @@ def test_factor_does_not_fill_however_long_edges_come_and_go():
             for other in rng.choice(100, 30, replace=False):
                 if hub != other:
                     tie(graph, hub, other)
-        while len(prune(graph, everything(graph), 300)):
+        while len(prune_edges(graph, everything(graph), 300)):
             pass
         if lap:  # the first one leaves fewer edges than that
             filled.append(room(graph))
@@ -161,10 +161,10 @@ def test_no_edge_goes_that_may_not_or_is_not_too_many():
     graph = crowd(np.random.default_rng(2))
     may = everything(graph)
     may[100:] = False
-    assert len(prune(graph, may, len(may))) == 0
-    gone = prune(graph, may, len(may) - 5)
-    assert len(gone) == 5
-    assert gone.max() < 100
+    assert len(prune_edges(graph, may, len(may))) == 0
+    removed = prune_edges(graph, may, len(may) - 5)
+    assert len(removed) == 5
+    assert removed.max() < 100
     assert graph.edges.enabled.sum() == len(may) - 5
 
 
@@ -206,14 +206,14 @@ def test_sightings_that_go_make_nothing_surer_and_take_less_than_their_share(see
     others = s.nodes[:, 0] != 5
     num = int(np.sum(~others))
     before = Marginals(graph).joint(np.arange(1, 20), np.arange(12))
-    gone = prune_sightings(live, 5, num - 6)
+    removed = prune_sightings(live, 5, num - 6)
     after = Marginals(graph).joint(np.arange(1, 20), np.arange(12))
-    assert 0 < len(gone) <= 6
+    assert 0 < len(removed) <= 6
     assert s.enabled[others].all()
-    assert not s.enabled[gone].any()
+    assert not s.enabled[removed].any()
     scale = np.sqrt(np.diag(before))
     assert np.linalg.eigvalsh((after - before) / np.outer(scale, scale)).min() > -1e-9
-    # what goes has less than AT_ONCE of a sighting together: det(1 - sum h) bounds the growth
+    # what goes has less than MAX_LEVERAGE of a sighting together: det(1 - sum h) bounds the growth
     assert np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1] < 2.0 * np.log(2.0)
 
 

@@ -10,7 +10,12 @@ from rlml_slam.graph.batch.marginals import Marginals
 from rlml_slam.graph.batch.solver import optimize
 from rlml_slam.graph.model.factors import relative_information
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.reduction.marginalization import Ties, eliminate, fused, limited
+from rlml_slam.graph.reduction.marginalization import (
+    RelativePoses,
+    floored_covariance,
+    fuse,
+    marginalize_pose,
+)
 from rlml_slam.params import Solver
 from rlml_slam.types import EdgeKind
 
@@ -41,10 +46,10 @@ def tie(graph, rng, i, j, true, noise=0.0, kind=EdgeKind.ODOMETRY, scale=1e-2):
     graph.add_edge(kind, i, j, measured, relative_information(measured, cov))
 
 
-def kept(graph, *gone):
+def kept(graph, *removed):
     """Let the poses go, with their tables."""
     mask = np.ones(len(graph.poses), dtype=bool)
-    mask[list(gone)] = False
+    mask[list(removed)] = False
     return graph.keep(mask, np.ones(len(graph.landmarks), dtype=bool))
 
 
@@ -53,8 +58,8 @@ def test_pose_of_a_chain_leaves_without_any_loss(seed):
     rng = np.random.default_rng(seed)
     graph, _ = chain(rng, 5)
     before = Marginals(graph).joint([1, 3, 4])
-    done = eliminate(graph, 2, NO_FLOOR)
-    assert done.onto in (1, 3)
+    done = marginalize_pose(graph, 2, NO_FLOOR)
+    assert done.hub in (1, 3)
     assert sorted(done.edges) == [1, 2]
     new = kept(graph, 2)
     np.testing.assert_array_equal(new.poses, [0, 1, -1, 2, 3])
@@ -69,7 +74,7 @@ def test_optimum_of_a_noisy_chain_stays():
     optimize(graph, Solver())
     before = graph.poses.copy()
     for pose in (2, 3):
-        eliminate(graph, pose, NO_FLOOR)
+        marginalize_pose(graph, pose, NO_FLOOR)
     kept(graph, 2, 3)
     optimize(graph, Solver())
     np.testing.assert_allclose(graph.poses, before[[0, 1, 4, 5]], atol=1e-9)
@@ -85,12 +90,12 @@ def test_star_leaves_a_tree_whose_relative_marginals_are_exact(seed):
     for k in range(1, 5):
         tie(graph, rng, *((0, k) if k % 2 else (k, 0)), true)
     joint = Marginals(graph).joint([1, 2, 3, 4])
-    done = eliminate(graph, 0, NO_FLOOR)
+    done = marginalize_pose(graph, 0, NO_FLOOR)
     kept(graph, 0)
     after = Marginals(graph).joint([0, 1, 2, 3])
     edges = graph.edges.nodes.tolist()
     assert len(edges) == 3
-    assert all(i == done.onto - 1 for i, _ in edges)
+    assert all(i == done.hub - 1 for i, _ in edges)
     for i, j in edges:
         J = np.hstack(se2.between_jacobians(graph.poses[i], graph.poses[j]))
         at = np.r_[3 * i : 3 * i + 3, 3 * j : 3 * j + 3]
@@ -111,7 +116,7 @@ def test_edges_that_are_there_already_are_joined_and_told_of():
     tie(graph, rng, 2, 0, true)
     tie(graph, rng, 0, 2, true, kind=EdgeKind.CLOSURE)
     before = Marginals(graph).poses([2])
-    done = eliminate(graph, 1, NO_FLOOR)
+    done = marginalize_pose(graph, 1, NO_FLOOR)
     # both odometry edges and the one of their kind beside them are in the new one
     assert {k: v for k, v in done.edges.items() if v >= 0}.keys() >= {2}
     new = kept(graph, 1)
@@ -125,7 +130,7 @@ def test_closure_stays_a_closure():
     rng = np.random.default_rng(4)
     graph, true = chain(rng, 4)
     tie(graph, rng, 0, 2, true, kind=EdgeKind.CLOSURE, scale=1.0)  # as weak as no odometry is
-    done = eliminate(graph, 2, NO_FLOOR)
+    done = marginalize_pose(graph, 2, NO_FLOOR)
     edges = graph.edges
     assert edges.kinds[edges.enabled].tolist() == [0, 2, 0]
     assert edges.kinds[done.edges[3]] == 2
@@ -133,10 +138,10 @@ def test_closure_stays_a_closure():
 
 def test_many_fused_estimates_are_no_better_than_what_they_have_in_common():
     floor2 = np.array([1e-4, 1e-4, 4e-6])
-    one = Ties(np.array([1.0, 2.0, 0.1]), np.diag([4e-4, 4e-4, 4e-5]))
+    one = RelativePoses(np.array([1.0, 2.0, 0.1]), np.diag([4e-4, 4e-4, 4e-5]))
     n = 1000
-    many = Ties(np.tile(one.T, (n, 1)), np.tile(one.cov, (n, 1, 1)))
-    out = fused(many, np.zeros(n, dtype=np.int64), 1, floor2)
+    many = RelativePoses(np.tile(one.T, (n, 1)), np.tile(one.cov, (n, 1, 1)))
+    out = fuse(many, np.zeros(n, dtype=np.int64), 1, floor2)
     np.testing.assert_allclose(out.T[0], one.T, atol=1e-12)
     np.testing.assert_allclose(out.cov[0], np.diag(floor2), rtol=1e-9)
 
@@ -145,7 +150,7 @@ def test_limit_leaves_alone_what_is_better_already():
     rng = np.random.default_rng(5)
     small = random_cov(rng, scale=1e-5)[None]
     at = np.zeros(1, dtype=np.int64)
-    out = limited(small, np.full(3, 1e-4), small, at)
+    out = floored_covariance(small, np.full(3, 1e-4), small, at)
     np.testing.assert_allclose(out, small, rtol=1e-9)
 
 
@@ -153,7 +158,7 @@ def test_pose_without_edges_is_refused():
     graph = Graph()
     graph.add_pose(np.zeros(3))
     with pytest.raises(SolverError, match='pose 0 has no edge'):
-        eliminate(graph, 0, NO_FLOOR)
+        marginalize_pose(graph, 0, NO_FLOOR)
 
 
 def test_where_neighbours_cannot_be_tied_the_graph_stays_as_it_was():
@@ -164,7 +169,7 @@ def test_where_neighbours_cannot_be_tied_the_graph_stays_as_it_was():
     graph.add_edge(EdgeKind.ODOMETRY, 0, 1, [100.0, 0.0, 0.0], np.diag([1e8, 1e8, 1e-8]))
     graph.add_edge(EdgeKind.SCAN, 1, 2, [1.0, 0.0, 0.0], np.diag([1e8, 1e8, 1e8]))
     graph.add_edge(EdgeKind.SCAN, 0, 2, [101.0, 0.0, 0.0], np.diag([1.0, 1.0, 1.0]))
-    with pytest.raises(SolverError, match='pose 1 cannot be eliminated'):
-        eliminate(graph, 1, NO_FLOOR)
+    with pytest.raises(SolverError, match='pose 1 cannot be marginalized'):
+        marginalize_pose(graph, 1, NO_FLOOR)
     assert len(graph.edges) == 3
     assert graph.edges.enabled.all()

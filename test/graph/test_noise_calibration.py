@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How large errors are is found from them; what an edge is told by the others is what they say."""
+"""Noise calibration: scales of errors; an edge left out is predicted by the rest."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_evidence_is_the_ratio_of_averaged_student_densities_and_a_uniform_one()
     assert got[0] == pytest.approx(expected, abs=1e-9)
 
 
-def test_an_edge_left_out_is_judged_as_by_the_graph_without_it():
+def test_an_edge_left_out_is_predicted_as_by_the_graph_without_it():
     graph = laps()
     optimum(graph)
     closures = np.flatnonzero(graph.edges.kinds == FactorKind.CLOSURE)

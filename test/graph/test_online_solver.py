@@ -17,7 +17,7 @@ from rlml_slam.graph.model.cost import total_cost
 from rlml_slam.graph.model.factors import Losses
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.graph.model.robust_loss import Loss, LossKind, loss
-from rlml_slam.graph.reduction.marginalization import eliminate
+from rlml_slam.graph.reduction.marginalization import marginalize_pose
 from rlml_slam.types import EdgeKind
 
 ROBUST = Losses(
@@ -83,7 +83,18 @@ def do_something(
     graph = live.graph
     e, closures = graph.edges, np.flatnonzero(graph.edges.kinds == 2)
     what = rng.choice(
-        ['drive', 'drive', 'close', 'wrong', 'toggle', 'see', 'eliminate', 'move', 'fix', 'losses']
+        [
+            'drive',
+            'drive',
+            'close',
+            'wrong',
+            'toggle',
+            'see',
+            'marginalize_pose',
+            'move',
+            'fix',
+            'losses',
+        ]
     )
     if what == 'drive':
         drive_on(graph, truth, rng)
@@ -100,12 +111,12 @@ def do_something(
         graph.add_sighting(i, k, z + 0.03 * rng.standard_normal(2), np.eye(2) / 0.03**2)
     elif what == 'eliminate' and len(truth) > 20:
         live.solve()
-        gone = int(rng.integers(1, len(truth) - 1))
-        graph.sightings.enabled[graph.sightings.nodes[:, 0] == gone] = False
-        eliminate(graph, gone, 1e-6 * np.ones(3))
-        kept = np.arange(len(truth)) != gone
+        removed = int(rng.integers(1, len(truth) - 1))
+        graph.sightings.enabled[graph.sightings.nodes[:, 0] == removed] = False
+        marginalize_pose(graph, removed, 1e-6 * np.ones(3))
+        kept = np.arange(len(truth)) != removed
         live.keep(kept, np.ones(len(points), np.bool_), np.zeros(len(e), np.bool_))
-        del truth[gone]
+        del truth[removed]
     elif what == 'move':
         T = rng.uniform(-3.0, 3.0, 3)
         graph.move(T)
@@ -151,15 +162,15 @@ def test_what_happens_every_day_takes_no_batch_solve() -> None:
 
 
 def test_a_solver_goes_on_with_a_renumbered_graph() -> None:
-    """What is left is not factored anew, but for where poses went."""
+    """What is left is not factored again, except where poses were removed."""
     rng = np.random.default_rng(2)
     graph, true, points = loop_graph(2, poses=40)
     truth, live = list(true), OnlineSolver(graph)
     for _ in range(200):
         drive_on(graph, truth, rng)
         live.solve()
-    for gone in (230, 233, 235):
-        eliminate(graph, gone, 1e-6 * np.ones(3))
+    for removed in (230, 233, 235):
+        marginalize_pose(graph, removed, 1e-6 * np.ones(3))
     kept = np.ones(len(truth), np.bool_)
     kept[[230, 233, 235]] = False
     live.keep(kept, np.ones(len(points), np.bool_), np.zeros(len(graph.edges), np.bool_))
@@ -201,7 +212,7 @@ def test_joint_covariance_is_that_of_the_whole_graph(seed: int) -> None:
 
 
 def test_covariance_that_cannot_be_told_moves_nothing() -> None:
-    """A graph that cannot be solved: poses stay, and it is told once it can be."""
+    """A graph that cannot be solved: poses stay, until it can be solved."""
     graph, truth, _ = loop_graph(1, poses=30, losses=ROBUST)
     live = OnlineSolver(graph)
     live.solve()

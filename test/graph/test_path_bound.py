@@ -11,7 +11,7 @@ from rlml_slam import se2
 from rlml_slam.graph.batch.marginals import Marginals
 from rlml_slam.graph.model.factors import relative_pose
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.robust.path_bound import reach
+from rlml_slam.graph.robust.path_bound import path_bound
 from rlml_slam.types import EdgeKind
 
 
@@ -41,13 +41,13 @@ def test_one_edge_is_known_as_well_as_it_was_measured_from_either_end():
     graph.fixed_poses[0] = True
     A = np.array([[3.0, 0.4, 0.2], [0.0, 2.0, -0.7], [0.0, 0.0, 5.0]])
     graph.add_edge(EdgeKind.SCAN, 0, 1, se2.between(*graph.poses), A.T @ A)
-    np.testing.assert_allclose(reach(graph, 1, [0])[0], known(graph, 0, 1), rtol=1e-9)
-    np.testing.assert_allclose(reach(graph, 0, [1])[0], known(graph, 1, 0), rtol=1e-9)
+    np.testing.assert_allclose(path_bound(graph, 1, [0])[0], known(graph, 0, 1), rtol=1e-9)
+    np.testing.assert_allclose(path_bound(graph, 0, [1])[0], known(graph, 1, 0), rtol=1e-9)
 
 
 def test_sigmas_add_up_along_a_way():
     graph = line([0.1, 0.2, 0.4])
-    assert reach(graph, 3, [0, 1, 3])[:, 0] == pytest.approx(
+    assert path_bound(graph, 3, [0, 1, 3])[:, 0] == pytest.approx(
         np.sqrt(2.0) * np.array([0.7, 0.6, 0.0]), rel=1e-6
     )
 
@@ -55,31 +55,31 @@ def test_sigmas_add_up_along_a_way():
 def test_turn_moves_what_lies_behind_it_by_the_lever():
     graph = line([1e-9] * 5, sigma_turn=0.01)
     levers = np.linalg.norm(graph.poses[1:, :2] - graph.poses[5, :2], axis=1)
-    assert reach(graph, 5, [0])[0] == pytest.approx([0.01 * levers.sum(), 0.05], rel=1e-6)
+    assert path_bound(graph, 5, [0])[0] == pytest.approx([0.01 * levers.sum(), 0.05], rel=1e-6)
 
 
 def test_loop_that_is_closed_makes_the_way_short():
     graph = line([0.1] * 20)
-    before = reach(graph, 20, [0, 10])
+    before = path_bound(graph, 20, [0, 10])
     graph.add_edge(
         EdgeKind.CLOSURE, 0, 20, se2.between(graph.poses[0], graph.poses[20]), 1e4 * np.eye(3)
     )
-    after = reach(graph, 20, [0, 10])
+    after = path_bound(graph, 20, [0, 10])
     assert after[0, 0] < 0.02 < before[0, 0]
     assert after[1, 0] <= before[1, 0]
     graph.edges.enabled[-1] = False
-    np.testing.assert_array_equal(reach(graph, 20, [0, 10]), before)
+    np.testing.assert_array_equal(path_bound(graph, 20, [0, 10]), before)
 
 
 @pytest.mark.parametrize('seed', range(5))
 def test_bound_is_never_less_than_what_the_graph_knows(seed):
     graph, _, _ = loop_graph(seed)
     for i in (0, 7, 22):
-        bound = reach(graph, 15, [i])[0]
+        bound = path_bound(graph, 15, [i])[0]
         assert (bound >= known(graph, i, 15) * (1.0 - 1e-9)).all()
 
 
 def test_what_no_way_leads_to_may_be_anywhere():
     graph = line([0.1])
     graph.add_pose(np.ones(3))
-    assert np.isinf(reach(graph, 2, [0, 1])).all()
+    assert np.isinf(path_bound(graph, 2, [0, 1])).all()

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The estimate of a graph that a robot adds to, kept at the optimum: what changed is solved.
+"""Online solver: keeps the estimate of a growing graph at the optimum.
 
-The common keyframe is a step or some of the incremental solver, which cost what it touches. The
-batch solver does what that cannot: it looks for another start where this one is bad, and never
-ends above it.
+A keyframe usually takes one or a few steps of the incremental solver, whose cost depends on what
+has changed alone. Where that does not converge, or the start is bad, the batch solver takes over,
+which computes another start and never ends at a higher cost.
 """
 
 from __future__ import annotations
@@ -19,19 +19,18 @@ from rlml_slam.graph.model.cost import total_cost
 from rlml_slam.graph.model.graph import Graph, Renumbering
 from rlml_slam.se2 import Array
 
-# Steps that are made without a look at the cost of the whole graph, and in all: then the batch
-# solver takes over, which needs fewer from a start that is no bad one.
-FEW, MOST = 5, 40
-# Share of the cost that is too little to go on for. Robust weights may come to rest slowly: where
-# each step brings 0.9 of what the last one did, this leaves a tenth of 0.1 %, to be taken up when
-# more comes.
-LITTLE = 1e-5
+# Incremental steps before the cost of the whole graph is evaluated, and in all: then the batch
+# solver takes over, which needs fewer iterations from a good start.
+UNCHECKED_STEPS, MAX_STEPS = 5, 40
+# Relative decrease of the cost at which the steps end. Robust weights may converge slowly: where
+# each step gains 0.9 of what the last one did, this leaves 0.01 % of the cost, for the next solve.
+MIN_DECREASE = 1e-5
 
 
 class OnlineSolver:
-    """Solves ``graph`` and tells covariances of it; ``steps`` and ``batches`` count what it took.
+    """Estimate and covariances of ``graph``; ``steps`` incremental, ``batches`` batch solves.
 
-    Who moves the estimate itself has to say so by ``start_over``.
+    Whoever changes the estimate in the graph has to call ``start_over``.
     """
 
     def __init__(self, graph: Graph, parameters: params.Solver = DEFAULT) -> None:
@@ -39,81 +38,81 @@ class OnlineSolver:
         self.steps = self.batches = 0
         self._p = parameters
         self._incremental = IncrementalSolver(graph)
-        self._at_rest = False  # the last solve ended, and no step came since
+        self._converged = False  # the last solve ended, and no step came since
         # the estimate of the solver, where the graph shows an older one until the next solve
         self._ahead: tuple[Array, Array] | None = None
 
     def solve(self) -> None:
         """Bring the estimate to the optimum; raises SolverError as the solvers do."""
-        self._catch_up()
-        if self._at_rest and self._incremental.is_current:
+        self._write_back()
+        if self._converged and self._incremental.is_current:
             return
         graph = self.graph
         before = graph.poses.copy(), graph.landmarks.copy()
         try:
-            self._at_rest = self._descend(before)
+            self._converged = self._step_to_optimum(before)
         except SolverError:
-            self._at_rest = False  # where the graph itself is to blame, the batch solver says so
-        if not self._at_rest:
+            self._converged = False  # where the graph itself is at fault, the batch solver raises
+        if not self._converged:
             graph.poses[:], graph.landmarks[:] = before
             self.solve_all()
 
-    def _catch_up(self) -> None:
-        """Show what was solved on the side."""
+    def _write_back(self) -> None:
+        """Write what was solved for the covariances alone into the graph."""
         if self._ahead is not None:
             poses, landmarks = self._ahead
             self.graph.poses[: len(poses)] = poses
             self.graph.landmarks[: len(landmarks)] = landmarks
             self._ahead = None
 
-    def _descend(self, before: tuple[Array, Array]) -> bool:
-        """Steps until the optimum is reached, or False where they do not lead there."""
+    def _step_to_optimum(self, before: tuple[Array, Array]) -> bool:
+        """Incremental steps until they converge; False where they do not."""
         graph = self.graph
         self._step()
         if self._incremental.settled:
             return True  # linear models that still hold: the cost is where they say
         start, num = total_cost(graph.tables(), *before)
         cost, steps = start, 1
-        while start <= BAD_START * num and steps < MOST and cost <= start:
+        while start <= BAD_START * num and steps < MAX_STEPS and cost <= start:
             self._step()
             steps += 1
             if self._incremental.settled:
                 return True
-            if steps >= FEW:
+            if steps >= UNCHECKED_STEPS:
                 last, cost = cost, total_cost(graph.tables(), graph.poses, graph.landmarks)[0]
-                if abs(last - cost) <= LITTLE * cost:
+                if abs(last - cost) <= MIN_DECREASE * cost:
                     return True
         return False
 
     def solve_all(self) -> None:
-        """The same by the batch solver, in the time that the whole graph takes."""
-        self._catch_up()
+        """As ``solve``, by the batch solver, in the time that the whole graph takes."""
+        self._write_back()
         self.batches += 1
         optimize(self.graph, self._p)
         self.start_over()
 
     def start_over(self) -> None:
-        """The estimate was changed by others."""
-        self._at_rest, self._ahead = False, None
+        """Start from the estimate in the graph: it was changed from outside."""
+        self._converged, self._ahead = False, None
         self._incremental.start_over()
 
     def joint(self, poses: ArrayLike, landmarks: ArrayLike = ()) -> Array:
         """Joint covariance (3k + 2l, 3k + 2l) of the poses (k,), then the landmarks (l,).
 
-        As that of Marginals. For robust weights count, it is that at the optimum; but the estimate
-        stays where it is: until the next solve if that has to be found first.
+        As that of Marginals, at the optimum, as robust weights count. Where the optimum has to be
+        found first, the graph shows it from the next solve on.
         """
-        if not (self._at_rest and self._incremental.is_current):
-            self._solve_aside()
+        if not (self._converged and self._incremental.is_current):
+            self._solve_hidden()
         return self._incremental.joint(poses, landmarks)
 
-    def _solve_aside(self) -> None:
-        """Find the optimum, but show it only with the next solve."""
+    def _solve_hidden(self) -> None:
+        """Find the optimum, but write it into the graph only with the next solve."""
         graph = self.graph
         shown = graph.poses.copy(), graph.landmarks.copy()
         try:
             self.solve()
-            if not self._at_rest:  # the batch solver left no tree
+            if not self._converged:  # the batch solver left no tree
                 self._step()
             self._ahead = graph.poses.copy(), graph.landmarks.copy()
         except SolverError:
@@ -128,13 +127,13 @@ class OnlineSolver:
         landmarks: NDArray[np.bool_],
         disabled: NDArray[np.bool_] | None = None,
     ) -> Renumbering:
-        """Graph.keep; what goes should have no enabled factor any more.
+        """Graph.keep; what is removed should have no enabled factor any more.
 
-        The others stay where they are until the next solve.
+        The estimate of the others does not change until the next solve.
         """
         graph = self.graph
         shown = graph.poses.copy(), graph.landmarks.copy()
-        self._catch_up()
+        self._write_back()
         try:
             self._step()
         except SolverError:
@@ -150,5 +149,5 @@ class OnlineSolver:
 
     def _step(self) -> None:
         self.steps += 1
-        self._at_rest = False
+        self._converged = False
         self._incremental.update()

@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Factors that go where there are more of them than a graph needs, rather those that tell little.
+"""Edge and sighting pruning by leverage: effective resistance sparsification of a graph.
 
-The leverage of an edge is the share of what is known of where its pose j is from its pose i that
-comes from itself, h = tr(Q W) / 3 with its information W and the covariance Q of its residual by
-the whole graph (the effective resistance by which Spielman & Srivastava, "Graph sparsification by
-effective resistances", 2011, tell which edges matter). Those of all edges sum up to the number of
-free poses at most, so that of m edges per pose they have 1 / m in the mean: most of what such a
-one tells is known without it. What is left is what was measured: nothing becomes surer than it
-was. The same holds of the sightings of a pose, h = tr(Q W) / 2, of which the least go.
+The leverage of an edge is the share of the information on the pose of j relative to i that comes
+from the edge itself, h = tr(Q W) / 3 with its information W and the covariance Q of its residual
+by the whole graph (the effective resistance by which Spielman & Srivastava, "Graph sparsification
+by effective resistances", 2011, sample edges). The leverages of all edges sum up to at most the
+number of free poses, so that of m edges per pose they are 1 / m in the mean: most of the
+information of such an edge is in the others. What is left is what was measured: no covariance
+gets smaller. The same holds of the sightings of a pose, h = tr(Q W) / 2; the least are removed.
 
-Were it for leverage alone, the edges that stay would lie the more at random the longer new ones
+By leverage alone, the edges that stay would be distributed the more randomly the longer new ones
 come in, and the factor of such a graph is nearly full. There, an edge to a pose with many
-neighbours costs little, for that pose separates the others anyway: so what an edge tells counts
-times the square of the number of neighbours of the busier one of its poses. By the number itself
-the factor still grew, by 8 % in an hour of driving in one hall; by its square it does not. Some
-that go tell more than the mean for that; none tells more than it leaves to the others, AT_ONCE.
+neighbours costs little, for that pose separates the others anyway: so the leverage of an edge
+counts times the square of the number of neighbours of the busier one of its poses. By the number
+itself the factor still grew, by 8 % in an hour of driving in one hall; by its square it does not.
+Some that are removed have more than the mean leverage for that; none has more than MAX_LEVERAGE.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from rlml_slam.graph.model.robust_loss import loss
 from rlml_slam.graph.robust.relative_covariance import residual_covs
 from rlml_slam.se2 import Array
 
-# Leverage that an edge which goes may have in any direction, and all that go at a time together.
-# The edges of a cut have one or more in sum: so none is cut through.
-AT_ONCE = 0.5
+# Maximum leverage, in any direction, of an edge that is removed, and of all removed at a time
+# together. The edges of a cut sum up to one or more: so the graph stays in one piece.
+MAX_LEVERAGE = 0.5
 
 
-def prune(graph: Graph, may: NDArray[np.bool_], most: int) -> NDArray[np.int64]:
-    """Disable edges of those that ``may`` (e,) go until there are ``most``; which they were (k,).
+def prune_edges(graph: Graph, allowed: NDArray[np.bool_], most: int) -> NDArray[np.int64]:
+    """Disable ``allowed`` (e,) edges until ``most`` are left; their indices (k,).
 
-    More are left where too many would have to go at a time. The estimate is to be the optimum.
+    More are left where too many would be removed at a time. The estimate is to be the optimum.
     """
     e = graph.edges
     use = np.flatnonzero(e.enabled)
@@ -47,34 +47,34 @@ def prune(graph: Graph, may: NDArray[np.bool_], most: int) -> NDArray[np.int64]:
     nodes = e.nodes[use]
     neighbours = np.bincount(np.unique(np.sort(nodes), axis=0).ravel())
     busier = neighbours[nodes].max(axis=1)
-    gone = use[_least(leverages(graph), may[use], len(use) - most, busier**2)]
-    e.enabled[gone] = False
-    return gone
+    removed = use[_least(leverages(graph), allowed[use], len(use) - most, busier**2)]
+    e.enabled[removed] = False
+    return removed
 
 
-def prune_sightings(live: OnlineSolver, pose: int, most: int) -> NDArray[np.int64]:
-    """The same of the sightings of one pose, from the tree of the live solver."""
-    s = live.graph.sightings
+def prune_sightings(solver: OnlineSolver, pose: int, most: int) -> NDArray[np.int64]:
+    """Disable sightings of one pose until ``most`` are left; covariances from the clique tree."""
+    s = solver.graph.sightings
     use = np.flatnonzero((s.nodes[:, 0] == pose) & s.enabled)
     if len(use) <= most:
         return use[:0]
-    h = sighting_leverages(live, pose, use)
-    gone = use[_least(h, np.ones(len(use), dtype=np.bool_), len(use) - most)]
-    s.enabled[gone] = False
-    return gone
+    h = sighting_leverages(solver, pose, use)
+    removed = use[_least(h, np.ones(len(use), dtype=np.bool_), len(use) - most)]
+    s.enabled[removed] = False
+    return removed
 
 
 def _least(
-    h: Array, may: NDArray[np.bool_], num: int, times: NDArray[np.int64] | int = 1
+    h: Array, allowed: NDArray[np.bool_], num: int, times: NDArray[np.int64] | int = 1
 ) -> NDArray[np.int64]:
-    """Of the leverages (k, d, d), up to ``num`` that ``may`` go together, the least first.
+    """Indices of up to ``num`` ``allowed`` of the leverages (k, d, d), the least first.
 
     Each counts so many ``times`` (k,).
     """
     total, largest = np.trace(h, axis1=1, axis2=2), np.linalg.eigvals(h).real.max(axis=1)
     order = np.argsort(total * times, kind='stable')
-    order = order[may[order] & (largest[order] < AT_ONCE)]
-    least: NDArray[np.int64] = order[np.cumsum(total[order]) < AT_ONCE * h.shape[1]][:num]
+    order = order[allowed[order] & (largest[order] < MAX_LEVERAGE)]
+    least: NDArray[np.int64] = order[np.cumsum(total[order]) < MAX_LEVERAGE * h.shape[1]][:num]
     return least
 
 
@@ -90,12 +90,12 @@ def leverages(graph: Graph) -> Array:
     return out
 
 
-def sighting_leverages(live: OnlineSolver, pose: int, sightings: NDArray[np.int64]) -> Array:
+def sighting_leverages(solver: OnlineSolver, pose: int, sightings: NDArray[np.int64]) -> Array:
     """Q W (k, 2, 2) of enabled ``sightings`` (k,), all from one ``pose``; robust weights count."""
-    graph, s = live.graph, live.graph.sightings
+    graph, s = solver.graph, solver.graph.sightings
     seen, information = s.nodes[sightings, 1], s.information[sightings]
     who, at = np.unique(seen, return_inverse=True)
-    joint = live.joint([pose], who)
+    joint = solver.joint([pose], who)
     residual, J_x, J_m = pose_landmark(
         graph.poses[np.full(len(seen), pose)],
         graph.landmarks[seen],
@@ -113,7 +113,7 @@ def sighting_leverages(live: OnlineSolver, pose: int, sightings: NDArray[np.int6
 
 
 def _weights(graph: Graph, kinds: NDArray[np.int64], s: Array) -> Array:
-    """What the losses leave of factors (k,) with squared norms ``s`` (k,)."""
+    """Robust weights of factors (k,) with squared norms ``s`` (k,)."""
     losses = graph.losses.in_order()
     of = [losses[code] for code in kinds.tolist()]
     return np.array(

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which closures to believe: the surest first, the others by the graph that these have made.
+"""Selection of loop closures: the most certain first, the others by the graph these have made.
 
-A wrong closure cannot be told by its residual once it has bent the map, and robust losses that
-start with all closures in the graph settle in whatever they are bent into. So the graph begins
-with odometry alone. A closure, or a group that agrees (agreement.py), enters when the evidence
-(evidence.py) of the graph so far is far above chance; each that enters sharpens the prediction for
-the others. The demands sink only when nothing meets them, down to a 5 % chance of being wrong.
-In the end each that is inside is judged once more, by all the others (``_review``).
+The residual of a wrong closure does not show it once it has bent the map, and robust losses that
+start with all closures in the graph converge to whatever these bend it into. So the graph begins
+with odometry alone. A closure, or a pairwise-consistent group (pairwise_consistency.py), enters
+when its log evidence (inlier_evidence.py) by the graph so far is far above chance; each that
+enters makes the prediction for the others more certain. The thresholds are lowered only when no
+closure meets them, down to a 5 % chance of being wrong. In the end each accepted closure is tested
+once more, against all the others (``_review``).
 """
 
 from __future__ import annotations
@@ -37,13 +38,12 @@ from rlml_slam.graph.robust.spanning_forest import Ints, SpanningForest
 from rlml_slam.se2 import Array
 
 Flags = NDArray[np.bool_]
-SURE = 0.01  # chances that any of all closures is wrong, with which the first ones enter
-GROUPS = 0.1  # the same for the groups, whose members speak for each other already
-DOUBT = 0.05  # chance of being wrong with which the last one enters
-STEP = 2.0  # by which the demands sink
-TRIES = 2  # times that a closure may be thrown out again
-# times that all are judged in the end, each as long as a solve: far more than it takes where
-# closures do not take turns
+FIRST_RISK = 0.01  # chance that any of all closures is wrong, at which the first ones enter
+GROUP_RISK = 0.1  # the same for the groups, whose members are consistent with each other already
+LAST_RISK = 0.05  # chance of being wrong at which the last one enters
+STEP = 2.0  # [nats] by which the thresholds are lowered
+TRIES = 2  # number of times that a closure may be rejected after it was accepted
+# reviews at most, each as long as a solve: far more than it takes unless closures alternate
 ROUNDS = 50
 
 
@@ -51,8 +51,8 @@ ROUNDS = 50
 class Selection:
     """``edges`` (k,) are the closures, ``accepted`` (k,) whether they are in the graph.
 
-    ``evidence`` (k,) is the log ratio of right to wrong when each was judged last, infinite for
-    one that alone holds two parts together. ``scale`` of the covariances, as found.
+    ``evidence`` (k,) is the log ratio of right to wrong when each was tested last, infinite for
+    one that alone connects two parts. ``scale`` of the covariances, as found.
     """
 
     edges: Ints
@@ -63,51 +63,51 @@ class Selection:
 
 
 def select_closures(
-    graph: Graph, parameters: params.Solver | None = None, barred: Ints | None = None
+    graph: Graph, parameters: params.Solver | None = None, excluded: Ints | None = None
 ) -> Selection:
-    """Enable the closures to believe and disable all others; the estimate is the optimum then.
+    """Enable the consistent closures and disable all others; the estimate is the optimum then.
 
-    The edges ``barred`` stay out in any case. All other factors are trusted. Raises
+    The edges ``excluded`` stay disabled in any case. All other factors are trusted. Raises
     SolverError like ``optimize``.
     """
     losses = graph.losses
     graph.losses = replace(losses, closure=Loss())
     try:
-        return _Selector(graph, parameters or params.Solver(), barred).run()
+        return _Selector(graph, parameters or params.Solver(), excluded).run()
     finally:
         graph.losses = losses
 
 
 class _Selector:
-    def __init__(self, graph: Graph, parameters: params.Solver, barred: Ints | None) -> None:
+    def __init__(self, graph: Graph, parameters: params.Solver, excluded: Ints | None) -> None:
         e = graph.edges
         self._graph, self._parameters = graph, parameters
         is_closure = e.kinds == FactorKind.CLOSURE
         self._edges = np.flatnonzero(is_closure)
-        may = np.isin(self._edges, [] if barred is None else barred, invert=True)
-        self._may = may
+        allowed = np.isin(self._edges, [] if excluded is None else excluded, invert=True)
+        self._allowed = allowed
         self._nodes, self._z = e.nodes[self._edges], e.measured[self._edges]
         self._cov = np.asarray(np.linalg.inv(e.information[self._edges]), dtype=np.float64)
         trusted = np.flatnonzero(e.enabled & ~is_closure)
         spanning_forest = SpanningForest(graph, trusted)
         area = extent2(spanning_forest.poses)
         self._groups = group(spanning_forest, self._nodes, self._z, self._cov, area)
-        self._held = _bridges(spanning_forest, self._nodes, self._groups, may)
-        if self._held.any():
-            held = self._edges[self._held]
-            spanning_forest = SpanningForest(graph, np.concatenate([trusted, held]))
+        self._bridges = _bridges(spanning_forest, self._nodes, self._groups, allowed)
+        if self._bridges.any():
+            bridges = self._edges[self._bridges]
+            spanning_forest = SpanningForest(graph, np.concatenate([trusted, bridges]))
             area = extent2(spanning_forest.poses)
         self._wrong = uniform(area)
         free = ~graph.fixed_poses
         graph.poses[free] = spanning_forest.poses[free]
-        self._accepted = self._held.copy()
-        self._left = np.where(may & ~self._held, TRIES, 0)
-        self._evidence = np.where(self._held, np.inf, -np.inf)
-        self._backbone = spanning_forest
+        self._accepted = self._bridges.copy()
+        self._left = np.where(allowed & ~self._bridges, TRIES, 0)
+        self._evidence = np.where(self._bridges, np.inf, -np.inf)
+        self._forest = spanning_forest
         self._solves = 0
 
     def run(self) -> Selection:
-        """Let closures in, then judge all of them again."""
+        """Accept closures, then review all of them."""
         self._grow()
         self._review()
         return Selection(
@@ -115,60 +115,60 @@ class _Selector:
         )
 
     def _grow(self) -> None:
-        """Let closures in until none of those outside is likelier right than wrong."""
+        """Accept closures until none of the rest is more likely right than wrong."""
         self._solve()
-        self._judge_first()
-        sunk = 0.0
+        self._evaluate_by_forest()
+        lowered = 0.0
         while True:
-            new = self._enough(sunk)
+            new = self._above_threshold(lowered)
             if new.any():
-                self._take(new)
-                self._judge()
-                sunk = max(sunk - STEP, 0.0)
-            elif sunk >= self._lowest():
+                self._accept(new)
+                self._evaluate_rest()
+                lowered = max(lowered - STEP, 0.0)
+            elif lowered >= self._max_lowering():
                 break
             else:
-                sunk += STEP
+                lowered += STEP
 
-    def _lowest(self) -> float:
-        """How far the demands may sink: to where one that enters is wrong with the chance DOUBT.
+    def _max_lowering(self) -> float:
+        """How far the thresholds may be lowered: to where an accepted one is wrong with LAST_RISK.
 
-        The odds beforehand are those of the closures outside and inside.
+        The prior odds are those of the rejected to the accepted closures.
         """
         inside = int(self._accepted.sum())
         odds = (len(self._edges) - inside + 1.0) / (inside + 1.0)
-        return self._strict() - math.log(odds / DOUBT)
+        return self._first_threshold() - math.log(odds / LAST_RISK)
 
-    def _of_groups(self, several: Flags, sunk: float) -> float:
-        """Demand of the groups: as of single ones, by the odds of groups, and never below 0."""
+    def _group_threshold(self, several: Flags, lowered: float) -> float:
+        """Threshold of the groups: as of single ones, by the odds of groups, and never below 0."""
         label, size, _ = self._groups
         num = int(several.sum())
-        strict = math.log(max(num, 1) / GROUPS)
+        strict = math.log(max(num, 1) / GROUP_RISK)
         inside = int((several & (np.bincount(label, self._accepted, len(size)) > 0.0)).sum())
-        last = math.log((num - inside + 1.0) / (inside + 1.0) / DOUBT)
-        return max(min(strict, max(strict - sunk, last)), 0.0)
+        last = math.log((num - inside + 1.0) / (inside + 1.0) / LAST_RISK)
+        return max(min(strict, max(strict - lowered, last)), 0.0)
 
-    def _strict(self) -> float:
-        return math.log(max(len(self._edges), 1) / SURE)
+    def _first_threshold(self) -> float:
+        return math.log(max(len(self._edges), 1) / FIRST_RISK)
 
-    def _enough(self, sunk: float) -> Flags:
-        """Closures outside whose evidence, or that of the best of their group, is enough."""
+    def _above_threshold(self, lowered: float) -> Flags:
+        """Closures not accepted yet whose evidence, or that of their group, is above threshold."""
         label, size, _ = self._groups
-        sunk = min(sunk, self._lowest())
+        lowered = min(lowered, self._max_lowering())
         outside = ~self._accepted & (self._left > 0)
         value = np.where(outside, self._evidence, -np.inf)
         best = np.full(len(size), -np.inf)
         np.maximum.at(best, label, value)
         several = size > 1
-        grouped: Flags = (several & (best > self._of_groups(several, sunk)))[label]
-        return outside & ((value > self._strict() - sunk) | grouped)
+        grouped: Flags = (several & (best > self._group_threshold(several, lowered)))[label]
+        return outside & ((value > self._first_threshold() - lowered) | grouped)
 
-    def _take(self, new: Flags) -> None:
-        """Let closures in, and throw out what the graph cannot agree with."""
+    def _accept(self, new: Flags) -> None:
+        """Accept closures, and reject those that contradict the graph then."""
         self._accepted |= new
         self._solve()
-        now = self._weigh(self._errors(np.arange(len(self._edges))), self._cov)
-        bad = self._accepted & ~self._held & (now < 0.0)
+        now = self._evidence_of(self._errors(np.arange(len(self._edges))), self._cov)
+        bad = self._accepted & ~self._bridges & (now < 0.0)
         if bad.any():
             self._evidence[bad] = now[bad]
             self._left[bad] -= 1
@@ -180,19 +180,19 @@ class _Selector:
         optimize(self._graph, self._parameters)
         self._solves += 1
 
-    def _judge_first(self) -> None:
-        """Evidence by the backbone alone."""
-        outside = np.flatnonzero(~self._held)
+    def _evaluate_by_forest(self) -> None:
+        """Evidence by the spanning forest of the trusted edges alone."""
+        outside = np.flatnonzero(~self._bridges)
         i, j = self._nodes[outside].T
-        T, S = self._backbone.motion(i, j)
+        T, S = self._forest.motion(i, j)
         e = se2.between(self._z[outside], T)
-        self._evidence[outside] = self._weigh(e, S + self._cov[outside])
+        self._evidence[outside] = self._evidence_of(e, S + self._cov[outside])
 
-    def _judge(self) -> None:
-        """Evidence of those outside by the graph as it is: roughly, and exactly where it counts.
+    def _evaluate_rest(self) -> None:
+        """Evidence of the others by the current graph: a bound, and exactly near a threshold.
 
-        The covariance of a difference is at most twice the sum of both, which no correlation
-        needs to be known for; what fails even so need not be looked at.
+        The covariance of a difference is at most twice the sum of both, whatever the
+        correlation; what fails even with that bound needs no exact covariance.
         """
         outside = np.flatnonzero(~self._accepted & (self._left > 0))
         if not len(outside):
@@ -201,13 +201,13 @@ class _Selector:
         i, j = self._nodes[outside].T
         e = self._errors(outside)
         marginals = Marginals(self._graph)
-        rough = self._roughly(marginals, outside)
-        # the true covariance is smaller: its density is lower at a large error, higher at none
-        open_ = np.flatnonzero((rough > -STEP) & (rough < self._strict() + STEP))
+        bound = self._evidence_bound(marginals, outside)
+        # the true covariance is smaller: its density is lower at a large error, higher at a small
+        open_ = np.flatnonzero((bound > -STEP) & (bound < self._first_threshold() + STEP))
         if len(open_):
             S = difference_covs(marginals, poses, i[open_], j[open_])
-            rough[open_] = self._weigh(e[open_], S + self._cov[outside[open_]])
-        self._evidence[outside] = rough
+            bound[open_] = self._evidence_of(e[open_], S + self._cov[outside[open_]])
+        self._evidence[outside] = bound
 
     def _errors(self, of: Ints) -> Array:
         """Residuals (k, 3) of the closures ``of`` (k,) by the graph as it is."""
@@ -215,30 +215,30 @@ class _Selector:
         i, j = self._nodes[of].T
         return factors.relative_pose(poses[i], poses[j], self._z[of])[0]
 
-    def _roughly(self, marginals: Marginals, outside: Ints) -> Array:
+    def _evidence_bound(self, marginals: Marginals, outside: Ints) -> Array:
         i, j = self._nodes[outside].T
         S = most_difference_covs(marginals, self._graph.poses, i, j)
-        return self._weigh(self._errors(outside), S + self._cov[outside])
+        return self._evidence_of(self._errors(outside), S + self._cov[outside])
 
     def _review(self) -> None:
-        """Judge those inside by the others, and those outside again, until nothing changes.
+        """Test each accepted closure against the others, and the rejected ones again.
 
-        What entered early was judged by a graph that knew little. Now all can be judged by what
-        all the others say, and by errors as they have turned out to be (calibration.py). Of those
-        that fail, the ones likelier wrong than right go at once; otherwise the worst goes alone,
-        as two that contradict each other need not both be wrong. After ``ROUNDS`` times all that
-        are in doubt go, and none comes back.
+        What entered early was tested by a graph with few closures. Now all are tested by all the
+        others, with the errors calibrated on themselves (noise_calibration.py). Of those that
+        fail, the ones more likely wrong than right are rejected at once; otherwise the worst one
+        alone, as two that contradict each other need not both be wrong. After ``ROUNDS`` times
+        all that fail are rejected, and none is accepted again.
         """
-        self._left = np.where(self._may & ~self._held, TRIES, 0)
+        self._left = np.where(self._allowed & ~self._bridges, TRIES, 0)
         for left in range(ROUNDS, -1, -1):
-            judged, evidence = self._judge_again()
-            demand = self._strict() - self._lowest()
-            doubt = judged & self._accepted & (evidence < demand)
-            back = judged & ~self._accepted & (evidence > demand)
-            self._evidence[judged] = evidence[judged]
-            if doubt.any():
-                worst = evidence[doubt].min()
-                out = doubt & (evidence <= max(worst, 0.0)) if left else doubt
+            tested, evidence = self._evaluate_all()
+            threshold = self._first_threshold() - self._max_lowering()
+            failed = tested & self._accepted & (evidence < threshold)
+            back = tested & ~self._accepted & (evidence > threshold)
+            self._evidence[tested] = evidence[tested]
+            if failed.any():
+                worst = evidence[failed].min()
+                out = failed & (evidence <= max(worst, 0.0)) if left else failed
                 self._left[out] -= 1
                 self._accepted &= ~out
             elif back.any() and left:
@@ -247,12 +247,12 @@ class _Selector:
                 return
             self._solve()
 
-    def _judge_again(self) -> tuple[Flags, Array]:
-        """(Which closures are judged, evidence of those), each by all others that are inside."""
+    def _evaluate_all(self) -> tuple[Flags, Array]:
+        """(Closures tested, their evidence), each by all other accepted ones."""
         outside = np.flatnonzero(~self._accepted & (self._left > 0))
-        inside = np.flatnonzero(self._accepted & ~self._held)
+        inside = np.flatnonzero(self._accepted & ~self._bridges)
         marginals = Marginals(self._graph)
-        outside = outside[self._roughly(marginals, outside) > -STEP]
+        outside = outside[self._evidence_bound(marginals, outside) > -STEP]
         i, j = self._nodes[outside].T
         e_out = self._errors(outside)
         S_out = difference_covs(marginals, self._graph.poses, i, j) + self._cov[outside]
@@ -261,30 +261,30 @@ class _Selector:
         e, S = np.concatenate([e_in, e_out]), np.concatenate([S_in, S_out])
         scale = self._groups.scale
         wrong = near_by(self._graph.poses, self._z[inside], scale * S_in)
-        judged, values = np.zeros(len(self._edges), np.bool_), np.zeros(len(self._edges))
+        tested, values = np.zeros(len(self._edges), np.bool_), np.zeros(len(self._edges))
         if len(both):
             calibration = calibrate(e, S, scale, wrong)
-            judged[both], values[both] = True, calibration.evidence(e, S, wrong)
-        return judged, values
+            tested[both], values[both] = True, calibration.evidence(e, S, wrong)
+        return tested, values
 
-    def _weigh(self, e: Array, S: Array) -> Array:
+    def _evidence_of(self, e: Array, S: Array) -> Array:
         return evidence(e, S, self._groups.scale, self._wrong)
 
 
-def _bridges(spanning_forest: SpanningForest, nodes: Ints, groups: Groups, may: Flags) -> Flags:
-    """Closures that hold pieces of the backbone together: from the largest groups, no loops."""
-    held = np.zeros(len(nodes), dtype=np.bool_)
-    if spanning_forest.pieces == 1:
-        return held
-    a, b = np.sort(spanning_forest.piece[nodes], axis=1).T
+def _bridges(forest: SpanningForest, nodes: Ints, groups: Groups, allowed: Flags) -> Flags:
+    """Closures that connect pieces of the spanning forest: from the largest groups, no loops."""
+    bridges = np.zeros(len(nodes), dtype=np.bool_)
+    if forest.pieces == 1:
+        return bridges
+    a, b = np.sort(forest.piece[nodes], axis=1).T
     order = np.lexsort((-groups.size[groups.label], b, a))
-    order = order[(a[order] != b[order]) & may[order]]
+    order = order[(a[order] != b[order]) & allowed[order]]
     pairs, first = np.unique(np.stack([a[order], b[order]], -1), axis=0, return_index=True)
     chosen = order[first]
     cost = 1.0 / groups.size[groups.label[chosen]]
-    n = spanning_forest.pieces
+    n = forest.pieces
     links = sparse.csr_matrix((cost, (pairs[:, 0], pairs[:, 1])), (n, n))
     rows, cols = sparse.csgraph.minimum_spanning_tree(links).nonzero()
     tree = set(zip(rows.tolist(), cols.tolist(), strict=True))
-    held[[k for k, pair in zip(chosen, pairs.tolist(), strict=True) if tuple(pair) in tree]] = True
-    return held
+    bridges[chosen[[tuple(pair) in tree for pair in pairs.tolist()]]] = True
+    return bridges

@@ -8,11 +8,11 @@ Antonante, Tzoumas & Carlone, RA-L 5 (2020); eq. 43)
         c / sqrt(s) sqrt(mu (mu + 1)) - mu    between
         0                               s >= (mu + 1) / mu c^2.
 
-Every round starts where the first one did: it would not leave again what closures that were still
-weighed bent the estimate into, and Gauss-Newton may not find its way down from there.
+Every round starts from the initial estimate: from that of the last round, bent by wrong closures
+that still had weight, Gauss-Newton may not reach the minimum.
 
-It needs no odometry to trust, but settles in whatever all closures together bend the map into:
-selection.py does better wherever there is odometry.
+It needs no trusted odometry, but converges to whatever all closures together bend the map into:
+closure_selection.py does better wherever there is odometry.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far off a pose may be, seen from others: the surest ways of edges that lead there.
+"""Bound of the error of a relative pose: the most certain path of edges between two poses.
 
-What the graph knows of two poses is no less than what any one way between them tells (Olson,
-"Robust and efficient robotic mapping", 2008: the Dijkstra projection). Along a way, standard
-deviations add up, not variances: that bounds the error however the errors of the edges go
-together, as those of a worn wheel or a bent corridor do. It is found in the time of a search
-through the graph, and no normal equations are solved.
+The covariance of a relative pose by the whole graph is no larger than that along any one path
+(Olson, "Robust and efficient robotic mapping", 2008: the Dijkstra projection). Along a path,
+standard deviations are added, not variances: that bounds the error however the errors of the edges
+are correlated, as those of a worn wheel or a bent corridor are. It takes the time of a shortest
+path search, and no normal equations are solved.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from rlml_slam.se2 import Array
 Ints = NDArray[np.int64]
 
 
-def reach(graph: Graph, pose: int, others: Ints) -> Array:
-    """Bounds (k, 2) of the sigma [m], [rad] of where ``pose`` is, seen from ``others`` (k,).
+def path_bound(graph: Graph, pose: int, others: Ints) -> Array:
+    """Bounds (k, 2) of the sigma [m], [rad] of where ``pose`` is, relative to ``others`` (k,).
 
-    The first is the root of the variances of x and y together. Infinite where no way of enabled
-    edges leads there; sightings are not ways.
+    The first is the root of the variances of x and y together. Infinite where no path of enabled
+    edges leads there; sightings are not part of paths.
     """
     e = graph.edges
     targets = np.asarray(others, dtype=np.int64)
-    return _reach(graph.poses, e.nodes, e.information, e.enabled, pose, targets)
+    return _search(graph.poses, e.nodes, e.information, e.enabled, pose, targets)
 
 
 @kernel
-def _reach(
+def _search(
     poses: Array, nodes: Ints, information: Array, enabled: NDArray[np.bool_], pose: int,
     others: Ints,
 ) -> Array:  # fmt: skip
@@ -106,7 +106,7 @@ def _sigmas(poses: Array, j: int, information: Array, pose: int) -> tuple[float,
 
 @part
 def _sink(heap: Array, at: Ints, size: int) -> None:
-    """Let the first entry of a binary heap down to its place."""
+    """Sift the first entry of a binary heap down."""
     k = 0
     while 2 * k + 1 < size:
         child = 2 * k + 1
@@ -121,7 +121,7 @@ def _sink(heap: Array, at: Ints, size: int) -> None:
 
 @part
 def _rise(heap: Array, at: Ints, k: int) -> None:
-    """Let entry k of a binary heap up to its place."""
+    """Sift entry k of a binary heap up."""
     while k and heap[k] < heap[(k - 1) // 2]:
         up = (k - 1) // 2
         heap[k], heap[up] = heap[up], heap[k]
@@ -133,4 +133,4 @@ def warm_up() -> None:
     """Compile the kernel with the signature that is used at run time."""
     graph = Graph()
     graph.add_poses(np.zeros((2, 3)))
-    reach(graph, 0, np.array([1]))
+    path_bound(graph, 0, np.array([1]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a graph tells of where one pose is from another, with and without an edge between them."""
+"""Covariances of relative poses by a graph, with and without an edge between them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rlml_slam.graph.model.graph import Graph
 from rlml_slam.se2 import Array
 
 Ints = NDArray[np.int64]
-# of an edge's covariance: less than this is what is left of a difference of equal figures
+# share of an edge's covariance below which R - Q is the rounding of a difference of equal numbers
 ROUNDING = 1e-9
 
 

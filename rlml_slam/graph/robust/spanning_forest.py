@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the trusted edges alone tell of where one pose is from another.
+"""Relative poses and their covariances by the trusted edges alone, along a spanning forest.
 
-A spanning forest of the edges; along it, covariances add up when they are all expressed in the
+Covariances add up when they are all expressed in the
 root's frame: with X_j = X_i D exp(t), exp(t) = exp(Ad(X_j) t) on the left of the whole chain.
 """
 
@@ -45,10 +45,10 @@ class SpanningForest:
         for b in order[1:]:
             self._depth[b] = self._depth[parent[b]] + 1
             if parent[b] < n:
-                self._hang(graph, edge, int(parent[b]), int(b))
+                self._attach(graph, edge, int(parent[b]), int(b))
         self._above = self._ancestors()
 
-    def _hang(self, graph: Graph, edge: dict[tuple[int, int], int], a: int, b: int) -> None:
+    def _attach(self, graph: Graph, edge: dict[tuple[int, int], int], a: int, b: int) -> None:
         """Pose and covariance of b from those of its parent a."""
         forward = (a, b) in edge
         k = edge[(a, b) if forward else (b, a)]

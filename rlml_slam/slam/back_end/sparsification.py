@@ -19,8 +19,8 @@ from rlml_slam.errors import SolverError
 from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.factors import FactorKind
 from rlml_slam.graph.model.graph import Renumbering
-from rlml_slam.graph.reduction.edge_pruning import prune
-from rlml_slam.graph.reduction.marginalization import Ties, eliminate
+from rlml_slam.graph.reduction.edge_pruning import prune_edges
+from rlml_slam.graph.reduction.marginalization import RelativePoses, marginalize_pose
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.back_end.scan_graph import ScanGraph
@@ -106,7 +106,7 @@ class Sparsifier:
         # odometry keeps the graph connected, and the newest edges are not final yet
         may = (e.kinds != FactorKind.ODOMETRY) & (e.nodes < self._end(num)).all(-1)
         may[self._loop_closer.unsolved_edges()] = False
-        removed = prune(self._graph, may, EDGES * poses)
+        removed = prune_edges(self._graph, may, EDGES * poses)
         if len(removed):
             kept = np.ones(num, dtype=np.bool_)
             self._keep(kept, dict.fromkeys(removed.tolist(), -1), {})
@@ -128,13 +128,15 @@ class Sparsifier:
         self._loop_closer.renumber(new, edges, poses, self._scan_graph.finished)
         return new
 
-    def _eliminate(self, poses: list[int]) -> tuple[dict[int, int], dict[int, tuple[int, Ties]]]:
+    def _eliminate(
+        self, poses: list[int]
+    ) -> tuple[dict[int, int], dict[int, tuple[int, RelativePoses]]]:
         """Marginalize poses: replacement of each of their edges (-1 for none) and of each pose.
 
         A pose whose neighbours cannot be connected stays.
         """
         edges: dict[int, int] = {}
-        ties: dict[int, tuple[int, Ties]] = {}
+        ties: dict[int, tuple[int, RelativePoses]] = {}
         floor2 = np.array(self._p.scan_edge_variance_floor)
         e = self._graph.edges
         left = np.array(poses)
@@ -143,16 +145,16 @@ class Sparsifier:
             pose = int(left[np.argmin(degrees)])
             left = left[left != pose]
             try:
-                done = eliminate(self._graph, pose, floor2)
+                done = marginalize_pose(self._graph, pose, floor2)
             except SolverError:
                 continue
-            ties[pose] = done.onto, done.tie
+            ties[pose] = done.hub, done.from_hub
             edges.update(done.edges)
         for pose in reversed(ties):  # the replacement may have been marginalized later
             onto, tie = ties[pose]
             if onto in ties:
                 last, back = ties[onto]
-                ties[pose] = last, back.then(tie)
+                ties[pose] = last, back.compose(tie)
         for first, last in reversed(edges.items()):
             edges[first] = edges.get(last, last)
         return edges, ties

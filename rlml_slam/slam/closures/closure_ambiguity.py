@@ -17,7 +17,7 @@ import numpy as np
 
 from rlml_slam import se2
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.robust.path_bound import reach
+from rlml_slam.graph.robust.path_bound import path_bound
 from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.closure_matching import AMBIGUOUS, Match, SearchResult
 from rlml_slam.slam.closures.loop_closure import Closure
@@ -70,5 +70,5 @@ def _are_of_one_pass(graph: Graph, key: Keyframe, other: SearchResult, found: Ma
     The robot's newest submaps surround it wherever it is, so they are no alternatives.
     """
     anchor = np.array([other.candidate.m.anchor.index])
-    between = float(reach(graph, found.m.anchor.index, anchor)[0, 0])
-    return between < float(reach(graph, key.index, anchor)[0, 0])
+    between = float(path_bound(graph, found.m.anchor.index, anchor)[0, 0])
+    return between < float(path_bound(graph, key.index, anchor)[0, 0])

@@ -11,7 +11,7 @@ import numpy as np
 
 from rlml_slam import se2
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.robust.path_bound import reach
+from rlml_slam.graph.robust.path_bound import path_bound
 from rlml_slam.params import LoopClosure
 from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap
@@ -60,7 +60,7 @@ def candidates(
     if not order:
         return []
     anchors = np.array([among[k].anchor.index for k in order], dtype=np.int64)
-    drift = SIGMAS * reach(graph, key.index, anchors)
+    drift = SIGMAS * path_bound(graph, key.index, anchors)
     windows = np.clip(drift[:, 0], p.search_window, p.max_search_window).tolist()
     angles = np.clip(drift[:, 1], p.search_angle, p.max_search_angle).tolist()
     found = [

@@ -13,7 +13,7 @@ from rlml_slam.estimation.landmark_merging import MergeTest
 from rlml_slam.graph.batch.marginals import Marginals
 from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.graph import Renumbering
-from rlml_slam.graph.reduction.marginalization import Ties
+from rlml_slam.graph.reduction.marginalization import RelativePoses
 from rlml_slam.matching.reflectors.association import gate
 from rlml_slam.params import Reflector
 from rlml_slam.se2 import Array, transform
@@ -78,7 +78,7 @@ class ReflectorGraph:
         num = sum(map(len, interval.sightings.values()))
         self._factors.num_added += np.array([num > 0, num])
 
-    def move(self, ties: Mapping[int, tuple[int, Ties]]) -> None:
+    def move(self, ties: Mapping[int, tuple[int, RelativePoses]]) -> None:
         """Move sightings of marginalized keyframes, as SightingFactors.move."""
         self._factors.move(self._landmarks.values(), ties)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.graph import Renumbering
 from rlml_slam.graph.reduction.edge_pruning import prune_sightings
-from rlml_slam.graph.reduction.marginalization import Ties
+from rlml_slam.graph.reduction.marginalization import RelativePoses
 from rlml_slam.slam.landmarks.landmark import Landmark
 from rlml_slam.slam.landmarks.sighting_reduction import Records, fused, moved
 
@@ -43,7 +43,9 @@ class SightingFactors:
         self._graph.sightings.enabled[factors[factors >= 0]] = False
         sightings['factor'] = -1
 
-    def move(self, landmarks: Iterable[Landmark], ties: Mapping[int, tuple[int, Ties]]) -> None:
+    def move(
+        self, landmarks: Iterable[Landmark], ties: Mapping[int, tuple[int, RelativePoses]]
+    ) -> None:
         """Move sightings to other keyframes: pose to (other pose, tie from it).
 
         Sightings of one reflector from the same keyframe are fused.
@@ -62,7 +64,7 @@ class SightingFactors:
                 continue
             s, at = rows[is_moved], at[is_moved]
             self.disable(s)
-            z, cov_z = moved(Ties(T[at], cov[at]), s)
+            z, cov_z = moved(RelativePoses(T[at], cov[at]), s)
             s['pose'], s['z'], s['information'] = onto[at], z, np.linalg.inv(cov_z)
             is_fused = np.isin(rows['pose'], s['pose'])
             others = rows[is_fused]

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.graph.reduction.marginalization import Ties, limited
+from rlml_slam.graph.reduction.marginalization import RelativePoses, floored_covariance
 from rlml_slam.se2 import Array, rotation, transform
 from rlml_slam.slam.keyframes import SIGHTING_GATE
 
@@ -17,7 +17,7 @@ Records = NDArray[np.void]
 COMMON2 = np.array([1e-4, 1e-4])
 
 
-def moved(ties: Ties, s: Records) -> tuple[Array, Array]:
+def moved(ties: RelativePoses, s: Records) -> tuple[Array, Array]:
     """Positions (k, 2) and covariances of sightings, relative to where ``ties`` (k,) begin."""
     z = transform(ties.T, s['z'][:, None])[:, 0]
     R = rotation(ties.T[:, 2])
@@ -45,7 +45,7 @@ def fused(s: Records) -> Records:
     np.add.at(b, at[agree], (s['information'] @ s['z'][..., None])[agree, :, 0])
     C = np.asarray(np.linalg.inv(W), dtype=np.float64)
     out['z'] = (C @ b[..., None])[..., 0]
-    out['information'] = np.linalg.inv(limited(C, COMMON2, cov[agree], at[agree]))
+    out['information'] = np.linalg.inv(floored_covariance(C, COMMON2, cov[agree], at[agree]))
     others = s[~agree][::-1]
     _, newest = np.unique(others['pose'], return_index=True)
     return np.concatenate([out, others[newest]])

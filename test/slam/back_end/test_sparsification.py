@@ -11,7 +11,7 @@ from rlml_slam import se2
 from rlml_slam.errors import SolverError
 from rlml_slam.graph.batch.solver import optimize
 from rlml_slam.graph.model.cost import total_cost
-from rlml_slam.graph.reduction.marginalization import eliminate
+from rlml_slam.graph.reduction.marginalization import marginalize_pose
 from rlml_slam.params import BackEnd as BackEndParameters
 from rlml_slam.params import LoopClosure, Node, Parameters
 from rlml_slam.slam.back_end import sparsification
@@ -320,9 +320,9 @@ def test_keyframe_that_cannot_be_let_go_of_stays_with_all_it_tells(monkeypatch, 
         if rng.random() < share:
             refused.append(pose)
             raise SolverError('cannot be tied')
-        return eliminate(graph, pose, floor2)
+        return marginalize_pose(graph, pose, floor2)
 
-    monkeypatch.setattr(sparsification, 'eliminate', eliminated)
+    monkeypatch.setattr(sparsification, 'marginalize_pose', eliminated)
     path = drive(*ROUND * 3, start=START)
     observed = observations(SQUARE, path, rng=np.random.default_rng(0))
     node = Node(map_start_pose=START)
