@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the front end knows of each reflector besides its place: identity, sightings, age."""
+"""Identity, number of detections and age of each reflector of the front end."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from rlml_slam.se2 import Array
 from rlml_slam.types import ANONYMOUS
 
-MEMORY = 50  # occasions over which the spread of a group is averaged
+MEMORY = 50  # double detections over which the spread of a group is averaged
 COLUMNS = (
     'keys', 'ids', 'sightings', 'last_seen', 'surveyed', 'diameters', 'spread2', 'doubles',
 )  # fmt: skip
-MAX_CANDIDATES = 40  # seldom seen ones beyond this make room: ghosts must not fill the state
+MAX_CANDIDATES = 40  # the oldest beyond this are dropped: ghosts must not fill the state
 
 
 def _ints() -> NDArray[np.int64]:
@@ -26,10 +26,10 @@ def _ints() -> NDArray[np.int64]:
 class LandmarkTracks:
     """Columns (m,) parallel to the reflectors of the joint state.
 
-    ``keys`` never repeat, ``ids`` are the reflectors' own (ANONYMOUS), ``sightings`` counts, and
-    ``last_seen`` is a stamp [ns]; ``surveyed`` ones come from a map and are never dropped.
-    ``spread2`` [m²]: variance per axis of where in a group that cannot be told apart a detection
-    is, the mean of ``doubles`` occasions on which two of it were seen at once; zero without any.
+    ``keys`` never repeat; ``ids`` of the reflectors or ANONYMOUS; ``sightings``: number of
+    detections; ``last_seen``: stamp [ns]; ``surveyed``: from a map, never dropped. ``spread2``
+    [m²]: variance per axis of a detection in a group of reflectors that are not distinguished,
+    the mean of ``doubles`` double detections; zero without any.
     """
 
     keys: NDArray[np.int64] = field(default_factory=_ints)
@@ -46,7 +46,7 @@ class LandmarkTracks:
         return len(self.keys)
 
     def append(self, stamp: int, id_: int, diameter: float, surveyed: bool = False) -> int:
-        """A new reflector, seen once; returns its key."""
+        """Add a reflector with one detection; returns its key."""
         key = self.next_key
         self.next_key += 1
         self.keys = np.append(self.keys, key)
@@ -60,7 +60,7 @@ class LandmarkTracks:
         return key
 
     def survey(self, keys: NDArray[np.int64], ids: NDArray[np.int64], diameters: Array) -> None:
-        """Reflectors (k,) of a given map, under keys of their own."""
+        """Add reflectors (k,) of a saved map, with the keys of the map."""
         k = len(keys)
         self.keys = np.append(self.keys, keys)
         self.ids = np.append(self.ids, ids)
@@ -72,24 +72,24 @@ class LandmarkTracks:
         self.doubles = np.append(self.doubles, np.zeros(k, dtype=np.int64))
 
     def see(self, index: NDArray[np.int64], stamp: int, ids: NDArray[np.int64]) -> None:
-        """The reflectors at ``index`` were seen again; an id, once told, is kept."""
+        """Count detections of the reflectors at ``index``; a detected id is kept."""
         self.sightings[index] += 1
         self.last_seen[index] = stamp
-        told = ids != ANONYMOUS
-        self.ids[index[told]] = ids[told]
+        known = ids != ANONYMOUS
+        self.ids[index[known]] = ids[known]
 
     def see_double(self, index: int, distance: float) -> None:
-        """Two detections ``distance`` [m] apart are both of the reflector at ``index``."""
+        """Two detections at a ``distance`` [m] are both of the reflector at ``index``."""
         self.doubles[index] += 1
         gain = 1.0 / min(int(self.doubles[index]), MEMORY)
         self.spread2[index] += gain * (0.25 * distance**2 - self.spread2[index])
 
     def confirmed(self, min_sightings: int) -> NDArray[np.bool_]:
-        """(m,): seen often enough, or from a map."""
+        """(m,): detected often enough, or from a map."""
         return (self.sightings >= min_sightings) | self.surveyed
 
     def stale(self, now: int, min_sightings: int, timeout: float) -> NDArray[np.bool_]:
-        """(m,): candidates to drop, by age and, beyond MAX_CANDIDATES, the longest unseen."""
+        """(m,): candidates to drop: too old, or the oldest beyond MAX_CANDIDATES."""
         if not len(self.keys):
             return np.zeros(0, dtype=np.bool_)
         candidate = ~self.confirmed(min_sightings)
@@ -101,7 +101,7 @@ class LandmarkTracks:
         return drop
 
     def rename(self, aliases: dict[int, int]) -> None:
-        """Give merged reflectors the key that goes on, and all of one key the newest sighting."""
+        """Replace the keys of merged reflectors; all of one key get the newest stamp."""
         self.keys = np.array([aliases.get(k, k) for k in self.keys.tolist()], dtype=np.int64)
         for key in set(aliases.values()):
             same = self.keys == key
@@ -109,18 +109,18 @@ class LandmarkTracks:
                 self.last_seen[same] = self.last_seen[same].max()
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
-        """Forget all where the mask (m,) is false."""
+        """Drop reflectors where the mask (m,) is false."""
         for name in COLUMNS:
             setattr(self, name, getattr(self, name)[mask])
 
     def take(self, mask: NDArray[np.bool_]) -> LandmarkTracks:
-        """Take out all where the mask (m,) is true, which are returned."""
+        """Remove and return the reflectors where the mask (m,) is true."""
         taken = replace(self)
         taken.keep(mask)
         self.keep(~mask)
         return taken
 
     def extend(self, others: LandmarkTracks) -> None:
-        """Append what was taken out."""
+        """Append reflectors that :meth:`take` removed."""
         for name in COLUMNS:
             setattr(self, name, np.concatenate([getattr(self, name), getattr(others, name)]))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tells a scan that a driver sends again under a new stamp: it hangs, or its laser does.
+"""Detection of an old scan that a driver sends again with a new stamp, because it hangs.
 
-Noise lets no two scans be the same to the last bit, but in a simulation without any, where the
-robot stands. One that is the same although odometry has moved on was not measured where its stamp
-says: it would hold the robot where it was, until it seems to have been carried away.
+Two scans are bitwise equal only in a simulation without noise, at standstill. If an equal scan
+comes although odometry has moved, it is not from the time of its stamp; it would hold the estimate
+at the old pose until the robot seems kidnapped.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from rlml_slam import se2
 from rlml_slam.se2 import Array
 from rlml_slam.types import Scan
 
-MOVED = 0.05  # [m, rad] by odometry: far beyond the noise of a range, and of a robot that stands
-FEWEST = 30  # ranges: fewer, in whole centimetres, may come again by chance
+MOVED = 0.05  # [m, rad] by odometry: far beyond the noise of a range, and of standstill
+FEWEST = 30  # ranges: fewer, in whole centimetres, may repeat by chance
 
 
 class RepeatedScans:
@@ -27,9 +27,9 @@ class RepeatedScans:
         self._new: dict[str, tuple[bytes, Array | None]] = {}
 
     def is_stale(self, scan: Scan, odometry: Array | None) -> bool:
-        """Whether a scan is the one before once more, from a robot that has moved since.
+        """Whether a scan equals the one before, although the robot has moved since.
 
-        ``odometry`` (3,) is its pose at the scan's stamp, None where it has none; then none is.
+        ``odometry`` (3,) is the pose at the stamp of the scan; without it, no scan is stale.
         """
         ranges = scan.ranges.tobytes()
         before, there = self._new.get(scan.frame_id, (b'', None))

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 WINDOW = 400  # stamps that the line is laid through
-FEW = 8  # stamps through which a line tells whether messages were lost
+FEW = 8  # stamps of a line that can show lost messages
 ENOUGH = 32  # stamps before anything is said: intervals that vary have wandered off by then
 # variance about the line per variance of the intervals; 0.5 is that of white jitter
 STEADY = 0.6

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much time there is between two sweeps of a laser, where its stamps tell when they came in.
+"""Time between two sweeps of a laser whose stamps are times of arrival.
 
-A laser turns at a constant rate, so no two of its sweeps are much closer in time than its period.
-Where stamps often say so, they are those of a transport that delivers in bursts. Odometry of the
-same log came the same way and goes with them; to a robot without odometry, the period is what
-was between two sweeps, and the stamps are off by as much as its speed makes of them.
+A laser turns at a constant rate, so that its sweeps are never much closer than its period. Stamps
+that often are closer come from a transport that delivers in bursts. Odometry of the same log was
+delivered in the same way and matches the stamps; without odometry, the mean period is the better
+estimate of the time between two sweeps.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections import deque
 
-WINDOW = 50  # intervals that tell the period
+WINDOW = 50  # intervals whose mean is the period
 ENOUGH = 20  # of them before anything is said
 SHORT = 0.5  # share of the period that no sweep is shorter than
 OFTEN = 0.1  # share of short intervals; jitter of a quarter of the period makes fewer
@@ -27,8 +27,8 @@ class SweepPeriod:
     def elapsed(self, dt: float) -> tuple[float, float]:
         """Time [s] between the last two sweeps, whose stamps differ by ``dt``, and its error.
 
-        The error is 0 where the stamps tell the time. Else it is the spread of what they say: a
-        sweep that was lost, or came after a later one, is not told from one that came late.
+        The error is 0 if the stamps are used. Else it is the spread of the intervals: a lost
+        sweep, or one that was overtaken, is not distinguished from a late one.
         """
         self._intervals.append(dt)
         n = len(self._intervals)

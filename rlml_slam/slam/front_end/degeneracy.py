@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The direction that scans leave open, remembered from one scan to the next.
 
-Along bare walls a scan tells nothing, but each scan finds its walls turned by a little noise of
-its own. Held a hair across the true direction by one scan and across another hair by the next,
+Along bare walls a scan carries no information, but the noise of each scan rotates its walls a
+little. Held a hair across the true direction by one scan and across another hair by the next,
 the pose would seem held along it as well: an information of the square of that noise, times the
 number of scans, that is not there. The walls are the same, so the direction is: its mean over
 the scans takes the place of that of each.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""De-skews the sweeps of a robot without odometry by the velocity of its own state."""
+"""Deskew of the scans of a robot without odometry, by the velocity of its state."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def deskewed(
 ) -> tuple[Observation, Sweep]:
     """The observation with its end points at its stamp, by the velocity (3,) of the base.
 
-    Where a gyro told the turn of the sweep, that is used.
+    If a gyro measured the turn of the sweep, that is used.
     """
     scan, T = observation.scan, observation.T_base_laser
     lasted = 0.0 if scan is None else sweep_time(scan)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where in a whole map a frame was taken, by its reflectors and its scan together.
+"""Global localization by reflectors and scan together.
 
-Reflectors alone tell it in most places, but where there is a scan, it must fit there. Of several
-places that the reflectors allow, the scan may tell which; where the two contradict each other,
-nothing is unique.
+Reflectors alone are mostly sufficient, but the scan, if there is one, must match at their pose. If
+the reflectors allow several poses, the scan may decide. If the two contradict each other, no pose
+is unique.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def _of_several(
                 f'the next with {second:.2f}'
             )
             return Relocation(Verdict.UNIQUE, why, *_at(stars.candidates[first]), score, second)
-    why = f'{stars.why}; the scan does not tell either: {by_scan.why}'
+    why = f'{stars.why}; the scan does not decide: {by_scan.why}'
     return Relocation(Verdict.AMBIGUOUS, why, *_at(best))
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where in a whole map a scan was taken, without any idea beforehand; or that it cannot be told.
+"""Global localization by scan matching: branch and bound over the whole map, without a prior.
 
-Every place and heading is searched by branch and bound. The best place counts only where it fits
-well, no other place fits nearly as well, and the scan holds it in every direction.
+The best pose is unique only if its score is high, no other pose has nearly the same score, and
+the scan observes every direction.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ MAX_SECOND = 0.85
 # often where the wall lies near their border, have become free: given back half of the wall's.
 BESIDE = 0.5
 WALL = 0.25  # probability from which a cell of the map may stop a beam
-OPEN_SIGMA = 0.5  # [m] a scan that leaves a direction wider than this does not tell the place
+OPEN_SIGMA = 0.5  # [m] a pose with a larger sigma in a direction is not unique
 
 
 @dataclass(frozen=True)
 class Relocation:
-    """The verdict, and why in words; ``pose`` (3,) and ``cov`` (3, 3), map frame, of the best.
+    """Verdict with its reason; ``pose`` (3,) and ``cov`` (3, 3) of the best match, map frame.
 
-    ``score`` and ``second`` are mean hit probabilities at the best place and the next best one, 0
-    where there is none. The pose is None where no place fits.
+    ``score`` and ``second`` are the mean hit probabilities of the best and the next best pose, 0
+    if there is none. ``pose`` is None if no pose fits.
     """
 
     verdict: Verdict
@@ -77,7 +77,7 @@ def relocalize(
     least = p.loop_closure.min_score
     if not places or places[0][1] < least:
         score = places[0][1] if places else 0.0
-        why = f'no place fits: the best has a score of {score:.2f}, {least:.2f} is asked for'
+        why = f'no pose fits: the best score is {score:.2f}, at least {least:.2f} is needed'
         return Relocation(Verdict.IMPOSSIBLE, why, score=score)
     pose, score = places[0]
     second = places[1][1] if len(places) > 1 else 0.0
@@ -85,11 +85,17 @@ def relocalize(
         second = possible(submap, points, places[1][0], second, score)
     cov = _covariance(submap, points, pose, p)
     sigma = float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]))
-    verdict, why = Verdict.UNIQUE, f'score {score:.2f}, the next best place {second:.2f}'
+    verdict, why = Verdict.UNIQUE, f'score {score:.2f}, the next best pose {second:.2f}'
     if second > MAX_SECOND * score:
-        verdict, why = Verdict.AMBIGUOUS, f'two places fit alike: {score:.2f} and {second:.2f}'
+        verdict, why = (
+            Verdict.AMBIGUOUS,
+            f'two poses fit equally well: scores {score:.2f} and {second:.2f}',
+        )
     elif sigma > OPEN_SIGMA:
-        verdict, why = Verdict.AMBIGUOUS, f'the scan leaves a direction open by {sigma:.1f} m'
+        verdict, why = (
+            Verdict.AMBIGUOUS,
+            f'the scan does not observe one direction: sigma {sigma:.1f} m',
+        )
     return Relocation(verdict, why, pose, cov, score, second)
 
 

@@ -83,7 +83,7 @@ def test_corridor_does_not_tell_the_place():
 def test_scan_of_another_room_is_in_no_place():
     found = relocalize(mapped(ROOM), scanned(OTHER_ROOM, np.zeros(3)), P)
     assert found.verdict is Verdict.IMPOSSIBLE
-    assert 'no place fits' in found.why
+    assert 'no pose fits' in found.why
     assert found.pose is None
 
 
