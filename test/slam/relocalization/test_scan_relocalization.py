@@ -68,7 +68,7 @@ def test_hall_that_looks_the_same_turned_is_ambiguous():
     for pose in places(6, seed=5):
         found = relocalize(grid, scanned(SQUARE_HALL, pose, rng), P)
         assert found.verdict is Verdict.AMBIGUOUS
-        assert 'fit alike' in found.why
+        assert 'fit equally well' in found.why
         # either of the two is what is shown
         twins = np.stack([pose, se2.compose(np.array([0.0, 0.0, np.pi]), pose)])
         assert np.hypot(*se2.between(twins, found.pose)[:, :2].T).min() < 0.05
