@@ -20,6 +20,13 @@ class SavedMap:
     grid: OccupancyGrid | None = None
 
 
+def require_contents(saved: SavedMap) -> SavedMap:
+    """The map itself; MapError where there is nothing in it to localize in."""
+    if saved.grid is None and len(saved.reflectors) == 0:
+        raise MapError('there is no map yet: drive through the place first')
+    return saved
+
+
 def load(folder: str | Path) -> SavedMap:
     """The map of a folder: that which a replay wrote, or the one that was saved as ``map``.
 

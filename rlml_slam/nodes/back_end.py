@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.clock import Clock
@@ -13,81 +14,78 @@ from sensor_msgs.msg import PointCloud2
 
 from rlml_slam import warm_up
 from rlml_slam.params import Parameters
+from rlml_slam.ros.back_end.back_end_figures import figures
 from rlml_slam.ros.back_end.map_services import MapServices
 from rlml_slam.ros.back_end.mapper import Mapper
+from rlml_slam.ros.back_end.user_requests import UserRequests
 from rlml_slam.ros.codecs import decode
-from rlml_slam.ros.codecs.frame_messages import FrameAssembler, Record, read_points, read_record
+from rlml_slam.ros.codecs.frame_messages import FrameAssembler, read_points, read_record
 from rlml_slam.ros.codecs.reflector_clouds import read_associated
 from rlml_slam.ros.declare import declare
 from rlml_slam.ros.diagnostics import HealthPublisher
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensors import checked
-from rlml_slam.slam.closures.closure_table import state_counts
+from rlml_slam.slam.conversation import FrontEndCommand, SessionFrame
 
 DEPTH = 200  # of the front end's answers: none may be lost while the map is drawn
 SETTLE_PERIOD = 0.1  # [s] between two looks whether the input has fallen silent
 
 
 class BackEndNode(Node):
-    """Joins what the front end says by stamp and hands the frames to the mapper."""
+    """Joins the front end's messages by stamp and gives the frames to the mapper.
 
-    def __init__(self, **options: Any) -> None:
+    With a front end in the same process, ``command`` takes the commands for it, and its frames
+    come by ``take``, as they are.
+    """
+
+    def __init__(
+        self, command: Callable[[FrontEndCommand], None] | None = None, **options: Any
+    ) -> None:
         super().__init__('back_end', **options)
         self.params: Parameters = declare(self)
-        self.mapper = Mapper(self, self.params)
+        self.mapper = Mapper(self, self.params, command)
+        self.requests = UserRequests(self.mapper, self.params, self.get_logger())
         warm_up.compile_loaded()
         self.join = FrameAssembler()
         self.health = HealthPublisher(self, figures=self.figures)
-        self.map_services = MapServices(self, self.params, self.mapper, self.join)
-        for topic, callback in (
-            ('frames', self.on_frame),
-            ('deskewed_points', self.on_points),
-            ('reflectors/associated', self.on_associated),
-        ):
-            self.create_subscription(PointCloud2, topic, checked(self, callback), DEPTH)
+        self.map_services = MapServices(self, self.params, self.mapper, self.requests)
+        if command is None:
+            self._subscribe()
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         period = self.params.node.transform_publish_period
         self.create_timer(period, self.mapper.send_transform, clock=steady)
         self.create_timer(SETTLE_PERIOD, self.mapper.settle, clock=steady)
 
-    def on_frame(self, msg: PointCloud2) -> None:
-        """Every figure of one of the front end's frames."""
-        self.take(self.join.add_record(read_record(msg)))
+    def _subscribe(self) -> None:
+        join, stamp = self.join, decode.stamp
+        self._listen('frames', lambda m: join.add_record(read_record(m)))
+        self._listen('deskewed_points', lambda m: join.add_points(stamp(m, ''), read_points(m)))
+        self._listen('reflectors/associated', lambda m: join.add_associated(read_associated(m)))
 
-    def on_points(self, msg: PointCloud2) -> None:
-        """The end points of its scan."""
-        time = decode.stamp(msg, 'deskewed_points')
-        self.take(self.join.add_points(time, read_points(msg)))
+    def _listen(self, topic: str, add: Callable[[Any], list[SessionFrame]]) -> None:
+        def callback(msg: Any) -> None:
+            for record in add(msg):
+                self.take(record)
 
-    def on_associated(self, msg: PointCloud2) -> None:
-        """Its detections with their landmarks."""
-        self.take(self.join.add_associated(read_associated(msg)))
+        self.create_subscription(PointCloud2, topic, checked(self, callback), DEPTH)
 
-    def take(self, records: list[Record]) -> None:
-        """Hand whole frames to the mapper."""
-        for record in records:
-            self.mapper.add(record)
-            self.health.update(record.frame)
+    def take(self, record: SessionFrame) -> None:
+        """Give a whole frame to the mapper."""
+        self.mapper.add(record)
+        self.health.update(record.frame)
 
     def figures(self) -> dict[str, object]:
         """Figures for /diagnostics."""
-        back_end = self.mapper.back_end
+        refused = self.map_services.refused
         return {
-            'keyframes': len(back_end.graph.poses),
-            'edges': len(back_end.graph.edges),
-            'closures accepted': back_end.loop_closer.tried[True],
-            'closures rejected': back_end.loop_closer.tried[False],
-            **state_counts(back_end.loop_closer.records),
-            **self.mapper.continued,
-            **({} if back_end.survey_frame is None else {'survey': back_end.survey_frame.why}),
-            'constellations not searched': back_end.constellation_search.not_searched,
-            'frames waiting for the worker': self.mapper.worker.backlog,
+            **figures(self.mapper),
             'frames without their points or detections': self.join.incomplete,
+            **({} if not refused else {'last refused request': refused}),
         }
 
     def destroy_node(self) -> None:
-        """Finish the running job first."""
-        self.mapper.worker.close()
+        """Finish the running jobs first."""
+        self.mapper.close()
         super().destroy_node()
 
 

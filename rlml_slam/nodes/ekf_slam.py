@@ -26,6 +26,7 @@ from rlml_slam.ros.sensors import RELIABLE, Sensors, checked
 from rlml_slam.ros.systems.ekf_services import EkfServices
 from rlml_slam.ros.tf import TransformPublisher
 from rlml_slam.se2 import Array
+from rlml_slam.slam.conversation import ANY, SessionFrame
 from rlml_slam.types import Observation
 
 
@@ -52,7 +53,7 @@ class EkfSlamNode(Node):
     def process(self, observation: Observation) -> None:
         """One observation: estimate, publish, and map to odom."""
         frame, n = self.estimator.process(observation), self.params.node
-        self.answers.publish(frame)
+        self.answers.publish(SessionFrame(ANY, frame))
         self.health.update(frame)
         self.odom.follow(frame)
         if self.odom.newest is not None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.node import Node
@@ -17,37 +18,46 @@ from rlml_slam.ros.front_end.front_end_control import FrontEndControl
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensor_input import STREAMS
 from rlml_slam.ros.sensors import Sensors
+from rlml_slam.slam.conversation import SessionFrame
 from rlml_slam.slam.front_end.front_end import FrontEnd
 from rlml_slam.types import Frame, Observation
 
 
 class FrontEndNode(Node):
-    """Drives a FrontEnd with the robot's sensors; all stamps are those of the input."""
+    """Drives a FrontEnd with the robot's sensors; all stamps are those of the input.
 
-    def __init__(self, **options: Any) -> None:
+    With a back end in the same process, ``take`` gets its frames, and ``control.command`` is for
+    that back end's commands.
+    """
+
+    def __init__(self, has_back_end: bool = False, **options: Any) -> None:
         super().__init__('front_end', **options)
         self.params: Parameters = declare(self)
         warm_up.compile_loaded()
         self.answers = FramePublisher(self, self.params.node)
-        self.control = FrontEndControl(self, self.params, self.answers)
+        self.take: Callable[[SessionFrame], None] | None = None
+        self.control = FrontEndControl(self, self.params, self.answers.begin_session, has_back_end)
         self.sensors = Sensors(self, self.params, STREAMS, self.process, self.control.restart)
         self.health = HealthPublisher(self, self.sensors)
 
     @property
     def front_end(self) -> FrontEnd:
         """The estimator as it is now."""
-        return self.control.front_end
+        return self.control.session.front_end
 
     @property
     def last(self) -> Frame | None:
         """The newest frame, None before the first."""
-        return self.control.last
+        return self.control.session.last
 
     def process(self, observation: Observation) -> None:
         """One observation: estimate and publish."""
-        frame = self.control.process(observation)
-        self.answers.publish(frame)
-        self.health.update(frame)
+        self.control.carry_out()
+        record = self.control.session.process(observation)
+        self.answers.publish(record)
+        if self.take is not None:
+            self.take(record)
+        self.health.update(record.frame)
         self.front_end.settle()
 
 

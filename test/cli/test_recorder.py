@@ -27,6 +27,7 @@ from rlml_slam.ros.codecs.serialized_path import serialized_path  # noqa: E402
 from rlml_slam.ros.codecs.update_message import build_update  # noqa: E402
 from rlml_slam.slam.back_end.back_end import Update  # noqa: E402
 from rlml_slam.slam.closures.loop_closure import Closure  # noqa: E402
+from rlml_slam.slam.conversation import SessionFrame  # noqa: E402
 from rlml_slam.types import Detections, Frame, Health, Level, Observation, Scan  # noqa: E402
 
 SECOND = 1_000_000_000
@@ -57,6 +58,11 @@ def scan(k):
     none = np.zeros(0, np.float32)
     s = Scan(k * SECOND + 7, 'laser', 0.0, 0.1, 0.0, 0.1, 30.0, ranges, none)
     return serialize_message(encode.laser_scan(make, s))
+
+
+def record(of):
+    """The message of a frame."""
+    return build_record(make, SessionFrame(1, of), 'local')
 
 
 def frame(k, level, wall_ms):
@@ -128,7 +134,7 @@ def test_health_and_inputs_are_those_of_the_diagnostics(recorder):
     recorder.on_diagnostics(encode.diagnostics(make, 3 * SECOND, 'front_end', Health(), figures))
     for k, level in ((1, Level.OK), (2, Level.DEGRADED), (3, Level.OK)):
         recorder.on_pose(pose(k, 0.0))
-        recorder.on_frame(build_record(make, frame(k, level, wall_ms=0.5 * k), 1, 'local'))
+        recorder.on_frame(record(frame(k, level, wall_ms=0.5 * k)))
     run = recorder.run('drive')
     assert run.frames.levels == [0, 1, 0]
     assert run.frames.reasons == [(), ('saw 0 of 4', 'no odometry'), ()]

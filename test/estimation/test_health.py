@@ -109,7 +109,7 @@ def test_place_that_is_not_in_the_map_stays_lost_and_is_new_after_a_while():
     assert (levels[(t > 0.8) & (t < 2.0)] == Level.LOST).all()
     assert not any(f.jumped for f in frames)
     assert (levels[t > 3.1] == Level.OK).all()
-    assert slam.recovery.why == ''
+    assert slam.system.recovery.why == ''
 
 
 def test_place_that_looks_like_another_stays_lost():
@@ -130,7 +130,7 @@ def test_place_that_looks_like_another_stays_lost():
     frames, slam = run(observed, Slam(Parameters(health=limits)))
     assert not any(f.jumped for f in frames)
     assert frames[-1].health.level is Level.LOST
-    assert re.search('alike|more than one', slam.recovery.why)
+    assert re.search('alike|more than one', slam.system.recovery.why)
 
 
 # --- localization ------------------------------------------------------------------------------
@@ -297,14 +297,18 @@ def test_new_reflectors_contradict_only_where_known_ones_were_seen_just_before()
 
 
 def test_recovery_leaves_a_robot_alone_that_is_not_lost():
-    frames, slam = run(observations(ROOM, LOOP[:20], rng=np.random.default_rng(3)))
+    frames, _ = run(observations(ROOM, LOOP[:20], rng=np.random.default_rng(3)))
     recovery = Recovery(Parameters())
-    assert all(recovery.look(f, slam.map, False) is None for f in frames)
-    # and does not look before the doubt has lasted
-    looks = []
     for f in frames:
-        recovery.look(replace(f, unconfirmed=True), lambda: looks.append(1) or slam.map(), False)
-        assert bool(looks) == (f.stamp - FIRST >= 6 * STEP)
+        recovery.follow(f)
+        assert not recovery.is_due(f)
+    # and is not due before the robot has been lost for a while
+    due = False
+    for f in frames:
+        unconfirmed = replace(f, unconfirmed=True)
+        recovery.follow(unconfirmed)
+        due |= recovery.is_due(unconfirmed)
+        assert due == (f.stamp - FIRST >= 6 * STEP)
 
 
 def test_reflectors_that_tell_who_they_are_are_left_to_the_back_end():

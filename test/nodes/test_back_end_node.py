@@ -56,7 +56,8 @@ def start(live, **values):
     live.spin_until(
         lambda: (
             all(front.count_subscribers(topic) == 1 for topic in talk)
-            and front.count_publishers('correction') == 1
+            and front.count_publishers('graph_correction') == 1
+            and front.control.session.mode
         )
     )
     return front, back
@@ -200,7 +201,7 @@ def test_services_answer_in_words(live, tmp_path):
 
     answer = live.call(SetBool, 'back_end/pause_new_measurements', SetBool.Request(data=True))
     assert answer.success
-    assert back.join.paused
+    assert back.mapper.system.is_paused
     assert len(back.mapper.back_end.keyframes) == keyframes
 
     reset = live.call(Trigger, 'back_end/reset', Trigger.Request())
@@ -238,7 +239,7 @@ def test_maps_stay_inside_their_folder(live, tmp_path, name):
     answer = live.call(Trigger, 'back_end/save_map', Trigger.Request())
     assert not answer.success
     with pytest.raises(Exception, match='is not inside of map_directory'):
-        back.mapper.folder.path(name)
+        back.mapper.archive.folder.path(name)
 
 
 def test_saved_map_serves_for_localization(live, tmp_path):
@@ -247,8 +248,8 @@ def test_saved_map_serves_for_localization(live, tmp_path):
     reflectors = slam.reflectors()
     reflector_file.save(reflectors, tmp_path / 'map.csv')
     front, back = start(live, map_directory=str(tmp_path), mode='localization')
-    live.spin_until(lambda: front.control.map is not None)
-    assert len(front.control.map) == len(reflectors)
+    live.spin_until(lambda: front.control.session.map is not None)
+    assert len(front.control.session.map.reflectors) == len(reflectors)
     drive(live, front, back)
     assert back.mapper.back_end.keyframes == []
     stamps, poses = slam.trajectory()
@@ -287,10 +288,10 @@ def test_robot_that_was_carried_away_finds_itself_in_its_map(live, tmp_path):
     believed = front.last.T_map_base
     found = call(Trigger, 'back_end/relocalize', Trigger.Request())
     assert found.success, found.message
-    session = front.answers.session
+    session = front.control.session.session
     live.spin_until(
         lambda: (
-            front.answers.session != session
+            front.control.session.session != session
             or np.hypot(*(front.front_end.state.pose - believed)[:2]) > 0.5
         )
     )
@@ -328,7 +329,7 @@ def test_map_in_the_making_does_not_jump(live):
     front, back = start(live)
     drive(live, front, back, end=6.0)
     # as if odometry and scans had lied together
-    back.mapper.back_end.T_map_local = np.array([3.0, 0.0, 0.0])
+    back.mapper.system.T_map_local = np.array([3.0, 0.0, 0.0])
     poses = back.mapper.back_end.graph.poses.copy()
     answer = live.call(Trigger, 'back_end/relocalize', Trigger.Request())
     assert not answer.success

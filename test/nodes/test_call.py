@@ -45,6 +45,8 @@ def test_services_answer_in_words_and_refuse_in_words(live, command, tmp_path):
     code, out, err = command('load_map', 'nowhere')
     assert (code, out) == (1, '')
     assert 'refused the map' in err
+    code, out, err = command('load_map', '')
+    assert (code, out) == (1, '')
     code, out, err = command('save_map')
     assert (code, out) == (1, '')
     assert 'nothing to save' in err

@@ -8,17 +8,18 @@ import dataclasses
 import numpy as np
 import pytest
 from made_worlds import ROOM, drive, errors, messages, observations
-from test_mapper import Ear
+from test_mapper import Ear, searched
 
 from rlml_slam.errors import FileFormatError, MapError
 from rlml_slam.maps import reflector_file
 from rlml_slam.params import Parameters
 from rlml_slam.ros.back_end.map_folder import MapFolder
 from rlml_slam.ros.back_end.mapper import Mapper
-from rlml_slam.ros.codecs.belief_message import read_belief
-from rlml_slam.ros.codecs.decode import pose_estimate
-from rlml_slam.ros.codecs.frame_messages import Record
-from rlml_slam.slam.front_end.front_end import FrontEnd
+from rlml_slam.ros.back_end.user_requests import UserRequests
+from rlml_slam.ros.codecs.correction_message import read_correction
+from rlml_slam.ros.codecs.request_message import read_request
+from rlml_slam.slam.conversation import RESTARTED
+from rlml_slam.slam.front_end_session import FrontEndSession
 from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.store import map_file
 from rlml_slam.types import Detections, Odometry, Scan
@@ -54,40 +55,41 @@ def make(folder):
         p = dataclasses.replace(PARAMS, node=dataclasses.replace(PARAMS.node, **values))
         ear = Ear()
         made.append(Mapper(ear, p))
+        made[-1].requests = UserRequests(made[-1], p, ear.get_logger())
+        searched(made[-1])
         return made[-1], ear
 
     yield mapper
     for mapper in made:
-        mapper.worker.close()
+        mapper.close()
 
 
 class Front:
-    """A front end that does what the back end tells it, as the node does."""
+    """A front end that carries out the back end's messages, as the node does."""
 
-    def __init__(self, mapper, ear, pose=(0.0, 0.0, 0.0)):
-        self.mapper, self.ear, self.session = mapper, ear, 1
-        self.front_end = FrontEnd(PARAMS)
-        self.front_end.reset(np.array(pose), np.zeros((3, 3)))
-        self.frames = []
+    def __init__(self, mapper, ear):
+        self.mapper, self.ear = mapper, ear
+        self.session = FrontEndSession(PARAMS)
+        self.frames, self.begun = [], 1
 
     def process(self, observation):
-        frame = self.front_end.process(observation)
-        self.frames.append(frame)
-        self.mapper.add(Record(self.session, frame, True, True))
-        self.mapper.worker.submit(lambda: None).result()
-        told = self.ear.sent['initialpose']
-        if told:
-            found = pose_estimate(told.pop(), 'initialpose')
-            self.front_end.reset(found.pose, found.cov)
-            self.session += 1
-            self.ear.sent['belief'].clear()
-        for msg in self.ear.sent['belief']:
-            said = read_belief(msg)
-            self.front_end.correct(said.T_map_local)
-            self.front_end.forget(said.belief.removed)
-            if said.stamp == self.front_end.newest and self.front_end.contradicts(said.belief):
-                self.front_end.adopt(said.belief)
-        self.ear.sent['belief'].clear()
+        record = self.session.process(observation)
+        self.frames.append(record.frame)
+        self.mapper.add(record)
+        searched(self.mapper)
+        for topic, read in (
+            ('session_start', read_request),
+            ('graph_correction', read_correction),
+        ):
+            before = self.session.session
+            for msg in self.ear.sent[topic]:
+                self.session.execute(read(msg))
+            self.begun += self.session.session != before
+            self.ear.sent[topic].clear()
+
+
+def entering(mapper):
+    return mapper.system.entry is not None
 
 
 def drive_on(mapper, ear):
@@ -100,11 +102,11 @@ def drive_on(mapper, ear):
 
 def test_mapping_goes_on_where_the_robot_is_found(mapped, make):
     mapper, ear = make(continue_map=True)
-    assert mapper.continued
+    assert entering(mapper)
     before = len(mapper.back_end.keyframes)
     front = drive_on(mapper, ear)
-    assert front.session == 2
-    assert mapper.continued == {}
+    assert front.begun == 2
+    assert not entering(mapper)
     assert len(mapper.back_end.keyframes) > before + 5
     found = mapper.back_end.reflectors()
     # none twice, under the keys that they had
@@ -115,25 +117,24 @@ def test_mapping_goes_on_where_the_robot_is_found(mapped, make):
     assert errors(late, AGAIN[10:])[0].max() < 0.06
 
 
-def test_belief_names_reflectors_as_the_session_does(mapped, make):
+def test_keys_of_the_session_are_none_of_the_map(mapped, make):
     mapper, ear = make(continue_map=True)
-    drive_on(mapper, ear)
-    belief = mapper.back_end.belief()
-    told = mapper._continued.to_session(belief)
-    assert len(set(told.keys.tolist())) == len(belief.keys)
+    front = drive_on(mapper, ear)
     first = mapped.reflector_graph.next_key
-    for key, other in zip(belief.keys.tolist(), told.keys.tolist(), strict=True):
-        if other >= 0:
-            assert mapper.back_end.reflector_graph.resolve(other + first) == key
-    assert (told.keys >= 0).sum() >= 3  # those that were seen in this session
+    seen = np.concatenate([f.landmarks for f in front.frames[5:]])
+    aliases = mapper.back_end.belief().aliases
+    assert {aliases.get(key, key) for key in seen[seen >= 0].tolist()} <= {
+        *mapped.reflectors().keys.tolist()
+    }
+    assert min(aliases) >= first
 
 
 def test_load_map_goes_on_while_mapping(make):
     mapper, ear = make()
-    mapper.load('map')
-    assert mapper.continued
+    mapper.worker.submit(lambda: mapper.requests.load('map')).result()
+    assert entering(mapper)
     drive_on(mapper, ear)
-    assert mapper.continued == {}
+    assert not entering(mapper)
 
 
 def test_nothing_is_mapped_until_the_place_is_known(make):
@@ -143,35 +144,39 @@ def test_nothing_is_mapped_until_the_place_is_known(make):
     for o in observations(ROOM, AGAIN[:30], scan=False, reflectors=False):
         front.process(o)
     assert len(mapper.back_end.keyframes) == before
-    assert ear.sent['initialpose'] == []
+    assert front.begun == 1
     mapper.send_transform()
     assert ear.sent['/tf'] == ear.sent['~/map_to_odom'] == []
-    # a restart that nobody told a place for is no entrance
-    front.session += 1
-    for o in observations(ROOM, AGAIN[:30], scan=False, reflectors=False):
+    # a restart is no entrance, even where the scan would fit at the pose it begins with
+    front.session.start_at(0, AGAIN[0], np.zeros((3, 3)))
+    front.session.request = RESTARTED
+    mapper.searcher._p = dataclasses.replace(  # nor does a search find a place
+        PARAMS, loop_closure=dataclasses.replace(PARAMS.loop_closure, min_score=1.0)
+    )
+    for o in observations(ROOM, AGAIN[:1], reflectors=False):
         front.process(o)
-    assert mapper.continued
+    assert entering(mapper)
+    assert front.begun == 1
 
 
-def test_place_that_a_person_tells_is_taken_where_the_scan_fits(make):
+def test_pose_given_by_a_user_is_taken_where_the_scan_fits(make):
     for pose, enters in ((AGAIN[0], True), (AGAIN[0] + [1.5, 1.0, 1.0], False)):
         mapper, ear = make(continue_map=True)
-        front = Front(mapper, ear, pose)
-        mapper._continued._look = lambda frame: None  # no place is found
+        front = Front(mapper, ear)
+        front.session.start_at(0, pose, 1e-4 * np.eye(3))
         seen = observations(ROOM, AGAIN[:5], reflectors=False)
-        front.process(seen[0])
-        assert mapper.continued
-        front.session += 1
-        front.process(seen[1])
-        assert (mapper.continued == {}) == enters
+        for o in seen:
+            front.process(o)
+        assert entering(mapper) != enters
+        assert (front.begun == 2) == enters
 
 
 def test_first_run_without_a_map_begins_one(make):
     mapper, ear = make(continue_map=True, map_file_name='other')
-    assert mapper.continued == {}
-    assert 'other.rlml is not there to go on with' in ear.warnings[-1]
+    assert not entering(mapper)
+    assert any('other.rlml does not exist' in text for text in ear.warnings)
     with pytest.raises(MapError, match='cannot be read'):
-        mapper.load('other')
+        mapper.requests.load('other')
 
 
 def test_damaged_map_is_refused_and_the_one_in_the_making_kept(make, folder):
@@ -185,7 +190,7 @@ def test_damaged_map_is_refused_and_the_one_in_the_making_kept(make, folder):
     before = len(mapper.back_end.keyframes)
     path.write_bytes(bytes(data))
     with pytest.raises(FileFormatError, match='damaged'):
-        mapper.load('map')
+        mapper.requests.load('map')
     assert len(mapper.back_end.keyframes) == before
     with pytest.raises(FileFormatError, match='damaged'):
         make(continue_map=True)

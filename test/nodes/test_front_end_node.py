@@ -18,10 +18,12 @@ from rlml_slam import se2
 from rlml_slam.errors import InputError, ParameterError
 from rlml_slam.nodes.front_end import FrontEndNode
 from rlml_slam.ros.codecs import decode, encode
+from rlml_slam.ros.codecs.correction_message import build_correction
 from rlml_slam.ros.codecs.message_types import make_rclpy as make
 from rlml_slam.ros.codecs.message_types import rclpy_class
 from rlml_slam.ros.codecs.reflector_clouds import read_associated
 from rlml_slam.sensing.synchronization.synchronizer import CONFIRM
+from rlml_slam.slam.conversation import Correct
 from rlml_slam.types import Health, Level, Status
 
 SECOND = 1_000_000_000
@@ -107,23 +109,26 @@ def test_detections_are_told_what_became_of_them(live, node):
         assert told[f'detections {status.name.lower()}'] == str(count)
 
 
+def correction(node, T_map_local, cov=None, session=None):
+    """Of the newest frame, as the back end sends it."""
+    session = node.control.session.session if session is None else session
+    return build_correction(make, Correct(session, node.last.stamp, T_map_local, cov), 'map')
+
+
 def test_correction_moves_the_map_pose_only(live, node):
     feed(node, 2.0)
-    correction = np.array([1.0, -2.0, 0.5])
-    stamp = node.last.stamp
-    node.control.correct(encode.pose_with_covariance(make, stamp, 'map', correction, np.eye(3)))
+    T_map_local = np.array([1.0, -2.0, 0.5])
+    node.control.on_correction(correction(node, T_map_local, np.eye(3)))
     frame = node.front_end.process(node.last.observation)
     np.testing.assert_allclose(
-        frame.T_map_base, se2.compose(correction, frame.T_local_base), atol=1e-12
+        frame.T_map_base, se2.compose(T_map_local, frame.T_local_base), atol=1e-12
     )
 
 
-def test_correction_tells_how_well_its_frame_is_known_in_the_map(live, node):
+def test_correction_says_how_well_its_frame_is_known_in_the_map(live, node):
     feed(node, 2.0)
     cov = np.diag([0.04, 0.01, 0.02])
-    node.control.correct(
-        encode.pose_with_covariance(make, node.last.stamp, 'map', np.zeros(3), cov)
-    )
+    node.control.on_correction(correction(node, np.zeros(3), cov))
     _, cov_map = node.front_end.in_map(node.last.T_local_base, node.last.cov_local)
     np.testing.assert_allclose(cov_map, cov, atol=1e-12)
 
@@ -132,15 +137,15 @@ def test_correction_tells_how_well_its_frame_is_known_in_the_map(live, node):
 def test_correction_of_an_old_session_means_nothing(live, node, again):
     feed(node, 2.0)
     stamp, observation = node.last.stamp, node.last.observation
+    late = correction(node, np.array([1.0, -2.0, 0.5]), np.eye(3))
     again(node.control)
-    late = encode.pose_with_covariance(make, stamp, 'map', np.array([1.0, -2.0, 0.5]), np.eye(3))
-    node.control.correct(late)
-    later = dataclasses.replace(observation, stamp=stamp + SECOND)
-    frame = node.control.process(later)
-    np.testing.assert_array_equal(frame.T_map_base, frame.T_local_base)
-    node.control.correct(late)
-    frame = node.control.process(dataclasses.replace(observation, stamp=stamp + 2 * SECOND))
-    np.testing.assert_array_equal(frame.T_map_base, frame.T_local_base)
+    node.control.on_correction(late)
+    session = node.control.session
+    # not even where a frame of the new session has the same stamp
+    for later in (stamp + SECOND, stamp):
+        frame = session.process(dataclasses.replace(observation, stamp=later)).frame
+        np.testing.assert_array_equal(frame.T_map_base, frame.T_local_base)
+        node.control.on_correction(late)
 
 
 def start_at_five():

@@ -63,17 +63,18 @@ def test_carried_robot_is_lost_and_found_again(live, localizes):
     events = iter(Simulation(load_world('room'), P, seed=1))
     front.sensors.stop_waiting()
     talk = ('frames', 'deskewed_points', 'reflectors/associated')
-    heard = ('relocation', 'initialpose', 'correction', 'localization_grid', 'localization_map')
+    heard = ('session_start', 'graph_correction', 'localization_grid', 'localization_map')
     live.spin_until(
         lambda: (
             all(front.count_subscribers(topic) == 1 for topic in talk)
             and all(back.count_subscribers(topic) == 1 for topic in heard)
+            and front.control.session.mode
         )
     )
     frames, truth = drive(live, front, back, events, 20.0)
     if localizes:
-        back.mapper.worker.submit(lambda: back.mapper.localize(True)).result()
-        live.spin_until(lambda: front.control.map is not None and front.control.grid is not None)
+        back.mapper.worker.submit(lambda: back.requests.localize(True)).result()
+        live.spin_until(lambda: front.control.session.map is not None)
         frames = []
     more, told = drive(live, front, back, events, 40.0)
     t, levels, errors = judged([*frames, *more], truth | told)
@@ -83,4 +84,4 @@ def test_carried_robot_is_lost_and_found_again(live, localizes):
     assert back_at < 3.0
     # 20 ms at full speed lie between a frame and the next truth
     assert errors[(t < 0.0) | (t > back_at + 0.5)].max() < 0.08
-    assert front.control.map is None or localizes
+    assert front.control.session.map is None or localizes

@@ -18,12 +18,13 @@ from rlml_slam.errors import MapError
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Parameters
-from rlml_slam.ros.back_end import map_folder
 from rlml_slam.ros.back_end.last_pose import LastPose
 from rlml_slam.ros.back_end.map_folder import MapFolder
 from rlml_slam.ros.back_end.mapper import Mapper
-from rlml_slam.ros.codecs.frame_messages import Record
+from rlml_slam.ros.back_end.user_requests import UserRequests
 from rlml_slam.ros.codecs.reflector_clouds import read_reflector_map
+from rlml_slam.ros.codecs.request_message import read_request
+from rlml_slam.slam.conversation import SessionFrame
 from rlml_slam.slam.store import map_file
 from rlml_slam.types import Detections, Frame, Health, Level, Motion, Observation, Reflectors
 
@@ -65,12 +66,15 @@ def make(ear):
 
     def mapper(**node):
         p = Parameters()
-        made.append(Mapper(ear, dataclasses.replace(p, node=dataclasses.replace(p.node, **node))))
+        p = dataclasses.replace(p, node=dataclasses.replace(p.node, **node))
+        made.append(Mapper(ear, p))
+        made[-1].requests = UserRequests(made[-1], p, ear.get_logger())
+        made[-1].worker.submit(lambda: None).result()
         return made[-1]
 
     yield mapper
     for mapper in made:
-        mapper.worker.close()
+        mapper.close()
 
 
 @pytest.fixture
@@ -89,14 +93,25 @@ def add(mapper, k, pose=(0.0, 0.0, 0.0), odometry=ODOMETRY, session=1, **more):
     T = np.array(pose)
     none = np.zeros(0, dtype=np.int64)
     frame = Frame(stamp, observation, T, cov, T, cov, none, none)
-    mapper.add(Record(session, frame, False, False, **more))
+    mapper.add(SessionFrame(session, frame, mode=mode_of(mapper), **more))
     return stamp
 
 
+def mode_of(mapper):
+    """What a front end would carry out by now."""
+    return mapper.system.mode
+
+
+def searched(mapper):
+    """Wait for everything that a frame caused."""
+    for worker in (mapper.worker, mapper.searcher.worker, mapper.worker):
+        worker.submit(lambda: None).result()
+
+
 def give(mapper, k, **frame):
-    """The same, used and told before this returns."""
+    """The same, used and sent before this returns."""
     stamp = add(mapper, k, **frame)
-    mapper.worker.submit(lambda: None).result()
+    searched(mapper)
     mapper.send_transform()
     return stamp
 
@@ -133,7 +148,7 @@ def test_map_to_odom_waits_for_no_job_of_the_worker(mapper):
         assert mapper.transforms[-1][0] == stamp
     *_, T = mapper.transforms[-1]
     np.testing.assert_allclose(se2.compose(T, ODOMETRY), [0.2, 0.0, 0.0], atol=1e-12)
-    mapper.worker.submit(lambda: setattr(mapper.back_end, 'T_map_local', np.array([1.0, 0, 0])))
+    mapper.worker.submit(lambda: setattr(mapper.system, 'T_map_local', np.array([1.0, 0, 0])))
     busy.set()
     give(mapper, 3, pose=(0.3, 0.0, 0.0))
     *_, T = mapper.transforms[-1]
@@ -142,7 +157,7 @@ def test_map_to_odom_waits_for_no_job_of_the_worker(mapper):
 
 def test_correction_of_one_session_is_not_of_the_next(mapper):
     give(mapper, 0)
-    mapper.back_end.T_map_local = np.array([1.0, 0.0, 0.0])
+    mapper.system.T_map_local = np.array([1.0, 0.0, 0.0])
     busy = Event()
     mapper.worker.submit(busy.wait)
     add(mapper, 1, pose=(0.5, 0.0, 0.0), session=2)
@@ -156,7 +171,7 @@ def test_correction_that_moves_the_robot_is_told(mapper, ear):
     give(mapper, 0)
     give(mapper, 1)
     assert ear.sent['jumps'] == []
-    mapper.back_end.T_map_local = np.array([0.3, 0.0, 0.0])
+    mapper.system.T_map_local = np.array([0.3, 0.0, 0.0])
     stamp = give(mapper, 2)
     (jump,) = ear.sent['jumps']
     assert jump.header.frame_id == 'base_link'
@@ -169,7 +184,8 @@ def test_pause_stops_the_map_but_not_map_to_odom(mapper):
     add = mapper.back_end.add
     mapper.back_end.add = lambda frame: (used.append(frame.stamp), add(frame))[1]
     first = give(mapper, 0)
-    moved = give(mapper, 1, pose=(1.0, 0.0, 0.0), paused=True)
+    mapper.system.pause(True)
+    moved = give(mapper, 1, pose=(1.0, 0.0, 0.0))
     assert used == [first]
     stamp, _, T = mapper.transforms[-1]
     assert stamp == moved
@@ -177,7 +193,8 @@ def test_pause_stops_the_map_but_not_map_to_odom(mapper):
 
 
 def test_pause_before_the_first_frame_is_survived(mapper, ear):
-    give(mapper, 0, paused=True)
+    mapper.system.pause(True)
+    give(mapper, 0)
     mapper.publish_map()
     assert len(mapper.transforms) == 1
     assert deserialize_message(ear.sent['trajectory'][-1], Path).poses == []
@@ -198,24 +215,24 @@ def test_loaded_map_is_not_saved_but_a_new_one_after_it_is(make, tmp_path):
     folder.save('old', SavedMap(posts(3)))
     mapper = make(mode='localization', map_directory=str(tmp_path), map_file_name='old')
     with pytest.raises(MapError, match='nothing to save'):
-        mapper.save('new')
-    mapper.localize(False)
+        mapper.requests.save('new')
+    mapper.requests.localize(False)
     with pytest.raises(MapError, match='there is no map yet'):
-        mapper.save('new')
+        mapper.requests.save('new')
     mapper.back_end.reflectors = lambda: posts(5)
-    mapper.save('new')
+    mapper.requests.save('new')
     assert len(folder.load('new').reflectors) == 5
 
 
 def test_map_made_here_can_be_saved_while_it_is_localized_in(make, tmp_path):
     mapper = make(map_directory=str(tmp_path))
     mapper.back_end.reflectors = lambda: posts(5)
-    mapper.localize(True)
-    mapper.save('new')
+    mapper.requests.localize(True)
+    mapper.requests.save('new')
     assert len(MapFolder(str(tmp_path)).load('new').reflectors) == 5
-    mapper.load('new')
+    mapper.requests.load('new')
     with pytest.raises(MapError, match='nothing to save'):
-        mapper.save('again')
+        mapper.requests.save('again')
 
 
 def drives(mapper, ks, **more):
@@ -231,56 +248,64 @@ def lost(folder):
     }
 
 
-def test_maps_of_every_beginning_do_not_fill_the_disk(make, ear, tmp_path, monkeypatch):
-    monkeypatch.setattr(map_folder, 'LOST_KEPT', 2)
+def test_map_of_a_few_keyframes_is_not_kept(make, ear, tmp_path):
     mapper = make(map_directory=str(tmp_path))
     for session in range(1, 5):
-        drives(mapper, range(21 * session, 21 * session + 21), session=session)
-    give(mapper, 105, session=5)
-    assert list(lost(tmp_path)) == ['map.lost-10.rlml', 'map.lost-8.rlml']
-    assert any('an older one is removed' in told for told in ear.warnings)
+        drives(mapper, range(10 * session, 10 * session + 10), session=session)
+    assert lost(tmp_path) == {}
+
+
+def test_automatic_maps_displace_none_that_is_there(make, ear, tmp_path):
+    old = [tmp_path / f'map.lost-{k}.rlml' for k in range(20)]
+    for path in old:
+        path.write_bytes(b'x')
+    mapper = make(map_directory=str(tmp_path))
+    drives(mapper, range(60))
+    give(mapper, 61, session=2)
+    assert all(path.read_bytes() == b'x' for path in old)
+    assert len([*tmp_path.glob('*.lost-*')]) == 21
 
 
 def test_map_is_kept_when_the_front_end_begins_anew(make, ear, tmp_path):
     mapper = make(map_directory=str(tmp_path))
-    drives(mapper, range(21))
+    drives(mapper, range(60))
     keys = len(mapper.back_end.keyframes)
-    assert keys > 5
-    give(mapper, 21, session=2)
-    assert lost(tmp_path) == {'map.lost-2.rlml': keys}
-    assert ear.warnings[-1].startswith('the map until now is kept: ')
+    assert keys > 10
+    give(mapper, 61, session=2)
+    assert lost(tmp_path) == {'map.lost-5.rlml': keys}
+    assert ear.warnings[-1].find('the map until now is kept: ') > 0
     # nothing is in the new map, and what is in a file already is not kept twice
-    drives(mapper, range(22, 44), session=2)
+    drives(mapper, range(62, 120), session=2)
     mapper.back_end.reflectors = lambda: posts(5)
-    mapper.save('map')
-    give(mapper, 44, session=3)
+    mapper.requests.save('map')
+    give(mapper, 120, session=3)
     assert len(lost(tmp_path)) == 1
 
 
 def test_map_that_cannot_be_kept_does_not_stop_the_next_one(make, ear, tmp_path):
     (tmp_path / 'file').touch()
     mapper = make(map_directory=str(tmp_path / 'file'))
-    drives(mapper, range(21))
-    give(mapper, 21, session=2)
-    assert ear.warnings[-1].startswith('the map until now is lost: ')
+    drives(mapper, range(60))
+    give(mapper, 61, session=2)
+    assert ear.warnings[-1].find('the map until now is not kept: ') > 0
     assert len(mapper.back_end.keyframes) == 1
 
 
 def test_map_made_here_stays_whole_while_it_is_localized_in(make, ear, tmp_path):
     """The front end begins anew in it, and the graph can be saved all the same."""
     mapper = make(map_directory=str(tmp_path))
-    drives(mapper, range(21))
+    drives(mapper, range(60))
     keys, found = len(mapper.back_end.keyframes), mapper.back_end.reflectors
     mapper.back_end.reflectors = lambda: posts(5)
-    mapper.localize(True)
+    mapper.requests.localize(True)
     mapper.back_end.reflectors = found
-    drives(mapper, range(21, 30), session=2)
-    np.testing.assert_array_equal(mapper.back_end.T_map_local, np.zeros(3))
-    mapper.save('map')
+    drives(mapper, range(60, 70), session=2)
+    np.testing.assert_array_equal(mapper.system.T_map_local, np.zeros(3))
+    mapper.requests.save('map')
     assert len(map_file.load(tmp_path / 'map.rlml').arrays['pose']) == keys
     with pytest.raises(MapError, match='does not change'):
-        mapper.revoke('0')
-    mapper.localize(False)
+        mapper.requests.revoke('0')
+    mapper.requests.localize(False)
     assert mapper.back_end.keyframes == []
     assert lost(tmp_path) == {}  # it is in a file
 
@@ -302,10 +327,11 @@ def test_map_without_the_grid_that_cannot_be_drawn(make, ear, tmp_path):
     assert ear.sent['map'] == []
     assert len(read_reflector_map(ear.sent['reflector_map_points'][-1])) == 5
     assert mapper.current().grid is None
-    found, why = mapper.relocalize()
-    assert not found
-    assert why.startswith('not found: ')
-    assert 'no grid: map of 9 x 9 cells' in mapper.save('map')
+    answer = mapper.requests.relocalize()
+    searched(mapper)
+    assert not answer.result().success
+    assert answer.result().text.startswith('not found: ')
+    assert 'no grid: map of 9 x 9 cells' in mapper.requests.save('map')
     saved = MapFolder(str(tmp_path)).load('map')  # nothing of the older one
     assert (len(saved.reflectors), saved.grid) == (5, None)
     whole = map_file.saved_map(map_file.load(tmp_path / 'map.rlml'))
@@ -339,8 +365,9 @@ def sees(mapper, k, pose, level=Level.OK):
         stamp, observation, pose, cov, pose, cov, used, np.zeros(n, dtype=np.int64),
         Health(level, ()),
     )  # fmt: skip
-    mapper.add(Record(1, frame, False, False))
-    mapper.worker.submit(lambda: None).result()
+    mode = mode_of(mapper)
+    mapper.add(SessionFrame(1, frame, mode, mode))
+    searched(mapper)
 
 
 @pytest.fixture
@@ -355,7 +382,7 @@ def switched_off(make, tmp_path):
 
 
 def told(ear):
-    return [[m.pose.pose.position.x, m.pose.pose.position.y] for m in ear.sent['initialpose']]
+    return [read_request(m).pose[:2] for m in ear.sent['session_start']]
 
 
 def test_robot_starts_where_it_was_switched_off(make, ear, switched_off):
@@ -401,5 +428,5 @@ def test_survey_is_taken_from_the_map_directory_alone(ear, tmp_path):
             Mapper(ear, dataclasses.replace(p, node=node, back_end=back_end))
     back_end = dataclasses.replace(p.back_end, survey='plant.csv')
     mapper = Mapper(ear, dataclasses.replace(p, node=node, back_end=back_end))
-    mapper.worker.close()
+    mapper.close()
     np.testing.assert_array_equal(mapper.back_end.survey_frame.survey.points, [[1.0, 2.0]])

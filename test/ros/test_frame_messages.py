@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from rlml_slam.errors import InputError
-from rlml_slam.motion import compose_motion
 from rlml_slam.ros.codecs import encode
-from rlml_slam.ros.codecs.belief_message import StampedBelief, build_belief, read_belief
+from rlml_slam.ros.codecs.correction_message import build_correction, read_correction
 from rlml_slam.ros.codecs.frame_messages import (
     MAX_BEHIND,
     FrameAssembler,
@@ -27,6 +26,8 @@ from rlml_slam.ros.codecs.reflector_clouds import (
     read_associated,
     read_reflector_map,
 )
+from rlml_slam.ros.codecs.request_message import build_request, read_request
+from rlml_slam.slam.conversation import Correct, Relocate, SessionFrame, StartSession
 from rlml_slam.types import (
     Belief,
     Detections,
@@ -81,7 +82,9 @@ def send(join, frame, session=1, parts='pdr'):
             msg = build_associated(make_bag, frame, 'base_link')
             out += join.add_associated(read_associated(msg))
         else:
-            out += join.add_record(read_record(build_record(make_bag, frame, session, 'local')))
+            out += join.add_record(
+                read_record(build_record(make_bag, SessionFrame(session, frame, 8, 9), 'local'))
+            )
     return out
 
 
@@ -102,13 +105,13 @@ def assert_equal(got, want, exact, path=''):
 def test_every_field_of_a_frame_travels():
     want = a_frame()
     (record,) = send(FrameAssembler(), want, session=7)
-    assert record.session == 7
+    assert (record.session, record.request, record.mode) == (7, 8, 9)
     assert_equal(record.frame, want, exact=False)
 
 
 def test_figures_travel_exactly():
     want = a_frame()
-    got = read_record(build_record(make_bag, want, 1, 'local')).frame
+    got = read_record(build_record(make_bag, SessionFrame(1, want), 'local')).of.frame
     for name in ('T_local_base', 'cov_local', 'T_map_base', 'cov_map', 'scan_score'):
         assert_equal(getattr(got, name), getattr(want, name), exact=True)
     assert_equal(got.observation.motion, want.observation.motion, exact=True)
@@ -150,22 +153,6 @@ def test_lost_part_costs_only_itself():
     assert len(out[0].frame.observation.detections) == 3
 
 
-def test_pause_marks_frames_and_keeps_their_motion():
-    join = FrameAssembler()
-    join.paused = True
-    first, second, third = (a_frame((k + 1) * SECOND, k) for k in range(3))
-    paused = send(join, first) + send(join, second)
-    assert [(r.paused, r.frame.stamp) for r in paused] == [(True, SECOND), (True, 2 * SECOND)]
-    np.testing.assert_array_equal(paused[1].frame.T_local_base, second.T_local_base)
-    join.paused = False
-    (record,) = send(join, third)
-    assert not record.paused
-    a, b, c = (f.observation.motion for f in (first, second, third))
-    want = compose_motion(compose_motion(a, b), c)
-    np.testing.assert_allclose(record.frame.observation.motion.delta, want.delta, atol=1e-12)
-    np.testing.assert_allclose(record.frame.observation.motion.cov, want.cov, rtol=1e-12)
-
-
 def test_other_clouds_are_refused():
     msg = build_points(make_bag, SECOND, 'base_link', np.zeros((1, 2)))
     with pytest.raises(InputError, match='frames: not one frame'):
@@ -177,7 +164,7 @@ def test_other_clouds_are_refused():
 def test_pose_that_is_not_finite_is_refused():
     frame = dataclasses.replace(a_frame(), T_local_base=np.array([np.nan, 0, 0]))
     with pytest.raises(InputError, match='frames: the pose is not finite'):
-        read_record(build_record(make_bag, frame, 1, 'local'))
+        read_record(build_record(make_bag, SessionFrame(1, frame), 'local'))
 
 
 def test_reflector_map_travels():
@@ -196,7 +183,7 @@ def test_statuses_are_those_of_the_enumeration():
 
 
 def test_header_of_the_clouds_is_the_frame():
-    msg = build_record(make_bag, a_frame(), 1, 'local')
+    msg = build_record(make_bag, SessionFrame(1, a_frame()), 'local')
     assert msg.header == encode.header(make_bag, SECOND, 'local')
 
 
@@ -211,16 +198,38 @@ def test_belief_travels_exactly():
         {3: 2, 9: 5},
         (4, 9),
     )
-    want = StampedBelief(SECOND, 12345, rng.normal(size=3), belief)
-    assert_equal(read_belief(build_belief(make_bag, want, 'map')), want, exact=True)
+    want = Correct(12345, SECOND, rng.normal(size=3), A[:3, :3] @ A[:3, :3].T, (6, 1), belief)
+    assert_equal(read_correction(build_correction(make_bag, want, 'map')), want, exact=True)
     bare = Belief(np.zeros(3), np.zeros(0, np.int64), np.zeros((0, 2)), np.eye(3), {})
-    got = read_belief(build_belief(make_bag, StampedBelief(1, 1, np.zeros(3), bare), 'map'))
-    assert_equal(got.belief, bare, exact=True)
+    for want in (
+        Correct(1, 1, np.zeros(3), None, (), bare),
+        Correct(1, 1, np.zeros(3), np.eye(3)),
+        Correct(1, 1, None, removed=(4,)),
+        Correct(1, 1, None),
+    ):
+        got = read_correction(build_correction(make_bag, want, 'map'))
+        assert_equal(got, want, exact=True)
 
 
 def test_belief_that_contradicts_itself_is_refused():
     belief = Belief(np.zeros(3), np.array([1]), np.zeros((1, 2)), np.eye(5), {})
-    msg = build_belief(make_bag, StampedBelief(1, 1, np.zeros(3), belief), 'map')
-    msg.width -= 4  # the last landmark row and the correction
-    with pytest.raises(InputError, match='belief: 4 values do not fit'):
-        read_belief(msg)
+    msg = build_correction(make_bag, Correct(1, 1, np.zeros(3), None, (), belief), 'map')
+    msg.width -= 1  # the last landmark row
+    with pytest.raises(InputError, match='graph_correction: 4 values do not fit'):
+        read_correction(msg)
+
+
+@pytest.mark.parametrize('kind', [StartSession, Relocate])
+def test_request_travels_exactly(kind):
+    rng = np.random.default_rng(0)
+    more = (17,) if kind is StartSession else ()
+    want = kind(
+        2_000_000_000, 2**32 - 1, SECOND, rng.normal(size=3), rng.normal(size=(3, 3)), *more
+    )
+    assert_equal(read_request(build_request(make_bag, want, 'map')), want, exact=True)
+
+
+def test_request_that_is_not_finite_is_refused():
+    msg = build_request(make_bag, Relocate(2, 1, 1, np.full(3, np.nan), np.eye(3)), 'map')
+    with pytest.raises(InputError, match='not finite'):
+        read_request(msg)

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from rlml_slam.errors import FileFormatError
-from rlml_slam.ros.back_end.last_pose import NEAR, PERIOD, LastPose, verified
+from rlml_slam.ros.back_end.last_pose import PERIOD, LastPose
+from rlml_slam.slam.relocalization.pose_test import NEAR, verified
 from rlml_slam.slam.relocalization.scan_relocalization import Relocation
 from rlml_slam.types import Frame, Health, Level, Motion, Observation, Verdict
 

@@ -134,7 +134,7 @@ class Recorder(Node):
 
     def on_frame(self, msg: PointCloud2) -> None:
         """What the front end says of one pose: its level of health, and its cost."""
-        frame = read_record(msg).frame
+        frame = read_record(msg).of.frame
         self._answers[frame.stamp] = (frame.health.level, frame.wall_ms)
 
     def on_associated(self, msg: PointCloud2) -> None:

@@ -11,8 +11,9 @@ from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.maps.survey import Survey
 from rlml_slam.slam.store import map_file
 
-LOST = '.lost-'
-LOST_KEPT = 10  # maps: a robot that begins anew every day must not fill its disk
+LOST = '.lost-'  # in the name of a map that was written without a user's request
+LOST_AGE = 30 * 86400.0  # [s] after which such a file is removed
+LOST_BYTES = 1_000_000_000  # of such files: where there are more, no other one is written
 SUFFIXES = ('.rlml', '.yaml', '.csv', '.pgm')
 
 
@@ -69,25 +70,35 @@ class MapFolder:
         return path.with_name(path.name + '.rlml')
 
     def lost(self, name: str, seconds: int) -> Path:
-        """The path of a map that nothing leads back to, made until a time."""
-        return self.whole(f'{name}{LOST}{seconds}')
+        """The path for a map that is about to go, made until a time [s]; no file has it yet."""
+        path, k = self.whole(f'{name}{LOST}{seconds}'), 1
+        while path.exists():
+            k += 1
+            path = self.whole(f'{name}{LOST}{seconds}-{k}')
+        return path
 
-    def forget_lost(self, name: str) -> list[Path]:
-        """Remove all but the newest LOST_KEPT of these; those that were removed, oldest first.
+    def make_room_for_lost(self, name: str, now: float) -> list[Path]:
+        """Remove files of :meth:`lost` that are older than LOST_AGE at a time [s]; which.
 
-        Raises MapError where one cannot be.
+        No other file is ever removed. Raises MapError where the younger ones fill LOST_BYTES.
         """
         path = self.path(name)
         begin = path.name + LOST
         try:
-            lost = [file for file in path.parent.glob('*.rlml') if file.name.startswith(begin)]
-            lost.sort(key=lambda file: (file.stat().st_mtime_ns, file.name))
-            for file in lost[:-LOST_KEPT]:
+            files = [file for file in path.parent.glob('*.rlml') if file.name.startswith(begin)]
+            old = [file for file in files if now - file.stat().st_mtime > LOST_AGE]
+            for file in old:
                 file.unlink()
                 file.with_name(file.name + map_container.PREVIOUS).unlink(missing_ok=True)
+            size = sum(file.stat().st_size for file in files if file not in old)
         except OSError as e:
-            raise MapError(f'{begin}…: an old one cannot be removed: {e.strerror}') from e
-        return lost[:-LOST_KEPT]
+            raise MapError(f'{begin}…: {e.filename}: {e.strerror}') from e
+        if size > LOST_BYTES:
+            raise MapError(
+                f'{path.parent}: {begin}… have {size / 1e6:.0f} MB; remove those that are not '
+                f'needed, so that others can be kept'
+            )
+        return sorted(old)
 
     def load(self, name: str) -> SavedMap:
         """Read name.rlml where it is there, else name.csv and name.yaml; a suffix says which.

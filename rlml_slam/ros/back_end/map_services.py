@@ -3,37 +3,41 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from diagnostic_msgs.srv import AddDiagnostics
 from nav_msgs.srv import GetMap, LoadMap
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.task import Future
 from std_srvs.srv import Empty, SetBool, Trigger
 
-from rlml_slam.errors import NoMapError, RlmlError
+from rlml_slam.errors import MapError, NoMapError, RlmlError
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Parameters
 from rlml_slam.ros.back_end.mapper import Mapper
+from rlml_slam.ros.back_end.user_requests import UserRequests
 from rlml_slam.ros.codecs import encode
-from rlml_slam.ros.codecs.frame_messages import FrameAssembler
 from rlml_slam.ros.codecs.message_types import make_rclpy
 from rlml_slam.slam.closures.closure_table import closure_table
 from rlml_slam.slam.landmarks.reflector_states import state_table
 
 
 class MapServices:
-    """Answers in the mapper's thread, between two frames, so that no subscription waits."""
+    """Answers in the mapper's thread, between two frames, so that no subscription waits.
+
+    ``refused`` is the newest request that was refused, and why.
+    """
 
     def __init__(
-        self, node: Any, params: Parameters, mapper: Mapper, join: FrameAssembler
+        self, node: Any, params: Parameters, mapper: Mapper, requests: UserRequests
     ) -> None:
         self._node = node
         self._p = params
         self._mapper = mapper
-        self._join = join
+        self._requests = requests
+        self.refused = ''
         # in the node's group, every subscription would wait for the answer
         own = MutuallyExclusiveCallbackGroup()
         for kind, name, answer in (
@@ -56,10 +60,18 @@ class MapServices:
             executor = self._node.executor
             done = Future(executor=executor)
 
-            def finish(_: Any) -> None:
+            def end(_: Any) -> None:
                 done.set_result(None)
                 # an executor that waits for messages does not see what became of a future
                 executor.wake()
+
+            def finish(job: concurrent.futures.Future[Any]) -> None:
+                failed = job.cancelled() or job.exception() is not None
+                later = None if failed else job.result()
+                if isinstance(later, concurrent.futures.Future):
+                    later.add_done_callback(end)
+                else:
+                    end(job)
 
             self._mapper.worker.submit(lambda: answer(request, response)).add_done_callback(finish)
             await done
@@ -69,16 +81,12 @@ class MapServices:
 
     def save_map(self, _request: Any, response: Any) -> None:
         """Write the map under map_file_name."""
-        self._try(response, lambda: self._mapper.save(self._p.node.map_file_name))
+        save = self._requests.save
+        self._try('save_map', response, lambda: save(self._p.node.map_file_name))
 
     def reset(self, _request: Any, response: Any) -> None:
         """Forget the map and begin at map_start_pose; the front end does as well."""
-        self._mapper.start_at(np.array(self._p.node.map_start_pose))
-        localizes = self._mapper.saved is not None
-        response.success = True
-        response.message = (
-            'begins at map_start_pose in the same map' if localizes else 'the map begins anew'
-        )
+        self._try('reset', response, self._requests.reset)
 
     def closures(self, _request: Any, response: Any) -> None:
         """All loop closures with their records, as a table of comma-separated values."""
@@ -92,27 +100,43 @@ class MapServices:
 
     def revoke_closure(self, request: Any, response: Any) -> None:
         """Take a loop closure out of the map; load_namespace is its number."""
-        self._try(response, lambda: self._mapper.revoke(request.load_namespace))
+        revoke = self._requests.revoke
+        self._try('revoke_closure', response, lambda: revoke(request.load_namespace))
 
     def pause(self, request: Any, response: Any) -> None:
         """Leave new measurements out of the map, or take them in again."""
-        self._join.paused = bool(request.data)
+        self._mapper.system.pause(bool(request.data))
         response.success = True
         response.message = 'paused' if request.data else 'measurements are used again'
 
-    def relocalize(self, _request: Any, response: Any) -> None:
+    def relocalize(self, _request: Any, response: Any) -> Any:
         """Find the newest scan anywhere in the map; while localizing, go on from there."""
-        response.success, response.message = self._mapper.relocalize()
 
-    def reinitialize(self, _request: Any, _response: Any) -> None:
+        def tell(answer: Any) -> None:
+            response.success, response.message = answer.result().success, answer.result().text
+
+        return self._relocalize(tell)
+
+    def reinitialize(self, _request: Any, _response: Any) -> Any:
         """The same for those who ask without wanting an answer: it goes to the log."""
-        found, message = self._mapper.relocalize()
         logger = self._node.get_logger()
-        (logger.info if found else logger.warning)(f'reinitialize_global_localization: {message}')
+
+        def log(answer: Any) -> None:
+            found = answer.result()
+            report = logger.info if found.success else logger.warning
+            report(f'reinitialize_global_localization: {found.text}')
+
+        return self._relocalize(log)
+
+    def _relocalize(self, take: Callable[[Any], None]) -> Any:
+        answer = self._requests.relocalize()
+        answer.add_done_callback(take)
+        return answer
 
     def set_localization_mode(self, request: Any, response: Any) -> None:
         """Localise in the map as it is now, or begin a new one."""
-        self._try(response, lambda: self._mapper.localize(bool(request.data)))
+        localize = self._requests.localize
+        self._try('set_localization_mode', response, lambda: localize(bool(request.data)))
 
     def dynamic_map(self, _request: Any, response: Any) -> None:
         """The grid as it is now."""
@@ -123,8 +147,11 @@ class MapServices:
     def load_map(self, request: Any, response: Any) -> None:
         """Localise in another map of map_directory; map_url is its name."""
         try:
-            saved = self._mapper.load(request.map_url or self._p.node.map_file_name)
+            if not request.map_url:
+                raise MapError('map_url is empty: it has to be the name of a map')
+            saved = self._requests.load(request.map_url)
         except RlmlError as e:
+            self.refused = f'load_map: {e}'
             refuse_map(self._node, response, e)
             return
         response.result = LoadMap.Response.RESULT_SUCCESS
@@ -134,13 +161,13 @@ class MapServices:
     def _message(self, grid: OccupancyGrid) -> Any:
         return encode.occupancy_grid(make_rclpy, self._mapper.stamp, self._p.node.map_frame, grid)
 
-    @staticmethod
-    def _try(response: Any, act: Callable[[], str]) -> None:
+    def _try(self, service: str, response: Any, act: Callable[[], str]) -> None:
         try:
             response.message = act()
             response.success = True
         except RlmlError as e:
             response.success, response.message = False, str(e)
+            self.refused = f'{service}: {e}'
 
 
 def refuse_map(node: Any, response: Any, why: RlmlError) -> None:

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from rlml_slam.errors import InputError
-from rlml_slam.motion import compose_motion
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.decode import stamp
 from rlml_slam.ros.codecs.message_types import Make
 from rlml_slam.ros.codecs.point_cloud import build_cloud, read_cloud
 from rlml_slam.ros.codecs.reflector_clouds import Associated
 from rlml_slam.se2 import Array
+from rlml_slam.slam.conversation import SessionFrame
 from rlml_slam.types import Frame, Health, Level, Motion, Observation
 
 MAX_BEHIND = 20  # frames that may overtake one whose points or detections are still on their way
@@ -30,7 +30,8 @@ MAX_BEHIND = 20  # frames that may overtake one whose points or detections are s
 RECORD = np.dtype(
     [
         ('x', '<f4'), ('y', '<f4'), ('z', '<f4'),
-        ('session', '<u4'), ('has_points', 'u1'), ('has_detections', 'u1'),
+        ('session', '<u4'), ('request', '<u4'), ('mode', '<u4'),
+        ('has_points', 'u1'), ('has_detections', 'u1'),
         ('T_local_base', '<f8', (3,)), ('cov_local', '<f8', (9,)),
         ('T_map_base', '<f8', (3,)), ('cov_map', '<f8', (9,)),
         ('odom_pose', '<f8', (3,)), ('origin', '<f8', (2,)),
@@ -49,25 +50,20 @@ _MOTION = ('delta', 'cov', 'known', 'bias_gain', 'bias', 'bias_var')
 
 @dataclass(frozen=True)
 class Record:
-    """A frame without its points and detections, and which of the two it has.
+    """A frame without its points and detections, and which of the two it has."""
 
-    ``session`` is another one when the front end began anew: so did its local frame. A frame that
-    is ``paused`` tells where the robot is, and nothing of the map.
-    """
-
-    session: int
-    frame: Frame
+    of: SessionFrame
     has_points: bool
     has_detections: bool
-    paused: bool = False
 
 
-def build_record(make: Make, frame: Frame, session: int, local_frame: str) -> Any:
+def build_record(make: Make, record: SessionFrame, local_frame: str) -> Any:
     """PointCloud2 of one point with every figure of the frame."""
+    frame = record.frame
     observation = frame.observation
     r = np.zeros(1, dtype=RECORD)
     r['x'], r['y'] = frame.T_local_base[:2]
-    r['session'] = session
+    r['session'], r['request'], r['mode'] = record.session, record.request, record.mode
     r['has_points'] = observation.points is not None
     r['has_detections'] = observation.detections is not None
     r['odom_pose'] = np.nan if observation.odom_pose is None else observation.odom_pose
@@ -122,7 +118,8 @@ def read_record(msg: Any, topic: str = 'frames') -> Record:
     )
     if not (np.isfinite(frame.T_local_base).all() and np.isfinite(frame.cov_local).all()):
         raise InputError(f'{topic}: the pose is not finite')
-    return Record(int(r['session']), frame, bool(r['has_points']), bool(r['has_detections']))
+    of = SessionFrame(int(r['session']), frame, int(r['request']), int(r['mode']))
+    return Record(of, bool(r['has_points']), bool(r['has_detections']))
 
 
 def build_points(make: Make, time: int, base_frame: str, points: Array) -> Any:
@@ -141,7 +138,6 @@ def read_points(msg: Any, topic: str = 'deskewed_points') -> Array:
 class FrameAssembler:
     """Records, points and detections of one stamp become frames again, in the records' order.
 
-    While ``paused``, so are the frames, and their motion is added to that of the next one.
     ``incomplete`` counts frames whose points or detections did not come.
     """
 
@@ -149,29 +145,27 @@ class FrameAssembler:
         self._records: deque[Record] = deque()
         self._points: dict[int, Array] = {}
         self._associated: dict[int, Associated] = {}
-        self._pending: Motion | None = None
-        self.paused = False
         self.incomplete = 0
 
-    def add_points(self, time: int, points: Array) -> list[Record]:
+    def add_points(self, time: int, points: Array) -> list[SessionFrame]:
         """End points of a scan."""
         self._points[time] = points
         return self._complete()
 
-    def add_associated(self, associated: Associated) -> list[Record]:
+    def add_associated(self, associated: Associated) -> list[SessionFrame]:
         """Detections with their landmarks."""
         self._associated[associated.detections.stamp] = associated
         return self._complete()
 
-    def add_record(self, record: Record) -> list[Record]:
+    def add_record(self, record: Record) -> list[SessionFrame]:
         """A frame without its points and detections; returns records whose frames are whole."""
         self._records.append(record)
         return self._complete()
 
-    def _complete(self) -> list[Record]:
+    def _complete(self) -> list[SessionFrame]:
         out = []
         while self._records:
-            head, time = self._records[0], self._records[0].frame.stamp
+            head, time = self._records[0], self._records[0].of.frame.stamp
             whole = (not head.has_points or time in self._points) and (
                 not head.has_detections or time in self._associated
             )
@@ -179,26 +173,10 @@ class FrameAssembler:
                 break
             self.incomplete += not whole
             self._records.popleft()
-            frame = self._whole(head.frame, self._points.get(time), self._associated.get(time))
+            points, seen = self._points.get(time), self._associated.get(time)
             self._forget(time)
-            paused = self.paused  # once: a service sets it in a thread of its own
-            self._pending = frame.observation.motion if paused else None
-            out.append(replace(head, frame=frame, paused=paused))
+            out.append(replace(head.of, frame=_whole(head.of.frame, points, seen)))
         return out
-
-    def _whole(self, frame: Frame, points: Array | None, seen: Associated | None) -> Frame:
-        motion = frame.observation.motion
-        observation = replace(
-            frame.observation,
-            motion=motion if self._pending is None else compose_motion(self._pending, motion),
-            points=points,
-            detections=None if seen is None else seen.detections,
-        )
-        if seen is None:
-            return replace(frame, observation=observation)
-        return replace(
-            frame, observation=observation, landmarks=seen.landmarks, statuses=seen.statuses
-        )
 
     def _forget(self, time: int) -> None:
         """What belongs to this frame or an earlier one; later stamps may be another session's."""
@@ -206,3 +184,13 @@ class FrameAssembler:
         for of in parts:
             for old in [t for t in of if t <= time]:
                 del of[old]
+
+
+def _whole(frame: Frame, points: Array | None, seen: Associated | None) -> Frame:
+    detections = None if seen is None else seen.detections
+    observation = replace(frame.observation, points=points, detections=detections)
+    if seen is None:
+        return replace(frame, observation=observation)
+    return replace(
+        frame, observation=observation, landmarks=seen.landmarks, statuses=seen.statuses
+    )

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from rlml_slam.ros.codecs.markers import detection_markers
 from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
 from rlml_slam.ros.codecs.reflector_clouds import build_associated
 from rlml_slam.se2 import Array
+from rlml_slam.slam.conversation import SessionFrame
 from rlml_slam.types import Detections, Frame
 
 CLOUD = 'sensor_msgs/msg/PointCloud2'
@@ -31,7 +31,7 @@ SHORT = 0.005  # [s] steps of several lidars: too short to tell a speed
 
 
 class FramePublisher:
-    """Publishes frames; ``begin_session`` tells the back end that the local frame is a new one."""
+    """Publishes frames, those of the back end and of viewers only where somebody subscribes."""
 
     def __init__(self, node: Any, params: Node) -> None:
         self._p = params
@@ -42,14 +42,14 @@ class FramePublisher:
         self.begin_session()
 
     def begin_session(self) -> None:
-        """From now on, the local frame is another one; no two processes share a number."""
-        self.session = time.time_ns() // 1000 % 2**32
+        """From now on, the local frame is another one."""
         self._last: Frame | None = None
         self._twisted = (np.zeros(3), np.zeros((3, 3)))
 
-    def publish(self, frame: Frame) -> None:
+    def publish(self, record: SessionFrame) -> None:
         """Send everything of one frame, stamped as the frame."""
-        p, observation, make = self._p, frame.observation, make_rclpy
+        p, frame, make = self._p, record.frame, make_rclpy
+        observation = frame.observation
         self._publishers['pose'].publish(
             encode.pose_with_covariance(
                 make, frame.stamp, p.map_frame, frame.T_map_base, frame.cov_map
@@ -62,22 +62,25 @@ class FramePublisher:
                 make, frame.stamp, frames, frame.T_local_base, frame.cov_local, twist, twist_cov
             )
         )
-        if observation.points is not None:
+        if observation.points is not None and self._is_heard('deskewed_points'):
             points = build_points(make, frame.stamp, p.base_frame, observation.points)
             self._publishers['deskewed_points'].publish(points)
         if observation.detections is not None:
-            associated = build_associated(make, frame, p.base_frame)
-            self._publishers['reflectors/associated'].publish(associated)
+            if self._is_heard('reflectors/associated'):
+                associated = build_associated(make, frame, p.base_frame)
+                self._publishers['reflectors/associated'].publish(associated)
             self._show_statuses(frame, observation.detections)
-        record = build_record(make, frame, self.session, p.local_frame)
-        self._publishers['frames'].publish(record)
+        if self._is_heard('frames'):
+            self._publishers['frames'].publish(build_record(make, record, p.local_frame))
         self._last = frame
+
+    def _is_heard(self, topic: str) -> bool:
+        return bool(self._publishers[topic].get_subscription_count() > 0)
 
     def _show_statuses(self, frame: Frame, detections: Detections) -> None:
         """The detections in colour, where somebody looks at them."""
-        publisher = self._publishers['reflectors/statuses']
-        if publisher.get_subscription_count() > 0:
-            publisher.publish(
+        if self._is_heard('reflectors/statuses'):
+            self._publishers['reflectors/statuses'].publish(
                 detection_markers(
                     make_rclpy, frame.stamp, self._p.base_frame, detections.points, frame.statuses
                 )

@@ -5,98 +5,122 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.maps.map_container import Content
 from rlml_slam.maps.occupancy import OccupancyGrid
-from rlml_slam.maps.saved_map import SavedMap
+from rlml_slam.maps.saved_map import SavedMap, require_contents
 from rlml_slam.maps.survey import Survey
+from rlml_slam.motion import STILL
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.synchronization.synchronized_system import SynchronizedSystem
+from rlml_slam.slam import conversation as say
 from rlml_slam.slam.back_end.back_end import BackEnd, Update
 from rlml_slam.slam.front_end.front_end import FrontEnd
+from rlml_slam.slam.front_end_session import FrontEndSession, is_lost
 from rlml_slam.slam.offline.back_end_process import BackEndProcess
 from rlml_slam.slam.offline.batch_reassociation import BatchReassociation
-from rlml_slam.slam.relocalization.global_localization import localize_globally
-from rlml_slam.slam.relocalization.recovery import Recovery
+from rlml_slam.slam.relocalization.pose_test import locate
+from rlml_slam.slam.relocalization.scan_relocalization import Relocation
 from rlml_slam.slam.store import map_file
-from rlml_slam.types import (
-    Frame,
-    Level,
-    Observation,
-    Reflectors,
-    Verdict,
-)
+from rlml_slam.slam.system import System
+from rlml_slam.types import Frame, Observation, Reflectors
 
 AHEAD = 1000  # frames that the front end may be ahead of the back end
 
 
 class Slam(SynchronizedSystem):
-    """Synchronizer, front end and back end.
+    """Synchronizer, front end and back end, with the conductor's commands executed at once.
 
     With ``parallel`` the back end works in a process of its own, up to AHEAD frames behind, and
     frames come later by as many; they are the same to the last bit. The front end's local frame
-    depends on nothing that the back end says, as long as there are no reflectors and the robot is
-    not lost: with the first reflector both take turns for good, and at a lost frame once. The
-    front end's times in milliseconds are then those of the processor, without the waits for one
-    another, as the back end's are in any case.
+    does not depend on the back end, as long as there are no reflectors and the robot is not lost:
+    with the first reflector both take turns for good, and at a lost frame once. The front end's
+    times in milliseconds are then those of the processor, without the waits for one another, as
+    the back end's are in any case.
+
+    Answers of searches come ``search_delay`` [s] of stamps late, as they do on a robot.
     """
 
     def __init__(
-        self, params: Parameters, parallel: bool = False, survey: Survey | None = None
+        self,
+        params: Parameters,
+        parallel: bool = False,
+        survey: Survey | None = None,
+        search_delay: float = 0.0,
     ) -> None:
         super().__init__(params)
-        self.front_end = FrontEnd(params)
+        self.session = FrontEndSession(params)
         self.back_end = BackEnd(params, survey)
-        self.recovery = Recovery(params)
+        self.system = System(params)
         self.batch_reassociation = BatchReassociation(params)
         if survey is not None:  # its frame is not that of the start
             self.batch_reassociation.close()
         self.updates: list[Update] = []
-        self._params = params
-        self._saved: SavedMap | None = None
-        self._begin_in: SavedMap | None = None
+        self.answers: dict[int, say.Answer] = {}
+        self._params, self._survey = params, survey
         self._path: list[tuple[int, Array]] = []
         self._parallel = parallel
         self._apart: BackEndProcess | None = None
-        self._pending: deque[tuple[Frame, float, Array]] = deque()
+        self._pending: deque[tuple[say.MapFrame, float, Array]] = deque()
+        self._loaded: BackEnd | None = None
+        self._delay = int(search_delay * 1e9)
+        self._late: deque[tuple[int, int, Relocation]] = deque()
+        self._out: list[Frame] = []
+        self._observation: Observation | None = None
+        self._newest: Frame | None = None  # None once it waits for the back end
+        self._spent = 0.0
+        front_end = self._command_front_end
+        self._executes: Mapping[type, Callable[[Any], None]] = {
+            say.StartSession: self._start_session,
+            say.Relocate: front_end,
+            say.Correct: front_end,
+            say.LocalizeIn: front_end,
+            say.MapFrame: self._map_frame,
+            say.Search: self._search,
+            say.DrawMap: self._draw_map,
+            say.TakeMap: self._take_map,
+            say.ForgetMap: self._forget_map,
+            say.Answer: self._answer,
+        }
+
+    @property
+    def front_end(self) -> FrontEnd:
+        """The estimator of now; another one where a map is entered or left."""
+        return self.session.front_end
+
+    # --- maps ----------------------------------------------------------------------------------
 
     def use_map(self, saved: SavedMap) -> None:
         """Localise in a map that never changes, instead of making one."""
-        self._saved = saved
-        self.front_end.use_map(saved.reflectors, saved.grid)
+        self.batch_reassociation.close()
+        self.execute(self.system.localize_in(saved))
 
     def continue_map(self, content: Content) -> None:
-        """Go on with a map that was saved: the first frame looks for its place in it.
+        """Go on with a map that was saved, as soon as the robot's place in it is known.
 
-        Where that is not told, it is taken to be at ``map_start_pose``. Raises FileFormatError if
-        the parts of the map do not fit together.
+        Raises FileFormatError if the parts of the map do not fit together; then all is as it was.
         """
+        self._take_turns()
+        loaded = BackEnd(self._params, self._survey)
+        map_file.restore(content, loaded)
+        self._loaded = loaded
         self.batch_reassociation.close()  # the map knows what this run does not
-        map_file.restore(content, self.back_end)
-        self._begin_in = map_file.saved_map(content)
-
-    def _enter(self, observation: Observation) -> None:
-        """Begin where an observation was made in the map to go on with."""
-        assert self._begin_in is not None
-        found = localize_globally(
-            self._begin_in.grid, self._begin_in.reflectors, observation, self._params
-        )
-        if found.verdict is Verdict.UNIQUE and found.pose is not None and found.cov is not None:
-            self.front_end.reset(found.pose, found.cov)
-        # keys of the front end and of the map must not mean different reflectors
-        self.front_end.tracks.next_key = self.back_end.reflector_graph.next_key
-        self._begin_in = None
+        first_key = loaded.reflector_graph.next_key
+        self.execute(self.system.continue_map(map_file.saved_map(content), first_key))
 
     def finish(self) -> list[Frame]:
         """Everything that still waits; then the last optimisation."""
-        frames = self.process(self.synchronizer.flush()) + self._take_turns()
-        if self._saved is None:
+        frames = self.process(self.synchronizer.flush())
+        self._take_turns()
+        frames += self._taken()
+        if self.system.map is None and self.system.entry is None:
             self.back_end.finish()
             self._look_back()
         return frames
@@ -114,100 +138,160 @@ class Slam(SynchronizedSystem):
             self.back_end.finish()
             self.back_end.associations_are_final = False
 
-    def process(self, observations: Iterable[Observation]) -> list[Frame]:
-        """What the sequencer made of the inputs."""
-        frames = []
-        for observation in observations:
-            if self._saved is not None or observation.detections:
-                frames += self._take_turns()
-            began = time.thread_time()
-            enters = self._begin_in is not None
-            if enters:
-                self._enter(observation)
-            frame = self.front_end.process(observation)
-            if enters:  # no motion leads here from where the map was left
-                frame = replace(frame, jumped=True)
-            self.batch_reassociation.add(observation, frame)
-            if self._saved is not None:
-                self._path.append((frame.stamp, frame.T_map_base))
-                frames.append(frame)
-            elif self._parallel:
-                spent = 1e3 * (time.thread_time() - began)
-                self._apart = self._apart or BackEndProcess(self.back_end, _add)
-                self._apart.add(frame)
-                late = self.front_end.late(observation.stamp_sigma)
-                self._pending.append((frame, spent, frame.cov_local + late))
-                is_lost = frame.health.level is Level.LOST or frame.unconfirmed
-                frames += self._settle(0 if is_lost else AHEAD)
-            else:
-                if self._take_over(_add(self.back_end, frame)):
-                    self._believe()
-                frames.append(frame)
-            found = self.recovery.look(frame, self.map, self._saved is not None)
-            if found is not None and found.pose is not None and found.cov is not None:
-                self.front_end.relocate(found.pose, found.cov)
-        return frames
+    # --- frames --------------------------------------------------------------------------------
 
-    def _take_turns(self) -> list[Frame]:
-        """End the back end's process, if there is one; the frames that waited for it."""
-        frames = self._settle(0)
+    def process(self, observations: Iterable[Observation]) -> list[Frame]:
+        """What the synchronizer made of the inputs."""
+        for observation in observations:
+            if self.system.map is not None or observation.detections:
+                self._take_turns()
+            self._deliver_late(observation.stamp)
+            began = time.thread_time()
+            self._observation = observation
+            record = self.session.process(observation)
+            self._spent = 1e3 * (time.thread_time() - began)
+            self.batch_reassociation.add(observation, record.frame)
+            self._give(record)
+            if self._newest is not None:
+                if self.system.map is not None:
+                    self._path.append((self._newest.stamp, self._newest.T_map_base))
+                self._out.append(self._newest)
+        return self._taken()
+
+    def _taken(self) -> list[Frame]:
+        out, self._out = self._out, []
+        return out
+
+    def _give(self, record: say.SessionFrame) -> None:
+        self._newest = record.frame
+        self.execute(self.system.on_frame(record))
+
+    def execute(self, commands: Iterable[say.Command]) -> None:
+        """Run the conductor's commands, each with all that its answer asks for."""
+        for command in commands:
+            run = self._executes.get(type(command))
+            if run is not None:  # a replay writes no log and publishes nothing
+                run(command)
+
+    def _command_front_end(self, command: say.FrontEndCommand) -> None:
+        self.session.execute(command)
+
+    def _start_session(self, command: say.StartSession) -> None:
+        before, observation = self.session.session, self._observation
+        self.session.execute(command)
+        began = self.session.session != before
+        if began and observation is not None and command.stamp == observation.stamp:
+            # what was found is the first of the session: no scan of a recording is left out
+            self._give(self.session.process(replace(observation, motion=STILL)))
+
+    def _map_frame(self, command: say.MapFrame) -> None:
+        frame = command.frame
+        if self._parallel:
+            self._apart = self._apart or BackEndProcess(self.back_end, _add)
+            self._apart.add(frame)
+            late = self.front_end.late(frame.observation.stamp_sigma)
+            self._pending.append((command, self._spent, frame.cov_local + late))
+            self._newest = None
+            self._settle(0 if is_lost(frame) else AHEAD)
+            return
+        update = _add(self.back_end, frame)
+        if update is not None:
+            belief = self.back_end.belief() if update.optimized else None
+            self.updates.append(update)
+            self.execute(self.system.on_update(command.session, frame.stamp, update, belief))
+
+    def _take_turns(self) -> None:
+        """End the back end's process, if there is one, after the frames that waited for it."""
+        self._settle(0)
         if self._apart is not None:
             self.back_end = self._apart.bring_home()
             self._apart = None
         self._parallel = False
-        return frames
 
-    def _settle(self, most: int) -> list[Frame]:
-        """The oldest of the frames that wait for the back end, so that ``most`` are left."""
-        frames = []
+    def _settle(self, most: int) -> None:
+        """Put out the oldest of the frames that wait, so that ``most`` are left."""
         while len(self._pending) > most:
             assert self._apart is not None
-            frame, spent, cov = self._pending.popleft()
+            command, spent, cov = self._pending.popleft()
+            frame = command.frame
             T_map_base, cov_map = self.front_end.in_map(frame.T_local_base, cov)
-            frames.append(replace(frame, T_map_base=T_map_base, cov_map=cov_map, wall_ms=spent))
-            self._take_over(self._apart.update())
-        return frames
+            self._out.append(replace(frame, T_map_base=T_map_base, cov_map=cov_map, wall_ms=spent))
+            update = self._apart.update()
+            if update is not None:
+                self.updates.append(update)
+                self.execute(self.system.on_update(command.session, frame.stamp, update, None))
 
-    def _take_over(self, update: Update | None) -> bool:
-        """Give the front end the correction of an update; whether there is one."""
-        if update is None:
-            return False
-        self.updates.append(update)
-        self.front_end.forget(update.removed)
-        if update.optimized:
-            self.front_end.correct(update.T_map_local, update.known)
-        return update.optimized
+    # --- searches and maps as commands -----------------------------------------------------------
 
-    def _believe(self) -> None:
-        """Let the front end go on from the graph where the graph contradicts it."""
-        belief = self.back_end.belief()
-        if belief is not None and self.front_end.contradicts(belief):
-            self.front_end.adopt(belief)
+    def _search(self, command: say.Search) -> None:
+        found = locate(command, self._params)
+        if self._delay == 0:
+            self.execute(self.system.on_search_result(command.number, found))
+            return
+        now = 0 if self.session.last is None else self.session.last.stamp
+        self._late.append((now + self._delay, command.number, found))
+
+    def _deliver_late(self, stamp: int) -> None:
+        """Answers of searches that are due by a stamp, or by the end of a clock that jumped."""
+        while self._late and not self._late[0][0] - self._delay <= stamp < self._late[0][0]:
+            _, number, found = self._late.popleft()
+            self.execute(self.system.on_search_result(number, found))
+
+    def _draw_map(self, command: say.DrawMap) -> None:
+        self.execute(self.system.on_map_drawn(command.number, self.map()))
+
+    def _take_map(self, _: say.TakeMap) -> None:
+        assert self._loaded is not None
+        self.back_end, self._loaded = self._loaded, None
+
+    def _forget_map(self, _: say.ForgetMap) -> None:
+        self._take_turns()
+        self.back_end.reset()
+
+    def _answer(self, command: say.Answer) -> None:
+        self.answers[command.number] = command
+
+    # --- the user's requests ---------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Begin at ``map_start_pose``; a map in the making is forgotten."""
+        self.execute(self.system.reset(np.array(self._params.node.map_start_pose)))
+
+    def set_localization_mode(self, on: bool) -> None:
+        """Localize in the map as it is now, or make a new one. MapError where there is none."""
+        if on == (self.system.map is not None):
+            return
+        if not on:
+            self.execute(self.system.make_map())
+            return
+        self.use_map(require_contents(self.map()))
+
+    # --- products --------------------------------------------------------------------------------
 
     def map(self) -> SavedMap:
         """The map as it is now, or the one that never changes."""
-        if self._saved is not None:
-            return self._saved
+        if self.system.map is not None:
+            return self.system.map
         if self._apart is not None:
             return self._apart.map()
         return SavedMap(self.back_end.reflectors(), self.back_end.occupancy_grid())
 
     def trajectory(self) -> tuple[NDArray[np.int64], Array]:
         """Stamps (n,) and poses (n, 3), map frame, one per frame; optimised where it maps."""
-        if self._saved is not None:
+        if self.system.map is not None:
             stamps = np.array([stamp for stamp, _ in self._path], dtype=np.int64)
             return stamps, np.array([pose for _, pose in self._path]).reshape(-1, 3)
         return self.back_end.trajectory()
 
     def reflectors(self) -> Reflectors:
         """The reflector map."""
-        return self._saved.reflectors if self._saved is not None else self.back_end.reflectors()
+        saved = self.system.map
+        return self.back_end.reflectors() if saved is None else saved.reflectors
 
     def occupancy_grid(self) -> OccupancyGrid | None:
         """The map of the scans, None without any."""
-        if self._saved is not None:
-            return self._saved.grid
-        return self.back_end.occupancy_grid()
+        saved = self.system.map
+        return self.back_end.occupancy_grid() if saved is None else saved.grid
 
 
 def _add(back_end: BackEnd, frame: Frame) -> Update | None:

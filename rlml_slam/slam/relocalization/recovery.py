@@ -1,47 +1,50 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds a lost robot in the whole map: at start in a saved map, and after it was carried away.
+"""When a lost robot is searched in the map: at the start in a saved map, or after it was moved.
 
-What is ambiguous or impossible changes nothing: the robot stays lost, and the next frames are
-tried as it moves on. Nothing of what is seen meanwhile is put into the map.
+An ambiguous or impossible search changes nothing: the robot stays lost, and later frames are
+tried as it moves on. Nothing that is seen meanwhile becomes part of the map.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Parameters
-from rlml_slam.slam.relocalization.global_localization import localize_globally
-from rlml_slam.slam.relocalization.scan_relocalization import Relocation
 from rlml_slam.slam.relocalization.search_schedule import SearchSchedule
-from rlml_slam.types import Frame, Level, Verdict
+from rlml_slam.types import Frame, Level
 
 
 class Recovery:
-    """Looks at every frame, and searches the map where a frame is lost; ``why`` is its verdict."""
+    """Looks at every frame; ``why`` is the text of the newest search, empty where none was made.
+
+    ``map`` is the map in the making as it was when the robot was lost, None before it was drawn.
+    """
 
     def __init__(self, params: Parameters) -> None:
         self._p = params
-        self._map: SavedMap | None = None  # as it was when the robot was lost: nothing is added
-        self._pace: SearchSchedule | None = None
+        self._schedule: SearchSchedule | None = None
+        self.map: SavedMap | None = None
         self.why = ''
 
-    def look(
-        self, frame: Frame, current: Callable[[], SavedMap], complete: bool
-    ) -> Relocation | None:
-        """The only place of a lost frame in the map, which is ``complete`` or in the making."""
+    @property
+    def is_active(self) -> bool:
+        """Whether the newest frame is lost."""
+        return self._schedule is not None
+
+    def stop(self) -> None:
+        """The robot knows its place, or has another map."""
+        self._schedule, self.map, self.why = None, None, ''
+
+    def follow(self, frame: Frame) -> None:
+        """Take the next frame."""
+        if not (frame.health.level is Level.LOST or frame.unconfirmed):
+            self.stop()
+        elif self._schedule is None or frame.stamp < self._schedule.since:
+            self._schedule = SearchSchedule(frame.stamp)
+
+    def is_due(self, frame: Frame) -> bool:
+        """Whether to search this frame, the newest; the next search counts from this one."""
+        if self._schedule is None:
+            return False
+        waited = frame.stamp - self._schedule.since >= self._p.health.lost_time * 1e9
         lost = frame.health.level is Level.LOST
-        if not (lost or frame.unconfirmed):
-            self._pace, self._map, self.why = None, None, ''
-            return None
-        if self._pace is None or frame.stamp < self._pace.since:
-            self._pace = SearchSchedule(frame.stamp)
-        waited = frame.stamp - self._pace.since >= self._p.health.lost_time * 1e9
-        if not (lost or waited) or not self._pace.is_due(frame):
-            return None
-        if self._map is None:
-            self._map = current()
-        grid, reflectors = self._map.grid, self._map.reflectors
-        found = localize_globally(grid, reflectors, frame.observation, self._p, complete)
-        self.why = found.why
-        return found if found.verdict is Verdict.UNIQUE else None
+        return (lost or waited) and self._schedule.is_due(frame)

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Maps between a running back end and the folder of saved maps."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from rlml_slam.errors import MapError
+from rlml_slam.maps import map_container
+from rlml_slam.maps.map_container import Content
+from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.maps.saved_map import SavedMap
+from rlml_slam.motion import SECOND
+from rlml_slam.params import Parameters
+from rlml_slam.ros.back_end.map_folder import MapFolder
+from rlml_slam.slam.back_end.back_end import BackEnd
+from rlml_slam.slam.store import map_file
+
+WORTH_KEEPING = 10  # keyframes that are in no file
+
+
+class MapArchive:
+    """Writes maps for users, and those that would be lost otherwise; loads and checks them."""
+
+    def __init__(self, params: Parameters, logger: Any) -> None:
+        self._p = params
+        self._logger = logger
+        self.folder = MapFolder(params.node.map_directory)
+        self._written = 0  # keyframes of the map in the making that are in a file
+
+    def load(self, name: str) -> Content:
+        """A whole map of the folder. Raises MapError or FileFormatError."""
+        return map_file.load(self.folder.whole(name))
+
+    def save(self, name: str, back_end: BackEnd, current: SavedMap, undrawn: str) -> str:
+        """Write a map under a name; what was written. Raises MapError."""
+        if current.grid is None and len(current.reflectors) == 0:
+            raise MapError(undrawn or 'there is no map yet')
+        if back_end.keyframes:
+            self._write(self.folder.whole(name), back_end, current.grid)
+        path = self.folder.save(name, current)
+        return f'{path}: {contents(current)}{f", no grid: {undrawn}" if undrawn else ""}'
+
+    def keep(self, back_end: BackEnd, grid: OccupancyGrid | None, reason: str) -> None:
+        """Write a map that is about to go under a name of its own, if it is worth it."""
+        keys, name = back_end.keyframes, self._p.node.map_file_name
+        if len(keys) - self._written < WORTH_KEEPING:
+            return
+        try:
+            for old in self.folder.make_room_for_lost(name, time.time()):
+                self._logger.warning(f'{reason}: an old map is removed: {old}')
+            path = self.folder.lost(name, keys[-1].stamp // SECOND)
+            self._write(path, back_end, grid)
+        except MapError as e:
+            self._logger.warning(f'{reason}: the map until now is not kept: {e}')
+        else:
+            self._logger.warning(f'{reason}: the map until now is kept: {path}')
+
+    def begin(self, back_end: BackEnd) -> None:
+        """The map in the making is another one, all of which is in a file."""
+        self._written = len(back_end.keyframes)
+
+    def _write(self, path: Path, back_end: BackEnd, grid: OccupancyGrid | None) -> None:
+        map_container.write(path, map_file.content_of(back_end, self._p, grid))
+        self._written = len(back_end.keyframes)
+
+
+def contents(of: SavedMap) -> str:
+    """What is in a map, in words."""
+    return f'{len(of.reflectors)} reflectors' + ('' if of.grid is None else ' and a grid')

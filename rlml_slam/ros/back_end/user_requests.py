@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What users ask of a running back end. A request that fails leaves everything as it was."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+from typing import Any
+
+import numpy as np
+
+from rlml_slam.errors import FileFormatError, MapError
+from rlml_slam.maps.saved_map import SavedMap, require_contents
+from rlml_slam.params import Parameters
+from rlml_slam.ros.back_end.last_pose import LastPose
+from rlml_slam.ros.back_end.map_archive import contents
+from rlml_slam.ros.back_end.mapper import Mapper
+from rlml_slam.slam.closures.closure_table import describe
+from rlml_slam.slam.conversation import Answer, Command
+from rlml_slam.slam.store import map_file
+
+
+class UserRequests:
+    """Methods are called in the mapper's worker; files are read and checked before they act.
+
+    At once, it does what the parameters ask for at the start: then it raises MapError or
+    FileFormatError where a map cannot be used.
+    """
+
+    def __init__(self, mapper: Mapper, params: Parameters, logger: Any) -> None:
+        self._mapper = mapper
+        self._archive = mapper.archive
+        self._p = params
+        self._logger = logger
+        self._is_loaded = False  # whether the map that is localized in came from the folder
+        mapper.submit(self._begin())
+
+    def _begin(self) -> list[Command]:
+        node, system = self._p.node, self._mapper.system
+        name = node.map_file_name
+        if node.mode == 'localization':
+            return self._localize_in(name, is_first=True)
+        begin = system.make_map()
+        if not node.continue_map:
+            return begin
+        whole = self._archive.folder.whole(name)
+        if whole.exists():
+            return [*begin, *self._continue(name)]
+        self._logger.warning(f'{whole} does not exist: another map begins')
+        return begin
+
+    def reset(self) -> str:
+        """Begin at ``map_start_pose``; what was done."""
+        system = self._mapper.system
+        localizes = system.map is not None
+        self._mapper.execute(system.reset(np.array(self._p.node.map_start_pose)))
+        if localizes:
+            return 'begins at map_start_pose in the same map'
+        return 'another map begins at map_start_pose'
+
+    def save(self, name: str) -> str:
+        """Write the map; what was written. Raises MapError."""
+        mapper = self._mapper
+        if mapper.system.map is not None and self._is_loaded:
+            raise MapError('the map that was loaded does not change: nothing to save')
+        current = mapper.current()
+        undrawn = mapper.products.undrawn if mapper.system.map is None else ''
+        return self._archive.save(name, mapper.back_end, current, undrawn)
+
+    def load(self, name: str) -> SavedMap:
+        """Localize in another saved map, or while mapping go on with it.
+
+        Raises MapError or FileFormatError.
+        """
+        mapper = self._mapper
+        if mapper.system.map is not None:
+            mapper.execute(self._localize_in(name))
+        else:
+            mapper.execute(self._continue(name))
+        return mapper.current()
+
+    def _localize_in(self, name: str, is_first: bool = False) -> list[Command]:
+        """Localize in a saved map; at first from the pose of the last run, if that fits."""
+        folder = self._archive.folder
+        saved, last, pose = folder.load(name), None, None
+        if self._p.node.restore_pose:
+            path = folder.path(name)
+            last = LastPose(path.with_name(path.name + '.pose'))
+            try:
+                pose = last.read() if is_first else None
+            except FileFormatError as e:
+                self._logger.warning(f'{e}')
+        self._is_loaded, self._mapper.last_pose = True, last
+        return self._mapper.system.localize_in(saved, pose, last is not None)
+
+    def _continue(self, name: str) -> list[Command]:
+        content, loaded = self._archive.load(name), self._mapper.new_back_end()
+        map_file.restore(content, loaded)
+        saved = map_file.saved_map(content)
+        self._mapper.loaded = loaded
+        return self._mapper.system.continue_map(saved, loaded.reflector_graph.next_key)
+
+    def localize(self, on: bool) -> str:
+        """Localize in the map as it is now, or begin a new one; what was done.
+
+        Raises MapError where there is no map yet.
+        """
+        mapper, system = self._mapper, self._mapper.system
+        if on == (system.map is not None):
+            return 'localizes already' if on else 'maps already'
+        if not on:
+            mapper.execute(system.make_map())
+            return 'maps: a new map begins where the robot is, in the axes of the old one'
+        current = require_contents(mapper.current())
+        self._is_loaded, mapper.last_pose = False, None
+        mapper.execute(system.localize_in(current))
+        return f'localizes in the map as it is now: {contents(current)}'
+
+    def relocalize(self) -> Future[Answer]:
+        """Find the newest frame anywhere in the map; the answer comes later."""
+        number, commands = self._mapper.system.relocalize()
+        answer = self._mapper.answers[number] = Future()
+        self._mapper.execute(commands)
+        return answer
+
+    def revoke(self, number: str) -> str:
+        """Take a loop closure out of the map for good; what was done.
+
+        Raises MapError or SolverError where that cannot be.
+        """
+        mapper, back_end = self._mapper, self._mapper.back_end
+        if not number.isdecimal():
+            raise MapError(f'{number!r} is not the number of a loop closure')
+        if mapper.system.map is not None:
+            raise MapError('the map that is localized in does not change')
+        closure = back_end.revoke(int(number))
+        self._logger.warning(describe(closure))
+        known, stamp = back_end.known, back_end.keyframes[-1].stamp
+        cov = None if known is None else known.cov_map
+        mapper.execute(mapper.system.on_solved(stamp, back_end.T_map_local, cov))
+        mapper.publish_map()
+        return describe(closure)

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The topic ``session_start``: where the front end is to begin a session, or to go on.
+
+A PointCloud2 of one point, the place, whose fields are those of the request, exactly.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rlml_slam.errors import InputError
+from rlml_slam.ros.codecs import encode
+from rlml_slam.ros.codecs.decode import stamp
+from rlml_slam.ros.codecs.message_types import Make
+from rlml_slam.ros.codecs.point_cloud import build_cloud, read_cloud
+from rlml_slam.slam.conversation import Relocate, StartSession
+
+START, RELOCATE = range(2)  # `kind`
+REQUEST = np.dtype(
+    [
+        ('x', '<f4'), ('y', '<f4'), ('z', '<f4'), ('kind', 'u1'), ('number', '<u4'),
+        ('session', '<u4'), ('first_key', '<i4'), ('pose', '<f8', (3,)), ('cov', '<f8', (9,)),
+    ]
+)  # fmt: skip
+
+
+def build_request(make: Make, command: StartSession | Relocate, map_frame: str) -> Any:
+    """PointCloud2 of one point."""
+    r = np.zeros(1, dtype=REQUEST)
+    r['x'], r['y'] = command.pose[:2]
+    r['number'], r['session'] = command.number, command.session
+    r['pose'], r['cov'] = command.pose, command.cov.ravel()
+    r['kind'] = RELOCATE
+    if isinstance(command, StartSession):
+        r['kind'], r['first_key'] = START, command.first_key
+    return build_cloud(make, encode.header(make, command.stamp, map_frame), r)
+
+
+def read_request(msg: Any, topic: str = 'session_start') -> StartSession | Relocate:
+    """The inverse of build_request; InputError if it is another kind of cloud."""
+    cloud = read_cloud(msg, topic)
+    missing = set(REQUEST.names or ()) - set(cloud.dtype.names or ())
+    if missing or len(cloud) != 1:
+        raise InputError(
+            f'{topic}: not one request; missing {", ".join(sorted(missing)) or "none"}'
+        )
+    r = cloud[0]
+    pose = np.array(r['pose'], dtype=np.float64)
+    cov = np.array(r['cov'], dtype=np.float64).reshape(3, 3)
+    if not (np.isfinite(pose).all() and np.isfinite(cov).all()):
+        raise InputError(f'{topic}: the pose is not finite')
+    # a request about the pose of now has no stamp
+    time = msg.header.stamp.sec * 1_000_000_000 + msg.header.stamp.nanosec
+    number, session = int(r['number']), int(r['session'])
+    if r['kind'] == START:
+        return StartSession(number, session, time, pose, cov, int(r['first_key']))
+    return Relocate(number, session, stamp(msg, topic), pose, cov)

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Searches that are under way, by number: a late or superseded answer is recognised."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+from rlml_slam.maps.saved_map import SavedMap
+from rlml_slam.slam.conversation import Answer, Command, DrawMap, Search, SessionFrame
+
+
+class Purpose(Enum):
+    """What a search is for."""
+
+    ENTER = 'to enter a saved map'
+    CONFIRM = 'to test the pose that a user gave'
+    RECOVER = 'to find a lost robot'
+    RESTORE = 'to test the pose of the last run'
+    ANSWER = 'to answer a user'
+
+
+@dataclass(frozen=True)
+class Pending:
+    """A search under way: of which frame, None where there was none yet."""
+
+    purpose: Purpose
+    record: SessionFrame | None
+
+
+class Searches:
+    """Numbers come from ``new_number``; ``take`` gives what a number stands for, once."""
+
+    def __init__(self, new_number: Callable[[], int]) -> None:
+        self._new_number = new_number
+        self._pending: dict[int, Pending] = {}
+
+    def is_pending(self, *purposes: Purpose) -> bool:
+        """Whether a search for one of the purposes is under way."""
+        return any(p.purpose in purposes for p in self._pending.values())
+
+    def begin(
+        self,
+        purpose: Purpose,
+        record: SessionFrame | None,
+        saved: SavedMap | None,
+        complete: bool = True,
+    ) -> Search | DrawMap:
+        """The command for a search in a map; without one, to draw the map in the making first."""
+        number = self._new_number()
+        self._pending[number] = Pending(purpose, record)
+        if saved is None:
+            return DrawMap(number)
+        return self._search(number, saved, complete)
+
+    def on_drawn(self, number: int, saved: SavedMap) -> list[Command]:
+        """The search that the map was drawn for; it is not complete while a robot is lost."""
+        purpose = self.purpose(number)
+        return [] if purpose is None else [self._search(number, saved, purpose is Purpose.ANSWER)]
+
+    def _search(self, number: int, saved: SavedMap, complete: bool) -> Search:
+        pending = self._pending[number]
+        frame = None if pending.record is None else pending.record.frame
+        given = frame if pending.purpose is Purpose.CONFIRM else None
+        return Search(number, None if frame is None else frame.observation, saved, complete, given)
+
+    def take(self, number: int) -> Pending | None:
+        """What is under way with this number, and no longer from now on; None if superseded."""
+        return self._pending.pop(number, None)
+
+    def purpose(self, number: int) -> Purpose | None:
+        """What a number stands for, None if superseded."""
+        pending = self._pending.get(number)
+        return None if pending is None else pending.purpose
+
+    def drop(self, *purposes: Purpose) -> None:
+        """Their answers will change nothing."""
+        self._pending = {n: p for n, p in self._pending.items() if p.purpose not in purposes}
+
+    def drop_all(self, why: str) -> list[Command]:
+        """No answer will change anything; users who wait for one get ``why``."""
+        waiting = [n for n, p in self._pending.items() if p.purpose is Purpose.ANSWER]
+        self._pending.clear()
+        return [Answer(number, False, f'not found: {why}') for number in waiting]

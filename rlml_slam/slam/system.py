@@ -1,0 +1,343 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The conductor: sessions, corrections, recovery and saved maps, as events in and commands out.
+
+It has no ROS, no clock, no thread and no file. Replay executes its commands directly, the nodes
+publish them. Slow work (a search, drawing the map) is a command with a number; its answer may come
+late, and one that was superseded meanwhile changes nothing.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+
+from rlml_slam import se2
+from rlml_slam.maps.saved_map import SavedMap
+from rlml_slam.motion import STILL, compose_motion
+from rlml_slam.params import Parameters
+from rlml_slam.se2 import Array
+from rlml_slam.slam.back_end.back_end import Update
+from rlml_slam.slam.closures.closure_table import describe
+from rlml_slam.slam.conversation import (
+    ANY,
+    FIRST_REQUEST,
+    Answer,
+    Command,
+    Correct,
+    ForgetMap,
+    KeepMap,
+    LocalizeIn,
+    MapFrame,
+    PublishMap,
+    Relocate,
+    RememberPose,
+    SessionFrame,
+    StartSession,
+    TakeMap,
+    info,
+    warning,
+)
+from rlml_slam.slam.map_entry import MapEntry
+from rlml_slam.slam.relocalization.pose_test import verified
+from rlml_slam.slam.relocalization.recovery import Recovery
+from rlml_slam.slam.relocalization.relocalize_answer import relocalize_answer
+from rlml_slam.slam.relocalization.scan_relocalization import Relocation
+from rlml_slam.slam.requests import Requests
+from rlml_slam.slam.searches import Pending, Purpose, Searches
+from rlml_slam.types import Belief, Verdict
+
+PAST = 100  # sessions whose frames may still be in a queue
+CERTAIN = 1e-6 * np.eye(3)
+
+
+class System:
+    """Decides what front end and back end do; every event returns commands, to be run in order.
+
+    ``map`` is what is localized in, None while a map is made. ``entry`` is there while a saved map
+    is to be continued and the robot's place in it is not known: then nothing is mapped.
+    ``mode`` is the number of the newest LocalizeIn;
+    ``T_map_local`` (3,) is the graph's newest correction of the session, ``newest`` the newest
+    frame.
+    """
+
+    def __init__(self, params: Parameters, first_request: int = FIRST_REQUEST) -> None:
+        self.requests = Requests(first_request)
+        self.searches = Searches(self.requests.new_number)
+        self.recovery = Recovery(params)
+        self.map: SavedMap | None = None
+        self.entry: MapEntry | None = None
+        self.newest: SessionFrame | None = None
+        self.session: int | None = None
+        self.T_map_local = np.zeros(3)
+        self.is_paused = False
+        self.mode = 0
+        self._past: deque[int] = deque(maxlen=PAST)
+        self._mapped: int | None = None  # session whose frames are in the graph
+        self._jumps = False  # no motion leads to the next frame of the graph
+        self._skipped = STILL  # motion of the frames that were left out
+        self._last_pose: Array | None = None  # of the last run, until it was tested
+        self._remembers = False
+
+    # --- maps, sessions and measurements, as the user wants them ---------------------------------
+
+    def localize_in(
+        self, saved: SavedMap, last_pose: Array | None = None, remembers: bool = False
+    ) -> list[Command]:
+        """Localize in a map that does not change, from ``last_pose`` (3,) if it fits there.
+
+        ``remembers``: the pose is written down for the next start.
+        """
+        self.map, self.entry = saved, None
+        self._last_pose, self._remembers = last_pose, remembers
+        return [*self._announce_mode(), PublishMap()]
+
+    def make_map(self) -> list[Command]:
+        """Make a map; it begins where the robot is, in the axes of a map that was localized in."""
+        leaves, self.map = self.map is not None, None
+        self._last_pose, self._remembers = None, False
+        out = self._announce_mode()
+        return [*out, *self._forget('localization ended')] if leaves else out
+
+    def continue_map(self, saved: SavedMap, first_key: int) -> list[Command]:
+        """Go on with a map, loaded and checked, as soon as the robot's place in it is known.
+
+        ``first_key``: the first that no reflector of the map has.
+        """
+        keep = [] if self._mapped is None else [KeepMap('another map was loaded')]
+        out = self._supersede('another map was loaded')
+        self.requests.drop()
+        self._forget_graph()
+        self.entry = MapEntry(saved, first_key)
+        return [*keep, *out, TakeMap(), PublishMap()]
+
+    def reset(self, pose: Array) -> list[Command]:
+        """Begin at a pose (3,) of the map; a map in the making is forgotten."""
+        out = self._supersede('the system was reset')
+        self.entry, self._last_pose = None, None
+        if self.map is None:
+            out.append(self._forget_graph())
+        return [*out, self._start(None, pose, CERTAIN)]
+
+    def pause(self, on: bool) -> list[Command]:
+        """Leave new measurements out of the map, or take them in again."""
+        self.is_paused = on
+        return []
+
+    def _announce_mode(self) -> list[Command]:
+        out = self._supersede('the map was changed')
+        self.requests.drop()
+        self.mode = self.requests.new_number()
+        return [*out, LocalizeIn(self.mode, self.map)]
+
+    def _supersede(self, why: str) -> list[Command]:
+        """No search under way has an effect any more."""
+        self.recovery.stop()
+        return self.searches.drop_all(why)
+
+    def _forget(self, why: str) -> list[Command]:
+        keep: list[Command] = [] if self._mapped is None else [KeepMap(why)]
+        return [*keep, self._forget_graph()]
+
+    def _forget_graph(self) -> ForgetMap:
+        self._mapped, self._jumps, self._skipped = None, False, STILL
+        return ForgetMap()
+
+    def _start(
+        self, record: SessionFrame | None, pose: Array, cov: Array, first_key: int = 0
+    ) -> StartSession:
+        """Begin a session at a pose that a frame has, or that is the robot's now."""
+        session, stamp = (ANY, 0) if record is None else (record.session, record.frame.stamp)
+        number = self.requests.new_number()
+        return self.requests.ask(StartSession(number, session, stamp, pose, cov, first_key))
+
+    # --- frames and what the graph makes of them -------------------------------------------------
+
+    def on_frame(self, record: SessionFrame) -> list[Command]:
+        """The next frame that came, of whatever session."""
+        if not self._is_of_mode(record) or record.session in self._past:
+            return []  # it was still in the queue
+        out: list[Command] = []
+        if record.session != self.session:
+            if self.requests.is_superseded(record):
+                return []
+            out += self._begin_session(record)
+        self.newest = record
+        again = self.requests.follow(record)
+        if again is not None:
+            out.append(again)
+        if self.requests.starts:
+            return out
+        if self.entry is not None:
+            return out + self._search_entry(self.entry, record)
+        if self.map is None:
+            out += self._map_frame(record)
+        if not self.is_paused:
+            out += self._restore(record) + self._recover(record)
+        if self._remembers and self._last_pose is None:
+            out.append(RememberPose(record.frame))
+        return out
+
+    def is_current(self, record: SessionFrame) -> bool:
+        """Whether a frame is of the session that is mapped or localized in."""
+        known = self.entry is None and not self.requests.starts
+        return known and record.session == self.session and self._is_of_mode(record)
+
+    def _is_of_mode(self, record: SessionFrame) -> bool:
+        # a front end that was never given a map makes one
+        return record.mode == self.mode or (record.mode == 0 and self.map is None)
+
+    def _begin_session(self, record: SessionFrame) -> list[Command]:
+        is_first = self.session is None
+        if self.session is not None:
+            self._past.append(self.session)
+        self.session, self.T_map_local = record.session, np.zeros(3)
+        out = self._supersede('the front end began another session')
+        if not self.requests.is_own(record):
+            self.requests.drop()
+            self._last_pose = None
+        if self.entry is not None:
+            if record.request in self.entry.requests:
+                out.append(info(f'the saved map is continued: {self.entry.why}'))
+                self.entry, self._jumps = None, True
+        elif self.map is None and self._mapped is not None:
+            out.append(warning('the front end began elsewhere: another map begins'))
+            out += self._forget('the front end began elsewhere')
+        elif self.map is None and is_first and not self.requests.is_own(record):
+            out += self._take_over(record)
+        return out
+
+    def _take_over(self, record: SessionFrame) -> list[Command]:
+        """Begin where a front end is that another run of the back end has corrected."""
+        frame = record.frame
+        if np.array_equal(frame.T_map_base, frame.T_local_base):
+            return []
+        return [self._start(record, frame.T_map_base, frame.cov_map)]
+
+    def _map_frame(self, record: SessionFrame) -> list[Command]:
+        frame = record.frame
+        motion = frame.observation.motion
+        if self._skipped is not STILL:
+            motion = compose_motion(self._skipped, motion)
+            frame = replace(frame, observation=replace(frame.observation, motion=motion))
+        self._skipped = motion if self.is_paused else STILL
+        if self.is_paused:
+            return []
+        if self._jumps:
+            frame, self._jumps = replace(frame, jumped=True), False
+        self._mapped = record.session
+        return [MapFrame(record.session, frame)]
+
+    def on_update(
+        self, session: int, stamp: int, update: Update, belief: Belief | None
+    ) -> list[Command]:
+        """What the frame at a stamp did, a keyframe now, and the graph's belief after it."""
+        if session != self._mapped:
+            return []
+        out: list[Command] = [warning(describe(closure)) for closure in update.changed]
+        if update.removed:
+            keys = ', '.join(map(str, update.removed))
+            out.append(warning(f'no longer seen where they were: reflectors {keys}'))
+        if update.optimized:
+            self.T_map_local = update.T_map_local
+            cov = None if update.known is None else update.known.cov_map
+            out.append(Correct(session, stamp, update.T_map_local, cov, update.removed, belief))
+        elif update.removed:
+            out.append(Correct(session, stamp, None, removed=update.removed))
+        return out
+
+    def on_solved(self, stamp: int, T_map_local: Array, cov_map: Array | None) -> list[Command]:
+        """The graph was solved for a user; its newest keyframe is at a stamp."""
+        if self._mapped is None or self._mapped != self.session:
+            return []
+        self.T_map_local = T_map_local
+        return [Correct(self._mapped, stamp, T_map_local, cov_map)]
+
+    # --- searches --------------------------------------------------------------------------------
+
+    def relocalize(self) -> tuple[int, list[Command]]:
+        """Find the newest frame anywhere in the map, for a user: the number of the Answer."""
+        known = self.map if self.entry is None else self.entry.saved
+        command = self.searches.begin(Purpose.ANSWER, self.newest, known)
+        return command.number, [command]
+
+    def _search_entry(self, entry: MapEntry, record: SessionFrame) -> list[Command]:
+        if self.searches.is_pending(Purpose.ENTER, Purpose.CONFIRM):
+            return []
+        purpose = entry.next_search(record)
+        return [] if purpose is None else [self.searches.begin(purpose, record, entry.saved)]
+
+    def _restore(self, record: SessionFrame) -> list[Command]:
+        seen = record.frame.observation
+        if self._last_pose is None or self.searches.is_pending(Purpose.RESTORE):
+            return []
+        if seen.points is None and seen.detections is None:
+            return []
+        return [self.searches.begin(Purpose.RESTORE, record, self.map)]
+
+    def _recover(self, record: SessionFrame) -> list[Command]:
+        self.recovery.follow(record.frame)
+        if not self.recovery.is_active:
+            self.searches.drop(Purpose.RECOVER)
+            return []
+        busy = self.searches.is_pending(Purpose.RECOVER, Purpose.RESTORE)
+        if busy or self.requests.pending is not None or not self.recovery.is_due(record.frame):
+            return []
+        known = self.recovery.map if self.map is None else self.map
+        return [self.searches.begin(Purpose.RECOVER, record, known, self.map is not None)]
+
+    def on_map_drawn(self, number: int, saved: SavedMap) -> list[Command]:
+        """The answer to DrawMap, however late."""
+        if self.searches.purpose(number) is Purpose.RECOVER:
+            self.recovery.map = saved
+        return self.searches.on_drawn(number, saved)
+
+    def on_search_result(self, number: int, found: Relocation) -> list[Command]:
+        """The answer to Search, however late."""
+        pending = self.searches.take(number)
+        if pending is None:
+            return []  # superseded
+        record, pose, cov = pending.record, found.pose, found.cov
+        if pending.purpose is Purpose.ANSWER:
+            return self._answer(number, pending, found)
+        assert record is not None
+        if pending.purpose is Purpose.RESTORE:
+            assert self._last_pose is not None
+            start, why = verified(self._last_pose, found)
+            self._last_pose = None
+            return [warning(why)] if start is None else [info(why), self._start(record, *start)]
+        if pending.purpose is Purpose.RECOVER:
+            self.recovery.why = found.why
+        elif self.entry is not None:
+            self.entry.why = found.why
+        if found.verdict is not Verdict.UNIQUE or pose is None or cov is None:
+            return []
+        if self.entry is not None:
+            return [self._enter(self.entry, record, pose, cov)]
+        number = self.requests.new_number()
+        go_on = Relocate(number, record.session, record.frame.stamp, pose, cov)
+        return [info(f'found again: {found.why}'), self.requests.ask(go_on)]
+
+    def _enter(
+        self, entry: MapEntry, record: SessionFrame, pose: Array, cov: Array
+    ) -> StartSession:
+        start = self._start(record, pose, cov, entry.first_key)
+        entry.requests.add(start.number)
+        return start
+
+    def _answer(self, number: int, pending: Pending, found: Relocation) -> list[Command]:
+        record, believed = pending.record, None
+        if record is not None:
+            believed = se2.compose(self.T_map_local, record.frame.T_local_base)
+        may_jump = self.map is not None or self.entry is not None
+        success, text = relocalize_answer(found, believed, may_jump)
+        out: list[Command] = [Answer(number, success, text)]
+        if success and may_jump:
+            assert record is not None
+            assert found.pose is not None
+            assert found.cov is not None
+            if self.entry is not None:
+                return [self._enter(self.entry, record, found.pose, found.cov), *out]
+            return [self._start(record, found.pose, found.cov), *out]
+        return out
