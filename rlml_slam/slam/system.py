@@ -9,17 +9,14 @@ late, and one that was superseded meanwhile changes nothing.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import replace
 
 import numpy as np
 
 from rlml_slam import se2
 from rlml_slam.maps.saved_map import SavedMap
-from rlml_slam.motion import STILL, compose_motion
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.back_end.back_end import Update
-from rlml_slam.slam.closures.closure_table import describe
 from rlml_slam.slam.conversation import (
     ANY,
     FIRST_REQUEST,
@@ -29,7 +26,6 @@ from rlml_slam.slam.conversation import (
     ForgetMap,
     KeepMap,
     LocalizeIn,
-    MapFrame,
     PublishMap,
     Relocate,
     RememberPose,
@@ -40,6 +36,7 @@ from rlml_slam.slam.conversation import (
     warning,
 )
 from rlml_slam.slam.map_entry import MapEntry
+from rlml_slam.slam.mapped_frames import MappedFrames, corrections
 from rlml_slam.slam.relocalization.pose_test import verified
 from rlml_slam.slam.relocalization.recovery import Recovery
 from rlml_slam.slam.relocalization.relocalize_answer import relocalize_answer
@@ -71,16 +68,11 @@ class System:
         self.newest: SessionFrame | None = None
         self.session: int | None = None
         self.T_map_local = np.zeros(3)
-        self.is_paused = False
+        self.frames = MappedFrames()
         self.mode = 0
         self._past: deque[int] = deque(maxlen=PAST)
-        self._mapped: int | None = None  # session whose frames are in the graph
-        self._jumps = False  # no motion leads to the next frame of the graph
-        self._skipped = STILL  # motion of the frames that were left out
         self._last_pose: Array | None = None  # of the last run, until it was tested
         self._remembers = False
-
-    # --- maps, sessions and measurements, as the user wants them ---------------------------------
 
     def localize_in(
         self, saved: SavedMap, last_pose: Array | None = None, remembers: bool = False
@@ -105,7 +97,7 @@ class System:
 
         ``first_key``: the first that no reflector of the map has.
         """
-        keep = [] if self._mapped is None else [KeepMap('another map was loaded')]
+        keep = [] if self.frames.session is None else [KeepMap('another map was loaded')]
         out = self._supersede('another map was loaded')
         self.requests.drop()
         self._forget_graph()
@@ -122,7 +114,7 @@ class System:
 
     def pause(self, on: bool) -> list[Command]:
         """Leave new measurements out of the map, or take them in again."""
-        self.is_paused = on
+        self.frames.is_paused = on
         return []
 
     def _announce_mode(self) -> list[Command]:
@@ -137,22 +129,21 @@ class System:
         return self.searches.drop_all(why)
 
     def _forget(self, why: str) -> list[Command]:
-        keep: list[Command] = [] if self._mapped is None else [KeepMap(why)]
+        keep: list[Command] = [] if self.frames.session is None else [KeepMap(why)]
         return [*keep, self._forget_graph()]
 
     def _forget_graph(self) -> ForgetMap:
-        self._mapped, self._jumps, self._skipped = None, False, STILL
+        self.frames.forget()
         return ForgetMap()
 
-    def _start(
-        self, record: SessionFrame | None, pose: Array, cov: Array, first_key: int = 0
-    ) -> StartSession:
+    def _start(self, record: SessionFrame | None, pose: Array, cov: Array) -> StartSession:
         """Begin a session at a pose that a frame has, or that is the robot's now."""
         session, stamp = (ANY, 0) if record is None else (record.session, record.frame.stamp)
-        number = self.requests.new_number()
+        number, first_key = self.requests.new_number(), 0
+        if self.entry is not None:
+            first_key = self.entry.first_key
+            self.entry.requests.add(number)
         return self.requests.ask(StartSession(number, session, stamp, pose, cov, first_key))
-
-    # --- frames and what the graph makes of them -------------------------------------------------
 
     def on_frame(self, record: SessionFrame) -> list[Command]:
         """The next frame that came, of whatever session."""
@@ -172,8 +163,8 @@ class System:
         if self.entry is not None:
             return out + self._search_entry(self.entry, record)
         if self.map is None:
-            out += self._map_frame(record)
-        if not self.is_paused:
+            out += self.frames.add(record)
+        if not self.frames.is_paused:
             out += self._restore(record) + self._recover(record)
         if self._remembers and self._last_pose is None:
             out.append(RememberPose(record.frame))
@@ -200,61 +191,33 @@ class System:
         if self.entry is not None:
             if record.request in self.entry.requests:
                 out.append(info(f'the saved map is continued: {self.entry.why}'))
-                self.entry, self._jumps = None, True
-        elif self.map is None and self._mapped is not None:
+                self.entry, self.frames.jumps = None, True
+        elif self.map is None and self.frames.session is not None:
             out.append(warning('the front end began elsewhere: another map begins'))
             out += self._forget('the front end began elsewhere')
         elif self.map is None and is_first and not self.requests.is_own(record):
-            out += self._take_over(record)
+            frame = record.frame
+            if not np.array_equal(frame.T_map_base, frame.T_local_base):
+                # another run of the back end has corrected it: the map begins where it is
+                out.append(self._start(record, frame.T_map_base, frame.cov_map))
         return out
-
-    def _take_over(self, record: SessionFrame) -> list[Command]:
-        """Begin where a front end is that another run of the back end has corrected."""
-        frame = record.frame
-        if np.array_equal(frame.T_map_base, frame.T_local_base):
-            return []
-        return [self._start(record, frame.T_map_base, frame.cov_map)]
-
-    def _map_frame(self, record: SessionFrame) -> list[Command]:
-        frame = record.frame
-        motion = frame.observation.motion
-        if self._skipped is not STILL:
-            motion = compose_motion(self._skipped, motion)
-            frame = replace(frame, observation=replace(frame.observation, motion=motion))
-        self._skipped = motion if self.is_paused else STILL
-        if self.is_paused:
-            return []
-        if self._jumps:
-            frame, self._jumps = replace(frame, jumped=True), False
-        self._mapped = record.session
-        return [MapFrame(record.session, frame)]
 
     def on_update(
         self, session: int, stamp: int, update: Update, belief: Belief | None
     ) -> list[Command]:
         """What the frame at a stamp did, a keyframe now, and the graph's belief after it."""
-        if session != self._mapped:
+        if session != self.frames.session:
             return []
-        out: list[Command] = [warning(describe(closure)) for closure in update.changed]
-        if update.removed:
-            keys = ', '.join(map(str, update.removed))
-            out.append(warning(f'no longer seen where they were: reflectors {keys}'))
         if update.optimized:
             self.T_map_local = update.T_map_local
-            cov = None if update.known is None else update.known.cov_map
-            out.append(Correct(session, stamp, update.T_map_local, cov, update.removed, belief))
-        elif update.removed:
-            out.append(Correct(session, stamp, None, removed=update.removed))
-        return out
+        return corrections(session, stamp, update, belief)
 
     def on_solved(self, stamp: int, T_map_local: Array, cov_map: Array | None) -> list[Command]:
         """The graph was solved for a user; its newest keyframe is at a stamp."""
-        if self._mapped is None or self._mapped != self.session:
+        if self.frames.session is None or self.frames.session != self.session:
             return []
         self.T_map_local = T_map_local
-        return [Correct(self._mapped, stamp, T_map_local, cov_map)]
-
-    # --- searches --------------------------------------------------------------------------------
+        return [Correct(self.frames.session, stamp, T_map_local, cov_map)]
 
     def relocalize(self) -> tuple[int, list[Command]]:
         """Find the newest frame anywhere in the map, for a user: the number of the Answer."""
@@ -314,17 +277,10 @@ class System:
         if found.verdict is not Verdict.UNIQUE or pose is None or cov is None:
             return []
         if self.entry is not None:
-            return [self._enter(self.entry, record, pose, cov)]
+            return [self._start(record, pose, cov)]
         number = self.requests.new_number()
         go_on = Relocate(number, record.session, record.frame.stamp, pose, cov)
         return [info(f'found again: {found.why}'), self.requests.ask(go_on)]
-
-    def _enter(
-        self, entry: MapEntry, record: SessionFrame, pose: Array, cov: Array
-    ) -> StartSession:
-        start = self._start(record, pose, cov, entry.first_key)
-        entry.requests.add(start.number)
-        return start
 
     def _answer(self, number: int, pending: Pending, found: Relocation) -> list[Command]:
         record, believed = pending.record, None
@@ -337,7 +293,5 @@ class System:
             assert record is not None
             assert found.pose is not None
             assert found.cov is not None
-            if self.entry is not None:
-                return [self._enter(self.entry, record, found.pose, found.cov), *out]
             return [self._start(record, found.pose, found.cov), *out]
         return out

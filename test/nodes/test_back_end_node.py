@@ -201,7 +201,7 @@ def test_services_answer_in_words(live, tmp_path):
 
     answer = live.call(SetBool, 'back_end/pause_new_measurements', SetBool.Request(data=True))
     assert answer.success
-    assert back.mapper.system.is_paused
+    assert back.mapper.system.frames.is_paused
     assert len(back.mapper.back_end.keyframes) == keyframes
 
     reset = live.call(Trigger, 'back_end/reset', Trigger.Request())

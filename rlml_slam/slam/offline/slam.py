@@ -76,7 +76,7 @@ class Slam(SynchronizedSystem):
         self._observation: Observation | None = None
         self._newest: Frame | None = None  # None once it waits for the back end
         self._spent = 0.0
-        front_end = self._command_front_end
+        front_end = self.session.execute
         self._executes: Mapping[type, Callable[[Any], None]] = {
             say.StartSession: self._start_session,
             say.Relocate: front_end,
@@ -84,10 +84,10 @@ class Slam(SynchronizedSystem):
             say.LocalizeIn: front_end,
             say.MapFrame: self._map_frame,
             say.Search: self._search,
-            say.DrawMap: self._draw_map,
+            say.DrawMap: lambda c: self.execute(self.system.on_map_drawn(c.number, self.map())),
             say.TakeMap: self._take_map,
             say.ForgetMap: self._forget_map,
-            say.Answer: self._answer,
+            say.Answer: lambda answer: self.answers.update({answer.number: answer}),
         }
 
     @property
@@ -173,9 +173,6 @@ class Slam(SynchronizedSystem):
             if run is not None:  # a replay writes no log and publishes nothing
                 run(command)
 
-    def _command_front_end(self, command: say.FrontEndCommand) -> None:
-        self.session.execute(command)
-
     def _start_session(self, command: say.StartSession) -> None:
         before, observation = self.session.session, self._observation
         self.session.execute(command)
@@ -237,9 +234,6 @@ class Slam(SynchronizedSystem):
             _, number, found = self._late.popleft()
             self.execute(self.system.on_search_result(number, found))
 
-    def _draw_map(self, command: say.DrawMap) -> None:
-        self.execute(self.system.on_map_drawn(command.number, self.map()))
-
     def _take_map(self, _: say.TakeMap) -> None:
         assert self._loaded is not None
         self.back_end, self._loaded = self._loaded, None
@@ -247,9 +241,6 @@ class Slam(SynchronizedSystem):
     def _forget_map(self, _: say.ForgetMap) -> None:
         self._take_turns()
         self.back_end.reset()
-
-    def _answer(self, command: say.Answer) -> None:
-        self.answers[command.number] = command
 
     # --- the user's requests ---------------------------------------------------------------------
 
