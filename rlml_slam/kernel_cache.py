@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compiled kernels on disk whose sources have changed since.
 
-Numba compiles a kernel anew when its own file changed. Constants and kernels of the files that
+Numba recompiles a kernel only when its own file changed. Constants and kernels of the files that
 this one imports are built into it as well, so here a kernel goes when any of those changed.
 """
 
@@ -23,7 +23,7 @@ MAKER = 'rlml_slam.compiled'
 def remove_stale(package: Path) -> None:
     """Delete the compiled kernels of a package which were made of other sources.
 
-    Where the folder cannot be written to, and NUMBA_CACHE_DIR tells no other, Numba keeps them
+    Where the folder cannot be written to, and NUMBA_CACHE_DIR names no other, Numba keeps them
     with the user's files, and an installation gives all files new times.
     """
     folder = _cache_of(package)

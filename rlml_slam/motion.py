@@ -313,7 +313,7 @@ class MotionBuffer:
     def extrapolate(self, start: int, end: int) -> Motion:
         """Motion from ``start`` to ``end`` where odometry ends before the latter.
 
-        The last speed goes on for COAST at most; an IMU that still measures tells the turn. The
+        The last speed goes on for COAST at most; an IMU that still measures gives the turn. The
         variance of the rest grows with the square of the time since odometry ended, as one unknown
         speed's does: that of a part is what it grows by, so parts add up to the whole.
         """

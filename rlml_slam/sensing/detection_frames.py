@@ -14,9 +14,7 @@ from rlml_slam.se2 import Array
 from rlml_slam.types import Detections
 
 SIGMA = (1e-4, 10.0)  # [m] a detection that claims to be better or worse is believed this much
-NEAREST = (
-    0.01  # [m] nothing stands in the sensor: that is how drivers tell of what they did not see
-)
+NEAREST = 0.01  # [m] nearer detections are invalid: drivers report a missing one at the origin
 
 
 def placed(d: Detections, frame_id: str, T: Array, max_range: float) -> tuple[Detections, bool]:

@@ -61,11 +61,11 @@ def _arc(
     last = arc
     beyond = np.zeros(len(codes), np.int64)
     for r in ranges:
-        told = r == 0.0
+        is_code = r == 0.0
         for code in codes:
-            told |= r == code
-        none += told
-        if told or not least <= r <= most:
+            is_code |= r == code
+        none += is_code
+        if is_code or not least <= r <= most:
             run = 0
             continue
         for k in range(len(codes)):
@@ -77,10 +77,10 @@ def _arc(
     farther = 0
     if arc >= 0.0:
         for r in ranges:
-            told = False
+            is_code = False
             for code in codes:
-                told |= r == code
-            farther += not told and arc < r <= most
+                is_code |= r == code
+            farther += not is_code and arc < r <= most
     return float(arc) if farther < FEWEST else -1.0, none, beyond
 
 

@@ -4,7 +4,7 @@
 With 64 neighbours to a word, eliminating a node is a few words or-ed into each of its neighbours'
 rows, and a count of bits is the degree, exactly. Up to some thousand nodes that is several times
 faster than approximate minimum degree on lists, most of all around landmarks, whose long lists
-are walked anew at every pose that is eliminated.
+are traversed again at every pose that is eliminated.
 
 As there, indistinguishable nodes are merged, and the degree is the external one: a node's own
 twins do not count (Amestoy, Davis & Duff 1996). They are noticed among the neighbours of a pivot,

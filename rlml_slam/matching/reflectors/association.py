@@ -106,7 +106,7 @@ class Associator:
         return self._joint[min(matches, len(self._joint)) - 1]
 
     def doubles(self, detections: Detections, match: Indices) -> Indices:
-        """(k,): the match that an anonymous unmatched detection cannot be told from, or -1."""
+        """(k,): the match of a detection too near to an anonymous unmatched one, or -1."""
         out = np.full(len(detections), -1, dtype=np.int64)
         matched = np.flatnonzero(match >= 0)
         unmatched = np.flatnonzero((match < 0) & (detections.ids == ANONYMOUS))

@@ -63,10 +63,10 @@ def compatible_pairs(
 
 @kernel
 def separable(noise: Array, ids: Indices, limits: Limits) -> Array:
-    """Distance (k,) from which on two reflectors can be told apart.
+    """Least distance (k,) [m] at which two reflectors can be distinguished.
 
-    That is ``min_separation``, and never less than what an anonymous detection's own ``noise``
-    (k, 2, 2) allows: it can be of either of two markers within it, and both count as one.
+    That is ``min_separation``; for an anonymous detection it is at least ``blur`` times the
+    largest sigma of its ``noise`` (k, 2, 2), as it may be of either of two reflectors within it.
     """
     out = np.empty(len(ids))
     for i in range(len(ids)):
@@ -159,7 +159,7 @@ def odds(d2: Array, log_det: Array, j: int, density: float) -> float:
 
 @part
 def keep_apart(seen: Array, ids: Indices, limit: Array, status: Indices) -> None:
-    """Of unknown detections that cannot be told apart, only the first begins a reflector."""
+    """Of unknown detections nearer than ``limit``, only the first may begin a reflector."""
     for i in range(len(ids)):
         if ids[i] != ANONYMOUS or (status[i] != NEW and status[i] != DEFERRED):
             continue

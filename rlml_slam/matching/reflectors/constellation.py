@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where in a map of reflectors anonymous detections were made; or that they cannot tell.
+"""Global pose in a map of reflectors from anonymous detections, with a test of uniqueness.
 
 Every pose at which at least three detections fall on reflectors is found (pair_votes), fitted and
 scored. The best one is unique only where chance does not make such a match and no other pose is
@@ -31,7 +31,7 @@ from rlml_slam.se2 import Array
 from rlml_slam.types import Verdict
 
 MAX_CANDIDATES = 50  # different poses that are fitted; those with fewest matches are left out
-TYPICAL = 5  # the pose of this rank behind the best tells what chance gives in this map
+TYPICAL = 5  # rank behind the best of the candidate that measures the matches by chance
 SAME_PLACE, SAME_TURN = 0.1, 0.02  # [m], [rad] poses as near as this are one
 
 
@@ -198,9 +198,9 @@ class _Search:
     def _scored(self, T: Array, cov: Array, match: NDArray[np.int64], chi2: float) -> Candidate:
         """The likelihood ratio of a pose against one at which every detection is a ghost.
 
-        Inside its gate, a match counts the same wherever it lies: in a hall that looks the same
-        twice, how well each reflector was mapped differs between the two, and would pretend to
-        tell them apart.
+        Inside its gate, the likelihood of a match is constant: in a hall with a repeated layout,
+        the residuals of the two poses differ only by the errors of the map, which must not decide
+        between them.
         """
         p = self._params
         hit = np.flatnonzero(match >= 0)
@@ -255,9 +255,10 @@ class _Search:
 
         A contrario (Moisan, Stival 2004): of each proposal, two matches are given and the other
         detections fall into some reflector's gate independently, with the share of the map that
-        gates cover. Rows of reflectors meet more often than that; how often, the poses tell that
-        come after the best. The first few of them are left out, as a layout that looks nearly the
-        same turned has them.
+        gates cover. Regular rows of reflectors match more often than that, so the share is raised
+        until TYPICAL poses are expected to reach the number of matches of the candidate TYPICAL
+        ranks behind the best. The candidates before it are left out, as a nearly symmetric layout
+        has some of its own.
         """
         others = len(self._z) - 2
         var = self._p_var.mean() + self._z_var.mean()

@@ -162,7 +162,7 @@ def vote(
             length = math.hypot(dx, dy)
             tolerance = g * math.sqrt(z_var[a] + z_var[b] + 2.0 * widest_var)
             if length <= 2.0 * tolerance:
-                continue  # such a pair tells no heading
+                continue  # too short a baseline to determine the heading
             low = _bisect(pairs.length, length - tolerance)
             high = _bisect(pairs.length, length + tolerance)
             if low == high:

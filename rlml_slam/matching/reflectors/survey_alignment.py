@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a map of reflectors lies in the frame of a survey: told for sure, or not at all.
+"""Pose of a map of reflectors in the frame of a survey, or none where it is not unique.
 
-Three reflectors or more that tell the ids of the survey place it, if they stand as surveyed; else
-the constellation does, where it fits one place and no other.
+It is computed from at least three reflectors that have an id in common with the survey, if they
+stand as surveyed; else from the constellation of all reflectors, if it fits at one pose only.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ROUNDS = 5  # of pairing and fitting: the first pairs may lack some at the edge
 
 @dataclass(frozen=True)
 class Placement:
-    """``T_survey_map`` (3,), None where nothing tells it, and ``why`` in words.
+    """``T_survey_map`` (3,), None where it is not determined, and the reason ``why``.
 
     ``pairs`` (k, 2) are rows of the map and of the survey.
     """
@@ -85,7 +85,7 @@ def pairs_at(found: Reflectors, surveyed: Survey, T: Array, sigma: float) -> NDA
 def _common_ids(
     found: Reflectors, surveyed: Survey
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of the map and of the survey that tell the same id; one told twice tells nothing."""
+    """Rows of the map and of the survey with the same id, ids that the map has twice left out."""
     ids, counts = np.unique(found.ids[found.ids != ANONYMOUS], return_counts=True)
     once = np.intersect1d(ids[counts == 1], surveyed.ids)
     rows = [np.flatnonzero(np.isin(x, once)) for x in (found.ids, surveyed.ids)]

@@ -27,8 +27,8 @@ def window(
 ) -> Candidate:
     """The best pose on a lattice around ``pose`` (3,), ties to the nearest.
 
-    The objective is the mean of M less prior_loss(): where the scan does not tell (along a
-    corridor), the prior does. Without ``whitening`` (3, 3) it is the scan alone.
+    The objective is the mean of M less prior_loss(): where the scan leaves the pose open
+    (along a corridor), the prior determines it. Without ``whitening`` (3, 3) it is the scan alone.
 
     ``points`` (n, 2) in the base frame. Shifts are multiples of ``stride`` cells; the angular
     step moves the mean end point by as much.

@@ -44,21 +44,21 @@ def _accumulate(
     """Sum of J^T J over the inliers (3, 3), x, y, theta of the pose in the submap frame.
 
     Then by how much (one sigma) the noise of the normals may leave more in a direction that is
-    along all surfaces than was taken off for it. ``sparse``: whether surfaces count that few
-    beams tell, far away.
+    along all surfaces than was taken off for it. ``sparse``: whether far surfaces
+    that only a few beams hit count too.
     """
     H, unsure = np.zeros((3, 3)), 0.0
     J = np.empty(3)
     c, s = math.cos(pose[2]), math.sin(pose[2])
     n = len(points)
-    place, fits, told = np.empty((n, 2)), np.empty(n, np.bool_), np.empty(n, np.bool_)
+    place, fits, usable = np.empty((n, 2)), np.empty(n, np.bool_), np.empty(n, np.bool_)
     for k in range(n):
         px, py = points[k, 0], points[k, 1]
         place[k, 0] = (pose[0] + c * px - s * py) * scale - corner_j
         place[k, 1] = (pose[1] + s * px + c * py) * scale - corner_i
         fits[k] = sample(values, place[k, 0], place[k, 1])[0] >= INLIER
         # beside a post that is not in the submap, a wall point would seem to hold the pose along
-        told[k] = fits[k] or not sparse
+        usable[k] = fits[k] or not sparse
     for k in range(n):
         if not fits[k]:
             continue
@@ -66,7 +66,7 @@ def _accumulate(
         rx, ry = c * px - s * py, s * px + c * py
         column, row = place[k, 0], place[k, 1]
         first, last = max(0, k - WINDOW), min(n, k + WINDOW + 1)
-        count, sxx, sxy, syy = _scatter(points, told, k, first, last, REACH)
+        count, sxx, sxy, syy = _scatter(points, usable, k, first, last, REACH)
         least = 5
         if count < 5 and sparse:
             least = 4
@@ -75,9 +75,9 @@ def _accumulate(
                 first -= 1
             while last < min(n - 1, k + FEW) and _joined(points, last):
                 last += 1
-            count, sxx, sxy, syy = _scatter(points, told, k, first, last + 1, np.inf)
+            count, sxx, sxy, syy = _scatter(points, usable, k, first, last + 1, np.inf)
         if count < least:
-            continue  # too lonely to tell a pole from a wall seen at a grazing angle
+            continue  # too few neighbours to distinguish a pole from a wall at a grazing angle
         mean, half = 0.5 * (sxx + syy), 0.5 * (sxx - syy)
         root = math.sqrt(half * half + sxy * sxy)
         along, across = mean + root, mean - root
@@ -112,14 +112,14 @@ def _accumulate(
 
 @part
 def _scatter(
-    points: Array, told: NDArray[np.bool_], k: int, first: int, end: int, reach: float
+    points: Array, usable: NDArray[np.bool_], k: int, first: int, end: int, reach: float
 ) -> tuple[int, float, float, float]:
-    """How many of the points [first, end) that are told are near point k, and their scatter."""
+    """Number of usable points of [first, end) within ``reach`` of point k, and their scatter."""
     px, py, count = points[k, 0], points[k, 1], 0
     sx = sy = sxx = sxy = syy = 0.0
     for q in range(np.uint64(first), np.uint64(end)):
         dx, dy = points[q, 0] - px, points[q, 1] - py
-        if told[q] and dx * dx + dy * dy < reach * reach:
+        if usable[q] and dx * dx + dy * dy < reach * reach:
             count += 1
             sx += dx
             sy += dy

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What neighbours in a scan tell of the surface that an end point lies on.
+"""Surface that an end point lies on, estimated from its neighbours in the scan.
 
 A laser samples a wall at points; a grid that holds only these points has a texture along the
 wall that the wall does not have, and a match sticks to it. So gaps between neighbours on one
@@ -17,8 +17,8 @@ from rlml_slam.se2 import Array
 MAX_GAP = 0.6  # [m] wider gaps between neighbours are not filled
 BEND = 0.1  # slope of the next neighbour off the line, up to which it is one surface
 ROUGHNESS = 0.03  # [m] scatter of end points across a surface
-REACH = 3  # neighbours on each side that tell the surface
-WIDE = 9  # as many where the former are too close together to tell
+REACH = 3  # neighbours on each side from which the surface is estimated
+WIDE = 9  # neighbours on each side where the former are too close together for it
 MAX_STEP = 1.0  # [m] neighbours farther apart are not of one surface
 FLAT = 0.02  # variance across per variance along, below which neighbours are a line
 
@@ -68,7 +68,8 @@ def constraints(points: Array) -> Array:
     """Per end point (n, 3) the matrix [[a, b], [b, c]] as (a, b, c) that its slope goes through.
 
     ``points`` (n, 2) in scan order, base frame. On a surface with unit normal u it is u u^T, in
-    clutter the identity, and 0 for a point too lonely to tell a post from a grazed wall.
+    clutter the identity, and 0 for a point with too few neighbours to distinguish a post from a
+    wall at a grazing angle.
     """
     n = len(points)
     out = np.zeros((n, 3))

@@ -19,7 +19,7 @@ NEAREST = 0.125  # [m] where the first octave begins
 FALLING = 1.0  # octave from which on brightness falls with range: 0.25 m
 BELIEVED = 4.0  # factor by which a farther octave may raise the brightness of a nearer one
 QUANTILE = 0.75  # of an octave's brightness; glare may take up to a quarter of its beams
-MIN_BEAMS = 16  # an octave with fewer beams tells nothing
+MIN_BEAMS = 16  # an octave with fewer beams is left out
 MAX_WINDOW = 400  # [beams] half a reflector at most, so that the cost is bounded
 
 

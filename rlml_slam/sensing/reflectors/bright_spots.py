@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bright spots of a scan, and which of them have the shape of a reflector.
 
-A reflector is told from glare, vests and saturated walls by its width, by its depth, and by its
-edges: it ends from one beam to the next, while glare fades.
+A reflector is distinguished from glare, vests and saturated walls by its width, its depth and
+its edges: it ends from one beam to the next, while glare fades.
 """
 
 from __future__ import annotations
@@ -182,7 +182,7 @@ def _judge(
             angle_min, increment, circular, settings,
         ):  # fmt: skip
             continue
-        # a width that beams this far apart tell to half their spacing
+        # each of the two edges is uniform within one spacing of beams: variance spacing^2 / 12
         var_width = spacing**2 / 6.0 + (0.5 * settings.size_tolerance) ** 2 + 1e-12
         weights[shape] = math.exp(-0.5 * (row[WIDTH] - width) ** 2 / var_width) + 1e-9
         total += weights[shape]

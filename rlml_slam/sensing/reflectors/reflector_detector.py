@@ -56,8 +56,8 @@ class Found:
         """The same as anonymous detections in the frame of the laser at the scan's stamp.
 
         ``sweep`` (3,) is the motion of base during the whole sweep, at constant twist: what beam
-        k of n saw is moved by T_base_laser^-1 exp(k / n log(sweep)) T_base_laser. What a laser
-        that turned saw with its first and again with its last beams is told once.
+        k of n saw is moved by T_base_laser^-1 exp(k / n log(sweep)) T_base_laser. A reflector
+        that a turning laser saw with its first and again with its last beams is returned once.
         """
         share = self.beams / max(len(scan.ranges), 1)
         moved = se2.exp(share[:, None] * se2.log(sweep))

@@ -13,9 +13,9 @@ from rlml_slam.sensing.reflectors.spot_edges import angle_of
 from rlml_slam.sensing.reflectors.spot_settings import Settings
 
 PROFILE = 7  # samples of a beam's profile on either side of its middle
-BESIDE = 5  # beams on either side of a spot that tell what it lies in
+BESIDE = 5  # beams on either side of a spot that are checked for a surface around it
 ROUGH = 0.1  # share of its width by which a reflector's surface may be off its shape
-CURVED = 5  # beams that tell a shape
+CURVED = 5  # least number of beams from which a shape is estimated
 FLATTER = 16.0  # chi^2 by which a thing is flat rather than round: 4 sigma
 SUNK = 0.5  # radius by which a cylinder is out of the line of what is beside it at least
 
@@ -39,9 +39,9 @@ def is_flat(
 ) -> bool:
     """Whether what is bright is a part of a flat surface rather than a cylinder.
 
-    It is where its own ranges tell, ``spread`` being what a cylinder leaves of them; or where it
-    lies in a surface that goes on straight at both sides, as paint and glare do: a cylinder
-    stands out of what it is fixed to.
+    It is flat if a plane fits its ranges better than a cylinder by FLATTER in chi^2, ``spread``
+    being the mean squared residual of the cylinder; or if it lies in a surface that goes on
+    straight at both sides, as paint and glare do: a cylinder stands out of what it is fixed to.
     """
     footprint = r * settings.divergence
     _, flat = centre_of(

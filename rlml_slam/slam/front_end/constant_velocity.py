@@ -43,7 +43,7 @@ class ConstantVelocity:
     def predict(self, state: JointState, dt: float, motion: Motion) -> None:
         """Move the pose by its own velocity to a sweep whose stamp is ``dt`` [s] later.
 
-        Of ``motion``, measured without odometry, the turn is used where a gyro tells all of it.
+        Of ``motion``, measured without odometry, the turn is used where a gyro measured all of it.
         """
         p = self._p
         self._pose, (_, self._cov) = state.pose, relative(state.x, state.P)
@@ -143,9 +143,10 @@ def way_cov(way: Array, before: Array, after: Array, heading: float) -> Array:
     """Covariance (3, 3) in base of the way between two poses, with all that was measured.
 
     ``way`` (3, 3) is that of the prediction, ``before`` and ``after`` (3, 3) those of the poses
-    in a submap, in which the robot's heading is ``heading``. What was measured at the second one,
-    relative to the submap, tells the way as well as the first one is known there. But a wrong
-    speed is wrong for many scans: what the pose gets less sure by adds up, and is added.
+    in a submap, in which the robot's heading is ``heading``. What was measured at the second pose,
+    relative to the submap, measures the way with its own covariance plus that of the first pose.
+    But the error of a speed lasts for many scans: the growth of the pose's covariance, which it
+    adds up to, is added.
     """
     c, s = math.cos(heading), math.sin(heading)
     R = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -36,9 +36,9 @@ MOVING = slice(VELOCITY, VELOCITY + 3)
 class JointState:
     """Mean ``x`` (15 + 2m,) and covariance ``P`` of all that is estimated together.
 
-    In this order: the pose, the gyro's bias, the shares by which the robot is faster and turns
-    more than its wheels tell, the velocity (forward, left, turn) of the base, which a robot with
-    odometry does not need (:mod:`coasting`), two anchors, the reflectors; and
+    In this order: the pose, the gyro's bias, the shares by which the robot's speed and turn
+    exceed those that its wheels measure, the velocity (forward, left, turn) of the base, which a
+    robot with odometry does not need (:mod:`coasting`), two anchors, the reflectors; and
     ``extra`` rows, zero but while reflectors are left out (:mod:`distant`): of what they depend
     on, the rows ``tied``, those that are nothing else any more.
     """

@@ -63,9 +63,9 @@ def relative(x: Array, P: Array) -> tuple[Array, Array]:
 def swept(x: Array, P: Array, half: Array, velocity: Array) -> tuple[Array, Array, Array]:
     """Where a match finds the robot in the submap (3,), D of it (3, 9), its covariance (3, 3).
 
-    The beams of a sweep tell where the robot is in the middle of it, and the ``velocity`` (3,)
-    that they were de-skewed with, where it was at the begin: what that is wrong by moves the
-    match, for ``half`` (3,) [s] of the sweep. D is by pose, anchor and velocity.
+    The beams of a sweep constrain the pose at the middle of it. The pose at its begin follows by
+    the ``velocity`` (3,) that they were de-skewed with, whose error moves the match by ``half``
+    (3,) [s] times that error. D is by pose, anchor and velocity.
     """
     pose, cov = relative(x, P)
     J = np.zeros((3, 9))
