@@ -59,6 +59,10 @@ COMMANDS: Table = {
                 'rlml_lab.studies.study_store',
                 'map files that are cut off, flipped, or killed while saved',
             ),
+            'live-load': Command(
+                'rlml_lab.studies.study_live_load',
+                'a map loaded while the robot drives, over DDS, with searches that take long',
+            ),
             'victoria-park': Command(
                 'rlml_lab.studies.study_victoria_park',
                 'dead reckoning, EKF and RLML among trees, against GPS',
