@@ -36,10 +36,10 @@ def answer(package, cache=None):
     """What the kernel answers to 10 in a new process; ``cache`` is Numba's folder."""
     code = 'from some.kernels import answer; print(answer(10))'
     path = f'{package.parent}:{Path(rlml_slam.__file__).parents[1]}'
-    told = {} if cache is None else {'NUMBA_CACHE_DIR': str(cache)}
+    cache_env = {} if cache is None else {'NUMBA_CACHE_DIR': str(cache)}
     done = subprocess.run(
         [sys.executable, '-c', code],
-        env={'PYTHONPATH': path, 'HOME': str(package.parent), **told},
+        env={'PYTHONPATH': path, 'HOME': str(package.parent), **cache_env},
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     return int(done.stdout)

@@ -286,7 +286,7 @@ def test_turn_rate_is_the_imus_where_there_is_one():
     assert m.cov[2, 2] == pytest.approx(sigma**2 * NOISE.noise_interval * 1.0, rel=1e-6)
     assert m.bias_gain[2] == pytest.approx(-1.0)
     np.testing.assert_array_equal(m.turn_gain, 0.0)
-    # what wheels and IMU differ by is the bias, as well as both tell
+    # the difference of wheels and IMU is the bias, with the variance of both
     assert m.bias == pytest.approx(0.2, rel=1e-6)
     assert m.bias_turn == pytest.approx(0.7, rel=1e-6)
     wheels = NOISE.turn_noise * 0.5 + NOISE.turn_noise_floor
@@ -343,7 +343,7 @@ def test_motion_across_a_long_gap_is_unknown_and_wide():
     m = with_gap(gap).motion(T0 + 2 * SECOND, T0 + round((2.0 + gap) * SECOND))
     assert not m.known
     np.testing.assert_array_equal(m.delta, 0.0)
-    # a speed that lasts, and a turn rate that is unknown anew in each interval: after so long, no
+    # a speed that lasts, and a turn rate that is independent in each interval: after so long, no
     # heading is left to be known either way
     expected = (np.array([NOISE.max_speed, NOISE.max_speed, NOISE.max_turn_rate]) / 5.0) ** 2
     lasted = np.array([gap, gap, NOISE.noise_interval])

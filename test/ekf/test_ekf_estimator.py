@@ -42,13 +42,13 @@ def detections(stamp, pose, ids, rng=None):
     R = se2.rotation(b)
     D = np.zeros((len(r), 2, 2))
     D[:, 0, 0], D[:, 1, 1] = SIGMA[0] ** 2, (r * SIGMA[1]) ** 2
-    told = near if ids else np.full(len(near), ANONYMOUS)
+    reported_ids = near if ids else np.full(len(near), ANONYMOUS)
     return Detections(
         stamp,
         'base_link',
         r[:, None] * R[:, :, 0],
         R @ D @ R.transpose(0, 2, 1),
-        told.astype(np.int64),
+        reported_ids.astype(np.int64),
         np.full(len(r), np.nan),
     )
 
@@ -56,7 +56,7 @@ def detections(stamp, pose, ids, rng=None):
 def drive(p, rng=None, ids=False, steps=STEPS, q=Q, wheels=(0.0, 0.0)):
     """Frames and true poses of a drive; the wheels' and the sensor's noise only with ``rng``.
 
-    ``wheels``: by what share the robot is faster, and turns more, than they tell.
+    ``wheels``: by what share the robot is faster, and turns more, than they measure.
     """
     estimator, pose, frames, truth = Estimator(p), np.zeros(3), [], []
     for k in range(steps):

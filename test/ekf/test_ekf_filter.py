@@ -130,9 +130,9 @@ def near_now(f, radius):
 def test_postponed_update_equals_the_plain_filter(invariant, wheels, steps):
     plain = Filter(POSE, COV, 0.02, POINT, invariant, wheels)
     rng = np.random.default_rng(5)
-    told = np.array([0.3, 0.0, 0.05])
+    delta = np.array([0.3, 0.0, 0.05])
     motions = [
-        Motion(told + 0.01 * rng.standard_normal(3), Q, turn_gain=told * [0.0, 0.0, 1.0])
+        Motion(delta + 0.01 * rng.standard_normal(3), Q, turn_gain=delta * [0.0, 0.0, 1.0])
         for _ in range(200)
     ]
     noise = 0.01 * rng.standard_normal((200, 50, 2))

@@ -102,7 +102,7 @@ def test_the_note_s_line_landmark_follows_the_robot_s_error():
         # no innovation at all, though H says that x was measured
         assert np.abs(as_range_and_bearing(pose) - h).max() < 1e-12
     assert abs(POINT.observe(wrong, landmark)[1][0, 0, 0]) > 0.5
-    # what a line does tell does not change along the wall
+    # the information of a line does not change along the wall
     line = line_model(fixed)
     assert np.abs(line.observe(true, landmark)[1][0, :, 0]).max() < 1e-12
 

@@ -126,14 +126,14 @@ def curved_case(rng, n=40):
     landmarks = rng.uniform(-4.0, 4.0, (6, 2))
     steps, truth = [], []
     for k in range(n):
-        told = np.array([0.2, 0.0, 0.12])
+        delta = np.array([0.2, 0.0, 0.12])
         gain = np.array([0.0, 0.0, -0.1]) if k % 2 else np.zeros(3)
-        turn = np.zeros(3) if k % 2 else np.array([0.0, 0.0, told[2]])
-        moved = told + gain * true[3] + turn * true[TURN]
+        turn = np.zeros(3) if k % 2 else np.array([0.0, 0.0, delta[2]])
+        moved = delta + gain * true[3] + turn * true[TURN]
         moved[:2] *= 1.0 + true[SPEED]
         moved = moved + np.sqrt(np.diag(Q)) * rng.standard_normal(3)
         bias = true[3] + 0.4 * true[TURN] + 0.01 * rng.standard_normal()
-        motion = Motion(told, Q, True, gain, bias, 1e-4 if k % 3 else np.inf, turn, 0.4)
+        motion = Motion(delta, Q, True, gain, bias, 1e-4 if k % 3 else np.inf, turn, 0.4)
         true[:3] = se2.compose(true[:3], moved)
         true[3] += 1e-3 * rng.standard_normal()
         true[SPEED:ROBOT] *= KEPT
@@ -172,7 +172,7 @@ def test_smoothed_path_is_the_most_probable_one():
     x = np.concatenate([found.start[None], found.states])
     rows = _Problem(start, steps, POINT).rows(x, found.points)
     J = rows.jacobian(x.size + found.points.size)
-    # the gradient of the cost is zero, as far as the last step and rounding tell
+    # the gradient of the cost is zero, up to the last step and rounding
     assert np.abs(J.T @ rows.errors()).max() < 1e-5 * abs(J).max() ** 2
     true = np.concatenate([start.x[None], truth])
     at_truth = _Problem(start, steps, POINT).rows(true, found.points).errors()

@@ -157,7 +157,7 @@ def localizing(saved, start=(0.0, 0.0, 0.0)):
 
 @pytest.mark.parametrize('reflectors', [True, False])
 def test_saved_map_tells_where_the_robot_starts(reflectors):
-    """Nobody told the pose: the first second does."""
+    """No initial pose is given: the first second determines it."""
     path = drive((0.0, 0.1, 1.0), (0.5, 0.3, 3.0), start=(2.0, 1.0, 2.0))
     observed = observations(ROOM, path, rng=np.random.default_rng(1), reflectors=reflectors)
     saved = room_map() if reflectors else room_map(np.zeros((0, 2)))
@@ -235,7 +235,7 @@ def test_robot_that_drives_out_of_its_map_is_degraded_and_goes_on():
 
 
 def test_map_of_a_hall_that_was_rebuilt_is_no_place_to_be_sure_of():
-    """Beyond the gate at 10 m, the walls of the map are gone and others stand farther out."""
+    """Beyond the gate at 10 m, the walls of the map are missing and others stand farther out."""
     rebuilt = np.vstack([hall(0, 3.0, -4.0, 10.0), hall(1, 8.0, 10.0)])
     shut = (rebuilt[:, 0] == 10.0) & (rebuilt[:, 2] == 10.0)
     gate = np.array([[10.0, -3.0, 10.0, -8.0], [10.0, 3.0, 10.0, 8.0]])

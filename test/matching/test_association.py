@@ -287,8 +287,8 @@ def test_match_of_a_lost_pose_is_doubtful_and_of_a_sure_one_used():
 def test_reflector_seen_a_moment_ago_and_one_with_an_id_need_no_proof():
     lost = wary(believed(pose_sigma=1.0), recent=[1])
     assert Associator(Reflector()).associate(seen(lost, [1]), lost).match[0] == 1
-    told = wary(believed(pose_sigma=1.0, ids=[7, 8, 9, 10]))
-    result = Associator(Reflector()).associate(seen(told, [1], ids=[8]), told)
+    with_ids = wary(believed(pose_sigma=1.0, ids=[7, 8, 9, 10]))
+    result = Associator(Reflector()).associate(seen(with_ids, [1], ids=[8]), with_ids)
     assert (result.match[0], result.status[0]) == (1, Status.USED)
 
 

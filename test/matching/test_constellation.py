@@ -213,7 +213,7 @@ def test_one_reflector_that_differs_does_not_decide_but_three_do():
     rng = np.random.default_rng(7)
     reflectors = symmetric(rng)
     for differing, verdict in ((1, Verdict.AMBIGUOUS), (3, Verdict.UNIQUE)):
-        fewer = reflectors[: 20 - differing]  # those whose twins are gone tell the twins apart
+        fewer = reflectors[: 20 - differing]  # reflectors without a twin break the symmetry
         found = search(seen_from(TRUTH, fewer, rng), fewer)
         assert found.verdict is verdict
     assert error_of(found.candidates[0].pose)[0] < 0.05

@@ -122,7 +122,7 @@ def test_answer_waits_for_the_sighting_that_tells():
 
 
 def test_symmetric_place_is_never_decided():
-    # exactly in the middle of two alike: nothing but a third could tell
+    # exactly between two equal candidates: only a third reflector could decide
     h = begin(pose=(0.0, 0.0, 0.0), points=[[4.0, 1.5], [4.0, -1.5]], pose_sigma=(0.2, 2.0, 0.02))
     for _ in range(20):
         h.see([sight(20, np.zeros(3), [4.0, 0.0])])
@@ -162,7 +162,7 @@ def test_drive_with_blind_stretches_is_told_right(seed):
     points = np.array([[0.6, -4.4], [2.9, -4.3], [3.0, -2.4], [1.6, 2.7], [3.3, 3.9], [1.3, 4.5]])
     pose = np.array([2.0, -0.5, -1.5])
     h = MultiHypothesis(pose, np.arange(6), points, np.diag(np.full(15, 1e-4)), 0.02)
-    key, truth_of, wrong, told = 100, {}, 0, 0
+    key, truth_of, wrong, num_answers = 100, {}, 0, 0
     for _ in range(25):
         blind = np.diag([0.25, 0.15, 0.2]) ** 2
         delta = np.array([rng.uniform(-0.5, 1.0), 0.0, rng.uniform(-2.0, 2.0)])
@@ -182,8 +182,8 @@ def test_drive_with_blind_stretches_is_told_right(seed):
                 ]
             )
             for k, other in h.answers(0.999).items():
-                told += 1
+                num_answers += 1
                 wrong += truth_of[k] != truth_of.get(other, other)
     # an answer of a reflector of its own counts as wrong too: all six are known
     assert wrong == 0
-    assert told > 0.5 * len(truth_of)
+    assert num_answers > 0.5 * len(truth_of)

@@ -28,7 +28,7 @@ BARE_WALL = wall((6.0, 2.0), (-6.0, 2.0))
 CORRIDOR = np.vstack([wall((8.0, 1.2), (-8.0, 1.2)), wall((-8.0, -1.2), (8.0, -1.2))])
 
 
-def told(points, pose=POSE, sigma=0.01, params=PARAMS, turn=0.0):
+def information_of(points, pose=POSE, sigma=0.01, params=PARAMS, turn=0.0):
     """Information of a scan of ``points`` (submap frame, turned) taken from ``pose``."""
     rng = np.random.default_rng(0)
     T = np.array([0.0, 0.0, turn])
@@ -44,7 +44,7 @@ def told(points, pose=POSE, sigma=0.01, params=PARAMS, turn=0.0):
 @pytest.mark.parametrize('angle', [0.0, 0.5, np.pi / 2, 2.0])
 @pytest.mark.parametrize('points', [BARE_WALL, CORRIDOR], ids=['wall', 'corridor'])
 def test_direction_along_bare_walls_is_left_open(points, angle):
-    info = told(points, turn=angle)
+    info = information_of(points, turn=angle)
     along = np.array([np.cos(angle), np.sin(angle)])
     across = np.array([-np.sin(angle), np.cos(angle)])
     # against the strongest direction: what the noise of the normals makes up is taken off
@@ -57,7 +57,7 @@ def test_direction_along_bare_walls_is_left_open(points, angle):
 
 
 def test_room_holds_all_directions():
-    info = told(ROOM)
+    info = information_of(ROOM)
     sigma = np.sqrt(np.diag(np.linalg.inv(info)))
     # never better than the floor that more beams do not lower, and close to it
     floor = np.sqrt(PARAMS.variance_floor)
@@ -68,13 +68,13 @@ def test_room_holds_all_directions():
 
 def test_information_is_symmetric_and_not_negative():
     for points in (ROOM, BARE_WALL, CORRIDOR, ROOM[:80]):
-        info = told(points)
+        info = information_of(points)
         np.testing.assert_array_equal(info, info.T)
         assert np.linalg.eigvalsh(info).min() > -1e-9 * np.trace(info)
 
 
 def test_turning_the_world_turns_the_information():
-    info, turned = told(ROOM), told(ROOM, turn=np.pi / 2)
+    info, turned = information_of(ROOM), information_of(ROOM, turn=np.pi / 2)
     R = np.eye(3)
     R[:2, :2] = se2.rotation(np.pi / 2)
     # the same noise on another axis and other cells: a few points change sides
@@ -84,8 +84,8 @@ def test_turning_the_world_turns_the_information():
 
 def test_moving_the_world_by_whole_cells_changes_nothing():
     shift = np.array([40 * 0.05, -60 * 0.05])
-    a = told(ROOM)
-    b = told(ROOM + shift, pose=POSE + np.append(shift, 0.0))
+    a = information_of(ROOM)
+    b = information_of(ROOM + shift, pose=POSE + np.append(shift, 0.0))
     scale = np.sqrt(np.outer(np.diag(a), np.diag(a)))
     np.testing.assert_allclose(b / scale, a / scale, atol=0.02)
 

@@ -186,7 +186,7 @@ def test_component_of_odometry_that_is_right_stays_where_another_loses():
     poses = np.stack([np.linspace(0, 2, 9), np.zeros(9), np.zeros(9)], -1)
     submap = built(world, se2.compose(T, poses), sigma=0.01)
     true = se2.compose(T, [1.1, 0.05, 0.0])
-    # the heading is wrong by 20 sigma; along the corridor only odometry tells
+    # the heading is wrong by 20 sigma; only odometry constrains the position along the corridor
     prior = se2.compose(true, [0.02, 0.0, 0.2])
     tight = np.linalg.inv(np.diag([0.01, 0.01, 0.01]) ** 2)
     found = match(submap, scan(world, true, 360, sigma=0.01), prior, tight)

@@ -344,13 +344,13 @@ def test_the_sweeps_motion_is_taken_out():
 @pytest.mark.parametrize('distance', [2.0, 10.0, 25.0])
 def test_centres_are_unbiased_and_their_covariance_is_honest(diameter, distance):
     f = evaluate_cylinders(Detector(), Laser(), diameter, distance, scans=60, seed=1)
-    # 2 mm asked for, and three sigmas of what 720 cylinders tell
+    # 2 mm required, plus three sigmas of the mean of 720 cylinders
     limit = 2.0 + 3.0 * f['bias_error_mm']
     assert abs(f['bias_along_mm']) < limit
     assert abs(f['bias_across_mm']) < limit
     assert f['detected'] >= 0.95
     assert f['false'] == 0
-    # two degrees of freedom; the middle of samples is nearer than independent samples tell
+    # two degrees of freedom; the mean error is smaller than for independent samples
     assert 0.5 < f['nees'] < 2.4
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scan that is sent again is told from one of a robot that stands."""
+"""A repeated scan is distinguished from a new scan of a robot at rest."""
 
 import numpy as np
 import pytest

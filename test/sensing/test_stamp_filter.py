@@ -19,7 +19,7 @@ REFLECTORS = np.array([[3.0, 1.0], [-2.0, 4.0], [1.0, 8.0], [5.0, 5.0]])
 TWIST = np.array([1.0, 0.0, 0.3])
 
 
-def told(stamps):
+def filtered_stamps(stamps):
     clock = StampFilter()
     return np.array([clock.filtered(int(s)) for s in stamps])
 
@@ -35,7 +35,7 @@ def jittered(true, rng, sigma=20):
 @pytest.mark.parametrize('period', [100, 20, 10])
 def test_jitter_of_a_steady_sensor_is_averaged_over_the_window(period):
     true = ticks(period, 8000)
-    error = (told(jittered(true, np.random.default_rng(0))) - true)[WINDOW:] / MS
+    error = (filtered_stamps(jittered(true, np.random.default_rng(0))) - true)[WINDOW:] / MS
     # the end of a line through n stamps has 2 / sqrt(n) of their error; a tenth of it is the
     # sampling error of some twenty independent windows
     assert 0.7 * 2.0 < error.std() < 1.3 * 2.0
@@ -54,13 +54,13 @@ def test_the_error_that_is_left_is_told(seed):
     assert 0.6 < normalised.std() < 1.5
     # before a line is believed, the stamps have all of their jitter
     assert 10 * MS < sigma[ENOUGH - 2] < 30 * MS
-    assert told(true).tolist() == true.tolist()
+    assert filtered_stamps(true).tolist() == true.tolist()
     assert StampFilter().sigma == 0.0
 
 
 def test_stamps_with_little_jitter_stay_as_they_are():
     true = ticks(100, 300) + np.random.default_rng(0).integers(0, 3 * MS, 300)
-    np.testing.assert_array_equal(told(true), true)
+    np.testing.assert_array_equal(filtered_stamps(true), true)
 
 
 def test_intervals_that_vary_are_not_jitter():
@@ -69,13 +69,13 @@ def test_intervals_that_vary_are_not_jitter():
         steps = 100.0 * MS * np.maximum(1.0 + share * rng.standard_normal(3000), 0.1)
         true = SECOND + np.cumsum(steps).astype(np.int64)
         # a random walk may look like a line for a while
-        assert np.mean(told(true) != true) < 0.05
+        assert np.mean(filtered_stamps(true) != true) < 0.05
 
 
 def test_bursts_are_not_jitter():
     # ten at once every second: as far off a line as white jitter of three periods, but in order
     true = np.sort(ticks(1000, 200)[:, None] + np.arange(10) * MS, axis=None)
-    np.testing.assert_array_equal(told(true), true)
+    np.testing.assert_array_equal(filtered_stamps(true), true)
 
 
 def test_exact_stamps_of_messages_that_overtake_one_another_stay():
@@ -91,7 +91,7 @@ def test_exact_stamps_of_messages_that_overtake_one_another_stay():
 def test_lost_messages_are_counted():
     true = ticks(100, 400)
     kept = np.delete(true, [150, 200, 201, *range(250, 256)])
-    error = told(jittered(kept, np.random.default_rng(1), 10.0)) - kept
+    error = filtered_stamps(jittered(kept, np.random.default_rng(1), 10.0)) - kept
     assert np.abs(error[ENOUGH:]).max() < 20 * MS
 
 
@@ -101,7 +101,7 @@ def test_message_lost_before_there_is_a_line_does_not_hide_all_others(seed, sigm
     rng = np.random.default_rng(seed)
     true = ticks(100, 6000)
     kept = true[(rng.random(len(true)) > 0.02) & (np.arange(len(true)) != 4)]
-    error = (told(jittered(kept, rng, sigma)) - kept)[2 * WINDOW :] / MS
+    error = (filtered_stamps(jittered(kept, rng, sigma)) - kept)[2 * WINDOW :] / MS
     # where one was lost, the stamp stays as it is
     assert np.mean(np.abs(error) > 0.5 * sigma) < 0.03
     assert np.sqrt((error**2).mean()) < 0.4 * sigma
@@ -110,7 +110,7 @@ def test_message_lost_before_there_is_a_line_does_not_hide_all_others(seed, sigm
 def test_jump_of_the_clock_begins_another_line():
     true = np.concatenate([ticks(100, 200), 5 * SECOND // 3 + 500 * SECOND + ticks(100, 200)])
     stamps = jittered(true, np.random.default_rng(2))
-    out = told(stamps)
+    out = filtered_stamps(stamps)
     np.testing.assert_array_equal(out[200 : 200 + ENOUGH - 1], stamps[200 : 200 + ENOUGH - 1])
     assert np.std(out[350:] - true[350:]) < 0.6 * np.std(stamps[350:] - true[350:])
 
@@ -157,6 +157,6 @@ def test_what_is_seen_is_moved_to_its_stamp_and_keeps_it():
 def test_motion_between_jittered_stamps_is_less_sure():
     motion = Motion(np.array([0.1, 0.0, 0.05]), 1e-6 * np.eye(3))
     wider = widened(motion, 100 * MS, 0.02)
-    gone = motion.delta / 0.1 * 0.02
-    np.testing.assert_allclose(wider.cov - motion.cov, np.outer(gone, gone))
+    shift = motion.delta / 0.1 * 0.02
+    np.testing.assert_allclose(wider.cov - motion.cov, np.outer(shift, shift))
     assert widened(motion, 100 * MS, 0.0) is motion

@@ -168,7 +168,7 @@ def test_lone_scan_waits_for_its_detections_only_if_they_use_to_come():
 
 def test_nothing_waits_longer_than_the_timeout():
     synchronizer, t = running(transform_timeout=0.2)
-    # odometry is gone; only scans come
+    # odometry has stopped; only scans arrive
     out = feed(synchronizer, [scan(t + k * 100 * MS) for k in range(1, 8)])
     assert [o.stamp for o in out] == [t + k * 100 * MS for k in range(1, 5)]
     assert synchronizer.inputs.counts['scan']['waited_out'] == 4
@@ -267,7 +267,7 @@ def test_detections_are_moved_from_their_sensor_to_the_base():
     synchronizer, t = running(use_scan=False)
     T = np.array([0.5, 0.2, np.pi / 2])
     synchronizer.set_sensor_pose('mast', T)
-    # one is too far, and one in the sensor itself: so do some drivers tell that they saw none
+    # one is too far, and one in the sensor itself: some drivers report an empty scan this way
     seen = ((2.0, 1.0), (300.0, 0.0), (0.0, 0.0))
     (o,) = feed(synchronizer, [detections(t, seen, frame='mast')])
     np.testing.assert_allclose(o.detections.points, [[-0.5, 2.2]], atol=1e-12)
@@ -327,7 +327,7 @@ def test_one_stamp_ahead_costs_no_observation(ahead, stream):
         out = feed(synchronizer, [*inputs[:at], bad, *inputs[at:]]) + synchronizer.flush()
         assert synchronizer.inputs.counts[stream]['future'] == 1
         known = [o for o in out if o.motion.known and o.odom_pose is not None]
-        # of the first message nothing else tells that it is wrong
+        # nothing else shows that the first message is wrong
         assert len(known) >= 30 - (0 if at else 3)
         assert max(o.stamp for o in out) < late
 

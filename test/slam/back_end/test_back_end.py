@@ -278,14 +278,14 @@ def test_neighbours_seen_together_are_never_merged():
 
 def test_reflectors_keep_the_id_and_the_diameter_that_some_detection_told():
     frames = frames_along(CURVE, scan=False, ids=True)
-    told = []
+    changed = []
     for k, f in enumerate(frames):
         d = f.observation.detections
         ids = d.ids if k % 4 == 1 else np.full(len(d), ANONYMOUS)
         diameters = np.where(k % 4 == 2, 0.01 * d.ids, np.nan)
         o = replace(f.observation, detections=replace(d, ids=ids, diameters=diameters))
-        told.append(replace(f, observation=o, landmarks=d.ids - 100))
-    found = run(told)[0].reflectors()
+        changed.append(replace(f, observation=o, landmarks=d.ids - 100))
+    found = run(changed)[0].reflectors()
     np.testing.assert_array_equal(found.ids, found.keys + 100)
     np.testing.assert_allclose(found.diameters, 0.01 * found.ids)
 

@@ -210,7 +210,7 @@ def test_wheels_that_err_for_long_are_in_the_covariance_after_a_loop(honest):
             poses[k + 1] = se2.compose(poses[k], moved)
         keys = chain(steps)
         graph, way = graph_of(keys), PathCovariance()
-        # a short loop, which tells next to nothing of the shares
+        # a short loop, which hardly constrains the scale errors
         true = se2.between(poses[12], poses[15])
         seen = se2.compose(true, np.sqrt(np.diag(MATCH)) * rng.standard_normal(3))
         found = closure(graph, 0, 12, 15, seen, MATCH)

@@ -133,7 +133,7 @@ def test_nothing_that_is_kept_grows_with_the_laps():
     assert back_end.loop_closer.tried[True] > 20
     early, late = np.array(sizes[-8:-4]), np.array(sizes[-4:])
     # edges come up to their limit by and by, and what is pruned then comes and goes by a third
-    # from lap to lap: late laps together tell a growth
+    # from lap to lap: late laps together show a growth
     assert (late.mean(axis=0) <= 1.1 * early.mean(axis=0)).all(), sizes
     # as many sightings as keyframes come with, at the most
     assert sizes[-1][2] <= len(SQUARE.reflectors) * sizes[-1][0]
@@ -228,7 +228,7 @@ def test_frames_of_a_keyframe_that_goes_stay_where_they_are():
 
 @pytest.mark.parametrize('limit', [60, 1000])
 def test_path_is_the_same_however_late_anyone_asks_for_it(limit):
-    """Frames hang on keyframes that have gone, one after the other, until they are looked for."""
+    """Frames refer to keyframes that were removed one by one, until the path is read."""
     rng = np.random.default_rng(5)
     lazy, eager = FrameTrajectory(limit), FrameTrajectory(limit)
     keys, local = np.zeros((0, 3)), np.zeros(3)
@@ -243,10 +243,10 @@ def test_path_is_the_same_however_late_anyone_asks_for_it(limit):
             for path in (lazy, eager):
                 path.add(10 * k + n, 0.1 * n * np.ones(3))
         if k % 4 == 3:
-            gone = rng.choice(np.arange(1, len(keys) - 1), min(3, len(keys) - 3), replace=False)
-            left = np.setdiff1d(np.arange(len(keys)), gone)
+            removed = rng.choice(np.arange(1, len(keys) - 1), min(3, len(keys) - 3), replace=False)
+            left = np.setdiff1d(np.arange(len(keys)), removed)
             new, onto = np.full(len(keys), -1), np.full(len(keys), -1)
-            new[left], onto[gone] = np.arange(len(left)), rng.choice(left, len(gone))
+            new[left], onto[removed] = np.arange(len(left)), rng.choice(left, len(removed))
             for path in (lazy, eager):
                 path.renumber(keys, new, onto)
             keys = keys[left]

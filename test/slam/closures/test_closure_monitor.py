@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A closure that turns out wrong is disabled, told, and may come back; a revoked one may not."""
+"""A wrong closure is disabled, reported, and may come back; a revoked one may not."""
 
 from __future__ import annotations
 

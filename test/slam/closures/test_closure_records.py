@@ -44,8 +44,8 @@ def by_hand(closures, new, edges, poses, most):
     newest = {c.edge: k for k, c in enumerate(kept) if c.accepted}
     kept = [c for k, c in enumerate(kept) if not c.accepted or newest[c.edge] == k]
     rejected = [k for k, c in enumerate(kept) if not c.accepted]
-    gone = set(rejected[: max(len(kept) - most, 0)])
-    return [c for k, c in enumerate(kept) if k not in gone]
+    removed = set(rejected[: max(len(kept) - most, 0)])
+    return [c for k, c in enumerate(kept) if k not in removed]
 
 
 def same(a: Closure, b: Closure) -> bool:
@@ -61,9 +61,9 @@ def test_records_follow_the_graph(seed, most, monkeypatch):
     records = ClosureRecords(expected)
     num_poses, num_edges = POSES, EDGES
     for _ in range(4):
-        gone = rng.choice(num_poses, 4, replace=False).tolist()
-        stay = np.setdiff1d(np.arange(num_poses), gone)
-        poses = {k: int(rng.choice(stay)) for k in gone}
+        removed = rng.choice(num_poses, 4, replace=False).tolist()
+        stay = np.setdiff1d(np.arange(num_poses), removed)
+        poses = {k: int(rng.choice(stay)) for k in removed}
         lost = rng.choice(num_edges, 8, replace=False).tolist()
         left = np.setdiff1d(np.arange(num_edges), lost)
         edges = {k: int(rng.choice(left)) if rng.random() < 0.6 else -1 for k in lost}
@@ -91,10 +91,10 @@ def test_records_follow_the_graph(seed, most, monkeypatch):
 def test_a_pair_that_is_tied_after_all_has_not_failed():
     records = ClosureRecords(tried(np.random.default_rng(1), 40))
     before, pair = list(records), next(c for c in records if not c.accepted)
-    gone = sum(not c.accepted and (c.i, c.j) == (pair.i, pair.j) for c in before)
-    assert records.remove_rejected({(pair.i, pair.j)}) == gone
+    num_removed = sum(not c.accepted and (c.i, c.j) == (pair.i, pair.j) for c in before)
+    assert records.remove_rejected({(pair.i, pair.j)}) == num_removed
     assert (pair.i, pair.j) not in records.rejected_pairs()
-    assert len(records) == len(before) - gone
+    assert len(records) == len(before) - num_removed
     assert records.remove_rejected(set()) == 0
 
 

@@ -35,7 +35,7 @@ def test_state_moves_by_its_velocity_as_in_a_dense_ekf(theta, gain):
     def f(y):
         out = y.copy()
         d = span * y[VELOCITY : VELOCITY + 3]
-        if gain:  # a gyro tells the turn
+        if gain:  # a gyro measures the turn
             d[2] = 0.3 + gain * y[BIAS]
         half = se2.compose(y[:3], (0.0, 0.0, 0.5 * d[2]))
         out[:3] = se2.compose(half, (d[0], d[1], 0.5 * d[2]))

@@ -110,7 +110,7 @@ def test_map_pose_is_the_local_pose_moved_by_the_newest_correction():
         (False, True, True, 1e-7),
         (True, False, True, 0.004),
         (True, True, True, 0.004),
-        # nothing tells the first motions but the sensor itself, whose prior is wide
+        # only the sensor itself measures the first motions, and its prior is wide
         (False, True, False, 0.02),
         (True, False, False, 0.02),
         (True, True, False, 0.02),
@@ -464,8 +464,8 @@ def test_a_moving_robot_is_as_uncertain_as_its_stamps_are():
     unsure, _ = run([replace(o, stamp_sigma=late) for o in observed])
     added = np.array([f.cov_map for f in unsure]) - np.array([f.cov_map for f in sure])
     along = unsure[-1].T_map_base[2]
-    gone = late * speed * np.array([np.cos(along), np.sin(along)])
-    np.testing.assert_allclose(added[-1][:2, :2], np.outer(gone, gone), atol=0.1 * gone @ gone)
+    lag = late * speed * np.array([np.cos(along), np.sin(along)])
+    np.testing.assert_allclose(added[-1][:2, :2], np.outer(lag, lag), atol=0.1 * lag @ lag)
     np.testing.assert_allclose(unsure[-1].T_map_base, sure[-1].T_map_base, atol=1e-12)
 
 

@@ -27,7 +27,7 @@ def motion(**kw):
 
 
 def moved(m, x):
-    """What a motion is by a state (n,) that tells how wheels and gyro err."""
+    """Motion corrected by the errors of wheels and gyro in the state ``x`` (n,)."""
     delta = m.delta + m.bias_gain * x[BIAS] + m.turn_gain * x[TURN]
     return delta * [1.0 + x[SPEED], 1.0 + x[SPEED], 1.0]
 
@@ -129,11 +129,11 @@ def test_bias_that_turning_wheels_tell_is_with_their_share_of_turn():
 
 
 def test_motion_that_tells_the_bias_changes_it():
-    silent, told = made(3), made(3)
-    silent.predict(motion(), 0.0)
-    told.predict(motion(bias=0.02, bias_var=1e-5), 0.0)
-    assert told.P[BIAS, BIAS] < silent.P[BIAS, BIAS]
-    assert abs(told.x[BIAS] - 0.02) < abs(silent.x[BIAS] - 0.02)
+    without_bias, with_bias = made(3), made(3)
+    without_bias.predict(motion(), 0.0)
+    with_bias.predict(motion(bias=0.02, bias_var=1e-5), 0.0)
+    assert with_bias.P[BIAS, BIAS] < without_bias.P[BIAS, BIAS]
+    assert abs(with_bias.x[BIAS] - 0.02) < abs(without_bias.x[BIAS] - 0.02)
 
 
 def test_new_landmark_has_the_covariance_of_its_inverse_observation():

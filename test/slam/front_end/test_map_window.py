@@ -49,12 +49,12 @@ def test_what_stays_in_reach_keeps_what_is_known_of_it():
     index = int(np.argmin(np.abs(AISLE[tracks.keys, 0] - 106.0)))
     key = tracks.keys[index]
     state.apply(LANDMARKS + 2 * index + np.arange(2), np.eye(2), 1e-6 * np.eye(2), np.ones(2))
-    told = state.landmark_covs()[index].copy()
+    cov_before = state.landmark_covs()[index].copy()
     state.x[0] = 100.0 + 1.5 * MARGIN
     window.update(state, tracks)
     (now,) = np.flatnonzero(tracks.keys == key)
-    np.testing.assert_allclose(state.landmark_covs()[now], told)
-    assert told[0, 0] < 1e-5
+    np.testing.assert_allclose(state.landmark_covs()[now], cov_before)
+    assert cov_before[0, 0] < 1e-5
 
 
 def test_nothing_changes_while_the_pose_stays_near(monkeypatch):

@@ -29,11 +29,11 @@ def drive(rng, shares, steps, turning=0.6):
         sigma_v = NOISE.speed_noise * v + NOISE.speed_noise_floor
         sigma_w = NOISE.turn_noise * abs(w) + NOISE.turn_noise_floor
         sigma = np.array([sigma_v, sigma_w]) * DT
-        tells = np.array([v, w]) * DT / (1.0 + shares) + sigma * rng.standard_normal(2)
-        half = 0.5 * tells[1]
-        delta = np.array([tells[0] * np.cos(half), tells[0] * np.sin(half), tells[1]])
+        measured = np.array([v, w]) * DT / (1.0 + shares) + sigma * rng.standard_normal(2)
+        half = 0.5 * measured[1]
+        delta = np.array([measured[0] * np.cos(half), measured[0] * np.sin(half), measured[1]])
         cov = np.diag([sigma[0], 1e-4, sigma[1]]) ** 2
-        by_turn = tells[1] * np.array([-0.5 * delta[1], 0.5 * delta[0], 1.0])
+        by_turn = measured[1] * np.array([-0.5 * delta[1], 0.5 * delta[0], 1.0])
         before = state.pose
         motion = Motion(delta, cov, turn_gain=by_turn)
         state.predict(motion, 0.0, kept, expected_motion(velocity, DT, NOISE))
@@ -70,7 +70,7 @@ def test_shares_are_as_sure_as_they_are_said_to_be():
 
 
 def test_noise_of_the_wheels_is_not_taken_for_a_share():
-    # with what the wheels tell as the derivative, the share of turn comes to -0.4 here
+    # with the measured motion as the derivative, the share of turn comes to -0.4 here
     x, P, _ = drive(np.random.default_rng(2), (0.0, 0.0), 2000, turning=0.0)
     assert abs(x[1]) < 0.01
     assert P[1, 1] == pytest.approx(NOISE.scale_error_sigma[1] ** 2, rel=0.02)

@@ -13,7 +13,7 @@ STEPS = 14
 
 
 def drive(settles):
-    """Target's cells after each of STEPS scans; ``settles`` tells when there is time to carve."""
+    """Target's cells after each of STEPS scans; ``settles``: when there is time to carve."""
     rng = np.random.default_rng(4)
     submaps = Submaps(params.Submap(insertions=SIZE))
     state = JointState(np.zeros(3), np.eye(3) * 1e-6, 0.1)

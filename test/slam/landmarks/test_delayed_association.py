@@ -100,7 +100,7 @@ def test_different_ids_are_never_joined():
     np.testing.assert_array_equal(back_end.reflectors().ids, before.ids)
 
 
-# --- groups that cannot be told apart ----------------------------------------------------------
+# --- groups that cannot be resolved ------------------------------------------------------------
 
 
 def test_group_is_one_reflector_whose_detections_say_less():
@@ -114,8 +114,8 @@ def test_group_is_one_reflector_whose_detections_say_less():
     # half the distance of 0.1 m, with the noise of two detections
     assert group == pytest.approx(0.05**2 + 0.03**2, rel=0.3)
     assert single == 0.0
-    told, given = frames[-1].observation.detections, observed[-1].detections
-    widened = np.trace(told.cov - given.cov, axis1=1, axis2=2)
+    used_detections, given = frames[-1].observation.detections, observed[-1].detections
+    widened = np.trace(used_detections.cov - given.cov, axis1=1, axis2=2)
     used = frames[-1].landmarks == front_end.tracks.keys[0]
     assert (widened[used] > 0.004).all()
     assert (widened[~used] == 0.0).all()

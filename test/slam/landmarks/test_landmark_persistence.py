@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reflectors that are gone, moved or new are told apart, and those that stay are left alone."""
+"""Missing, moved and new reflectors are distinguished; those that stay are unchanged."""
 
 import math
 from dataclasses import replace
@@ -123,8 +123,8 @@ def test_map_and_front_end_have_what_is_there_now(changed):
     assert gap.min(axis=1).max() < 0.05
     held = slam.front_end.reflectors().points
     assert np.linalg.norm(held[:, None] - at(CHANGED)[None], axis=-1).min(axis=1).max() < 0.1
-    gone = [s.key for s in by_state(slam.back_end)['missing']]
-    assert not set(gone) & set(slam.front_end.tracks.keys.tolist())
+    missing = [s.key for s in by_state(slam.back_end)['missing']]
+    assert not set(missing) & set(slam.front_end.tracks.keys.tolist())
 
 
 def test_states_are_saved_with_the_map(changed, tmp_path, capsys):
@@ -197,7 +197,7 @@ def test_odds_follow_bayes():
     assert not persistence._update_odds(m, False, pose, SECOND)
     first = (1 - 3 / 5) / (1 - empty)  # (1 + 2) of (2 + 3)
     assert m.history.odds == pytest.approx(math.log(HIDDEN + (1 - HIDDEN) * first), rel=1e-12)
-    # from the same spot, the same miss tells nothing more
+    # from the same spot, the same miss adds no information
     before = m.history.odds
     persistence._update_odds(m, False, np.array([0.2, 0.0, 0.0]), SECOND)
     assert m.history.odds == before
@@ -215,8 +215,8 @@ def test_odds_follow_bayes():
     assert m.history.odds == pytest.approx(before + math.log(3 / 6 / empty), rel=1e-12)
     for k in range(20):
         persistence._update_odds(m, True, np.array([1.0 * k, 0.0, 0.0]), SECOND)
-    gone = PARAMS.reflector.persistence_threshold
-    assert m.history.odds == pytest.approx(math.log((1 - gone) / gone), rel=1e-12)
+    threshold = PARAMS.reflector.persistence_threshold
+    assert m.history.odds == pytest.approx(math.log((1 - threshold) / threshold), rel=1e-12)
 
 
 def test_no_single_while_ends_a_reflector():

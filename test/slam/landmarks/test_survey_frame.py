@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A survey defines the frame of the map, as soon as the reflectors tell it and not before."""
+"""A survey defines the frame of the map as soon as the reflectors determine it."""
 
 from dataclasses import replace
 
@@ -128,7 +128,7 @@ def test_ids_tell_the_place_where_the_constellation_does_not():
     assert place(anonymous, survey, 0.02).T_survey_map is None
     named = replace(anonymous, ids=np.arange(4))
     np.testing.assert_allclose(place(named, survey, 0.02).T_survey_map, T_PLANT, atol=1e-9)
-    # ids that stand elsewhere than surveyed tell nothing
+    # ids at other places than surveyed give no frame
     swapped = replace(anonymous, ids=np.array([1, 0, 2, 3]))
     assert place(swapped, survey, 0.02).T_survey_map is None
 

@@ -42,10 +42,10 @@ def test_large_frames_and_large_answers_pass_one_another(monkeypatch, batch):
 
     def answer(_back_end, got):
         assert got.observation.points.shape == (20_000, 2)
-        return Update(0, np.zeros(3), False, (), 0.0, gone=MUCH)
+        return Update(0, np.zeros(3), False, (), 0.0, removed=MUCH)
 
     other = back_end_process.BackEndProcess(BackEnd(Parameters()), answer)
     for _ in range(30):
         other.add(frame)
-    assert all(other.update().gone == MUCH for _ in range(30))
+    assert all(other.update().removed == MUCH for _ in range(30))
     assert isinstance(other.bring_home(), BackEnd)

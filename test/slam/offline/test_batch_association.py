@@ -66,8 +66,8 @@ def test_one_cloud_of_many_detections_is_one_reflector():
 
 def test_only_what_is_anonymous_is_open():
     assert BatchAssociation(seen(ROW), Reflector()).is_ambiguous
-    told = [detections_of(ROW, 0, [1, 2, 3])]
-    assert not BatchAssociation(told, Reflector()).is_ambiguous
+    with_ids = [detections_of(ROW, 0, [1, 2, 3])]
+    assert not BatchAssociation(with_ids, Reflector()).is_ambiguous
 
 
 def test_a_ghost_that_nothing_repeats_is_no_reflector():
@@ -81,7 +81,7 @@ def test_a_ghost_that_nothing_repeats_is_no_reflector():
 
 
 def joined(groups, points, sigma=0.1, ids=None):
-    """What is left of reflectors, of which each look sees those told; 0.02 m of noise is told."""
+    """Reflectors left after joining; ``groups``: those in each look; stated sigma 0.02 m."""
     rng, points = np.random.default_rng(0), np.array(points)
     marks = ReflectorPoints(
         points, np.full(len(points), ANONYMOUS) if ids is None else np.array(ids)
@@ -152,7 +152,7 @@ def test_without_any_nothing_is_joined():
 
 
 def test_a_cloud_that_scatters_more_than_it_tells_is_not_spread_over_many():
-    """Of a person with a reflecting vest, among reflectors that scatter as they tell."""
+    """A person with a reflecting vest, among reflectors that scatter as stated."""
     rng, num = np.random.default_rng(0), 400
     still = np.array([[2.0, 1.0], [5.0, 1.0], [5.0, 4.0], [2.0, 4.0]])
     at = still + np.array([0.12, 0.02, 0.02, 0.02])[:, None] * rng.standard_normal((num, 4, 2))

@@ -60,7 +60,7 @@ def test_noiseless_run_stays_exact():
 @pytest.mark.parametrize(('apart', 'sigma'), [(0.15, 0.03), (0.25, 0.08)])
 @pytest.mark.parametrize('seed', [0, 1])
 def test_reflectors_of_a_group_are_told_apart_in_the_end(seed, apart, sigma):
-    """Closer than can be told while the run goes on, which takes a group for one."""
+    """Too close to be resolved during the run, which takes a group for one reflector."""
     place = world(SINGLE, SINGLE + apart * BESIDE)
     slam = run(place, seed, scan=False, sigma=sigma)
     assert len(slam.reflectors()) < len(place.reflectors)
@@ -104,8 +104,8 @@ def test_rows_are_told_apart_though_the_path_is_off_by_their_gaps(seed):
     slam.process(made)
     slam.back_end.finish()
     frames = slam.batch_reassociation.reassociate(slam.back_end.trajectory()[1], slam.reflectors())
-    told, of = np.concatenate([f.landmarks for f in frames]), np.concatenate(truth)
-    pairs = np.unique(np.stack([of, told])[:, told >= 0], axis=1, return_counts=True)[1]
+    keys, of = np.concatenate([f.landmarks for f in frames]), np.concatenate(truth)
+    pairs = np.unique(np.stack([of, keys])[:, keys >= 0], axis=1, return_counts=True)[1]
     assert np.sort(pairs)[-15:].sum() > 0.9 * len(of)  # one of the associations for each of the 15
 
 
@@ -130,8 +130,8 @@ def test_what_is_told_apart_is_as_sure_as_it_was_measured():
     ]
     assert max(extra_variance) > 0.05**2
     slam.back_end.finish()
-    told = slam.batch_reassociation.reassociate(slam.back_end.trajectory()[1], slam.reflectors())
-    for frame, o in zip(told, made, strict=True):
+    frames = slam.batch_reassociation.reassociate(slam.back_end.trajectory()[1], slam.reflectors())
+    for frame, o in zip(frames, made, strict=True):
         np.testing.assert_array_equal(frame.observation.detections.cov, o.detections.cov)
 
 
@@ -180,7 +180,7 @@ def pillar(gap, seed, sigma):
     ('gap', 'seed', 'sigma'), [(0.15, 0, 0.02), (0.2, 0, 0.02), (0.3, 1, 0.04), (0.3, 2, 0.04)]
 )
 def test_what_was_told_apart_the_graph_does_not_take_for_one_again(gap, seed, sigma):
-    """Never seen together, and nearer than the front end can tell them apart."""
+    """Never seen together, and too close for the front end to resolve."""
     slam, place = pillar(gap, seed, sigma)
     found = slam.reflectors()
     off = np.linalg.norm(found.points[:, None] - place.reflectors, axis=-1)
@@ -240,7 +240,7 @@ def test_with_scans_there_is_nothing_to_look_back_on():
 
 
 def test_map_that_is_gone_on_with_stays_what_it_was():
-    """It has seen what this run has not: it is not made anew of the run alone."""
+    """It has seen what this run has not: it is not rebuilt from this run alone."""
     slam = run(world(SINGLE), 6, scan=False, sigma=0.02)
     slam.finish()
     content = map_file.content_of(slam.back_end, Parameters(), None)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reflectors and scan together tell the place, or contradict each other."""
+"""Reflectors and scan together determine the pose, or contradict each other."""
 
 from __future__ import annotations
 

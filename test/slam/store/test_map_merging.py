@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two maps become one where their reflectors tell how they lie, and nowhere else."""
+"""Two maps are merged where their reflectors determine the relative pose, and only there."""
 
 from dataclasses import replace
 
@@ -150,8 +150,8 @@ def test_command_merges_files(two, tmp_path, capsys):
     assert len(map_file.saved_map(map_file.load(out)).reflectors) == len(ROOM.reflectors)
 
 
-@pytest.mark.parametrize(('shared', 'told'), [(7, True), (2, False)])
-def test_maps_that_overlap_by_a_few_reflectors_are_placed_by_these(shared, told):
+@pytest.mark.parametrize(('shared', 'unique'), [(7, True), (2, False)])
+def test_maps_that_overlap_by_a_few_reflectors_are_placed_by_these(shared, unique):
     rng = np.random.default_rng(8)
     west, both, east = (
         rng.uniform(low, high, (n, 2))
@@ -167,6 +167,6 @@ def test_maps_that_overlap_by_a_few_reflectors_are_placed_by_these(shared, told)
     stars = locate(
         seen, cov[0], first, cov[1], replace(Relocalization(), false_share=UNMATCHED_SHARE)
     )
-    assert (stars.verdict is Verdict.UNIQUE) == told, stars.why
-    if told:
+    assert (stars.verdict is Verdict.UNIQUE) == unique, stars.why
+    if unique:
         np.testing.assert_allclose(stars.candidates[0].pose, START, atol=0.03)
