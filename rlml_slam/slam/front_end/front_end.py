@@ -190,10 +190,6 @@ class FrontEnd:
         self._map.use_map(reflectors, grid)
         self._reflectors.use_map(reflectors)
 
-    def use_grid(self, grid: OccupancyGrid | None) -> None:
-        """Replace the grid of the saved map, None for none."""
-        self._map.use_grid(grid)
-
     def relocate(self, T_map_base: Array, cov: Array) -> None:
         """Continue at another pose (3,), (3, 3) of the map, after relocalization.
 
