@@ -40,7 +40,7 @@ COMMANDS: Table = {
                 'whether reflectors alone give the pose, and whether the answer is right',
             ),
             'lego': Command(
-                'rlml_lab.studies.study_lego',
+                'rlml_lab.lego.study_lego',
                 'spikes and EKF on the LEGO robot among cylinders: figures and a picture',
             ),
             'repeatability': Command(

@@ -9,7 +9,7 @@
 ``base_link`` is the middle between the wheels. Each stream has stamps of its own: motors are asked
 less often than scans come, so that every fifth of their rows is the one before once more, and the
 scanner's data is the oldest by the time it is stamped. Here all stamps are the scanner's, those of
-the first beams of its sweeps; :mod:`rlml_lab.studies.lego_time` estimates what lies between.
+the first beams of its sweeps; :mod:`rlml_lab.lego.lego_time` estimates what lies between.
 """
 
 from __future__ import annotations

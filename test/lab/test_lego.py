@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from rlml_lab.lego.lego_scale import Ranges, fit_scale
+from rlml_lab.lego.lego_time import camera_lag, scan_lag
+from rlml_lab.lego.study_lego import camera_view
 from rlml_lab.main import main
-from rlml_lab.studies.lego_scale import Ranges, fit_scale
-from rlml_lab.studies.lego_time import camera_lag, scan_lag
-from rlml_lab.studies.study_lego import camera_view
 from rlml_slam import se2
 from rlml_slam.datasets.lego import (
     BEAM,

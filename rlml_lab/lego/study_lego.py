@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from rlml_lab.studies.lego_scale import Ranges, at, fit_scale, ranges_of
-from rlml_lab.studies.lego_time import camera_lag, scan_lag
+from rlml_lab.lego.lego_scale import Ranges, at, fit_scale, ranges_of
+from rlml_lab.lego.lego_time import camera_lag, scan_lag
 from rlml_slam import se2
 from rlml_slam.datasets.lego import (
     CAMERA_LAG,

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from rlml_lab.studies.lego_scale import Ranges
+from rlml_lab.lego.lego_scale import Ranges
 from rlml_slam import se2
 from rlml_slam.datasets.lego import T_BASE_LASER, Lego
 from rlml_slam.se2 import Array
