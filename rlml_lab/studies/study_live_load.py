@@ -32,7 +32,7 @@ from rlml_slam.ros.codecs import decode
 from rlml_slam.se2 import Array
 
 SYSTEMS = {1: ('slam',), 2: ('front_end', 'back_end')}
-START = 120.0  # [s] for processes to start, and their kernels to be compiled
+START = 400.0  # [s] for processes to start, and their kernels to be compiled
 DRIVE = 25.0  # [s] of wall clock, before the map is saved
 MOST = 30.0  # [s] in which a map has to be entered, besides the delay
 ERROR = 0.3  # [m] of a good pose

@@ -40,7 +40,10 @@ def drive(live, front, back, events, end):
             frames.append(front.last)
             stamp = front.last.stamp
             live.spin_until(lambda t=stamp: back.health.newest >= t)
-            back.mapper.worker.submit(lambda: None).result()
+            # the searches as well: their time is not that of the simulation
+            mapper = back.mapper
+            for worker in (mapper.worker, mapper.searcher.worker, mapper.worker):
+                worker.submit(lambda: None).result()
             live.executor.spin_once(timeout_sec=0.0)
         if event.time >= START + end * SECOND:
             break
