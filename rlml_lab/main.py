@@ -61,7 +61,7 @@ COMMANDS: Table = {
             ),
             'live-load': Command(
                 'rlml_lab.studies.study_live_load',
-                'a map loaded while the robot drives, over DDS, with searches that take long',
+                'load a map while driving, over DDS',
             ),
             'victoria-park': Command(
                 'rlml_lab.studies.study_victoria_park',
