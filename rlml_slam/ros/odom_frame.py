@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the frame of the odometry lies, so that /tf can tell it."""
+"""Pose of the odometry frame in the local frame, for /tf."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rlml_slam.types import Frame
 class OdomFrame:
     """Follows the frames; ``newest`` is the stamp [ns] of the last one and T_local_odom (3,).
 
-    It is None before the first that tells.
+    It is None before the first frame with odometry.
     """
 
     def __init__(self) -> None:

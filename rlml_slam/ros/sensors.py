@@ -29,7 +29,7 @@ DEPTH = 200
 MOTION_DEPTH = 2000
 SENSOR = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 MOTION = QoSProfile(depth=MOTION_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-PATIENCE = 5.0  # [s] of the wall clock, after which it is told what has never come
+PATIENCE = 5.0  # [s] of the wall clock, after which missing inputs are named in the log
 SILENCE = 1.0  # [s] of the wall clock without any message, after which nothing more is waited for
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -38,7 +38,7 @@ class Sensors:
     """Feeds the messages of the streams to a Synchronizer and its observations to ``handle``.
 
     Where the clock jumps back by more than the buffer holds, ``restart`` is called and a new
-    sequencer begins. Scans and detections wait, in order, until /tf_static tells where their
+    sequencer begins. Scans and detections wait, in order, until /tf_static has where their
     sensor is, but no longer than TF_PATIENCE. Where all inputs fall silent, what still waits for
     odometry is used as it is.
     """
@@ -84,7 +84,7 @@ class Sensors:
 
     @property
     def extrinsics(self) -> Extrinsics:
-        """Where the sensors sit, as far as /tf_static has told."""
+        """Where the sensors sit, as far as /tf_static has them."""
         return self._feed.extrinsics
 
     def hangs(self, sensor: str) -> bool:
@@ -102,7 +102,7 @@ class Sensors:
     def _take(self, first: dict[int, list[tuple[str, Any]]]) -> int:
         """Use all that has arrived, ``first`` of each queue before the rest; how many.
 
-        Odometry tells that scans before it are complete. It is taken from its queue before them,
+        Odometry shows that scans before it are complete. It is taken from its queue before them,
         so that a scan that comes between the two takes is not found to be late.
         """
         queues = {k: first.get(k, []) + self._taken(k) for k in reversed(range(len(self._queues)))}
@@ -169,7 +169,7 @@ class Sensors:
         self._release()
 
     def stop_waiting(self) -> None:
-        """Do without what /tf_static has not told yet."""
+        """Stop waiting for transforms on /tf_static."""
         self._waits = False
         self._release()
 
@@ -195,7 +195,7 @@ class Sensors:
         try:
             observations = add()
         except InputError as e:
-            self._logger.warning(f'{e}: everything begins anew')
+            self._logger.warning(f'{e}: the front end starts again')
             self._begin(self.extrinsics)
             self._restart()
             return

@@ -143,7 +143,7 @@ TOPICS = (
     Topic('deformable_slam', IN, 'carrier_velocity', 'geometry_msgs/TwistStamped', SENSOR,
           "the carrier's nominal velocity from the stamp on, in the axes of the map (or no "
           'frame) or of the base'),
-    Topic('deformable_slam', IN, 'initialpose', POSE, RELIABLE, 'begin anew at this pose'),
+    Topic('deformable_slam', IN, 'initialpose', POSE, RELIABLE, 'start again at this pose'),
     Topic('deformable_slam', IN, '/tf_static', 'tf2_msgs/TFMessage', LATCHED,
           'where the sensors sit'),
     Topic('deformable_slam', OUT, 'pose', POSE, RELIABLE,

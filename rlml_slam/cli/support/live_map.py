@@ -44,7 +44,7 @@ def save(node: Any, executor: SingleThreadedExecutor, check: Callable[[], None])
 
 
 def take(run: Run, folder: Path) -> str:
-    """Give a run the map that was saved into a folder, and what it tells; else what is wrong."""
+    """Add the map that was saved into a folder, and its tables, to a run; else the problem."""
     try:
         _take(run, folder)
     except RlmlError as e:

@@ -39,7 +39,7 @@ class Source:
     """What takes the place of a robot: an executable of this package with its parameters.
 
     ``system`` are parameters of front end and back end, ``config`` their parameter file.
-    ``sensor`` is the (topic, type) whose every message asks for a pose. ``progress`` tells the
+    ``sensor`` is the (topic, type) whose every message asks for a pose. ``progress`` shows the
     share of the drive that is done. ``keeps_map``: the run gets the whole map at its end.
     """
 

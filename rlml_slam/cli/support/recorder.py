@@ -28,7 +28,7 @@ from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.codecs.frame_messages import read_record
 from rlml_slam.ros.codecs.message_types import rclpy_class
 from rlml_slam.ros.codecs.reflector_clouds import read_associated, read_reflector_map
-from rlml_slam.ros.codecs.update_message import Told, read_update
+from rlml_slam.ros.codecs.update_message import UpdateSummary, read_update
 from rlml_slam.ros.sensors import LATCHED
 from rlml_slam.ros.systems.simulator_messages import TRUE_REFLECTORS
 from rlml_slam.se2 import Array
@@ -64,7 +64,7 @@ class Recorder(Node):
         self._healths: dict[int, Health] = {}
         self._answers: dict[int, tuple[Level, float]] = {}
         self._seen: dict[int, tuple[int, int]] = {}
-        self._updates: list[Told] = []
+        self._updates: list[UpdateSummary] = []
         self._began: float | None = None
         self._heard = 0.0
         self._path = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)))
@@ -203,8 +203,8 @@ class Recorder(Node):
     def sent(self) -> int:
         """Messages of the sensor that its source says it sent; else those that came here."""
         key = f'{self._sensor[0]} published'
-        told = [int(f[key]) for f in self.figures.values() if key in f]
-        return told[0] if told else self.sensed
+        counted = [int(f[key]) for f in self.figures.values() if key in f]
+        return counted[0] if counted else self.sensed
 
     def error(self) -> float | None:
         """Position error [m] of the newest pose whose truth is known."""
@@ -235,8 +235,8 @@ class Recorder(Node):
         path = self._products.get('trajectory')
         mapped = stamp_of(path) if path is not None else 0
         answered = self.frames.stamps[-1] if self.frames.stamps else 0
-        told = max(self._healths, default=0)
-        return self.sensed >= self.sent() and min(mapped, told) >= answered >= newest
+        reported = max(self._healths, default=0)
+        return self.sensed >= self.sent() and min(mapped, reported) >= answered >= newest
 
     def note(self) -> str:
         """One line for the progress."""
@@ -284,7 +284,7 @@ class Recorder(Node):
         return log
 
     def _reasons(self, stamp: int, level: Level) -> tuple[str, ...]:
-        """Those of the diagnostics nearest in time that told the same level."""
+        """Reasons of the diagnostics nearest in time with the same level."""
         if level is Level.OK:
             return ()
         near = min(

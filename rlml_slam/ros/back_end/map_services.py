@@ -112,10 +112,10 @@ class MapServices:
     def relocalize(self, _request: Any, response: Any) -> Any:
         """Find the newest scan anywhere in the map; while localizing, go on from there."""
 
-        def tell(answer: Any) -> None:
+        def respond(answer: Any) -> None:
             response.success, response.message = answer.result().success, answer.result().text
 
-        return self._relocalize(tell)
+        return self._relocalize(respond)
 
     def reinitialize(self, _request: Any, _response: Any) -> Any:
         """The same for those who ask without wanting an answer: it goes to the log."""
@@ -171,7 +171,7 @@ class MapServices:
 
 
 def refuse_map(node: Any, response: Any, why: RlmlError) -> None:
-    """Answer load_map where a map cannot be had; the answer has no text, so the log tells."""
+    """Answer load_map where a map cannot be had; its answer has no text: the reason is logged."""
     node.get_logger().warning(f'load_map: {why}')
     response.result = (
         LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST

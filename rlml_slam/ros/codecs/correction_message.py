@@ -22,7 +22,7 @@ from rlml_slam.slam.conversation import Correct
 from rlml_slam.types import Belief
 
 # `kind`; an alias maps `key` to `value`, NOTHING is the only row where there is nothing else
-POSE, LANDMARK, CORRECTION, ALIAS, GONE, REMOVED, NOTHING = range(7)
+POSE, LANDMARK, CORRECTION, ALIAS, BELIEF_REMOVED, REMOVED, NOTHING = range(7)
 
 
 def build_correction(make: Make, command: Correct, map_frame: str) -> Any:
@@ -42,7 +42,7 @@ def build_correction(make: Make, command: Correct, map_frame: str) -> Any:
         values = [*b.T_map_base, *b.points.ravel()]
         rows += list(zip(kinds, keys, values, b.cov, strict=True))
         rows += [(ALIAS, key, float(other), none) for key, other in b.aliases.items()]
-        rows += [(GONE, key, 0.0, none) for key in b.removed]
+        rows += [(BELIEF_REMOVED, key, 0.0, none) for key in b.removed]
     rows = rows or [(NOTHING, -1, 0.0, none)]
     layout = [
         ('session', '<u4'), ('kind', 'u1'), ('key', '<i4'), ('value', '<f8'), ('cov', '<f8', (n,))
@@ -89,5 +89,5 @@ def _belief(rows: NDArray[np.void], value: NDArray[np.float64], topic: str) -> B
         value[kind == LANDMARK].reshape(-1, 2),
         cov,
         dict(zip(rows['key'][alias].tolist(), value[alias].astype(int).tolist(), strict=True)),
-        tuple(rows['key'][kind == GONE].tolist()),
+        tuple(rows['key'][kind == BELIEF_REMOVED].tolist()),
     )

@@ -25,7 +25,7 @@ UPDATE = np.dtype(
 
 
 @dataclass(frozen=True)
-class Told:
+class UpdateSummary:
     """One keyframe of the back end: loop closures that it brought, and its cost [ms]."""
 
     keyframe: int
@@ -46,7 +46,7 @@ def build_update(make: Make, stamp: int, map_frame: str, place: Array, update: U
     return build_cloud(make, encode.header(make, stamp, map_frame), cloud)
 
 
-def read_update(msg: Any, topic: str = 'updates') -> Told:
+def read_update(msg: Any, topic: str = 'updates') -> UpdateSummary:
     """The inverse of build_update; InputError if it is another kind of cloud."""
     cloud = read_cloud(msg, topic)
     missing = set(UPDATE.names or ()) - set(cloud.dtype.names or ())
@@ -55,7 +55,7 @@ def read_update(msg: Any, topic: str = 'updates') -> Told:
             f'{topic}: not one keyframe; missing {", ".join(sorted(missing)) or "none"}'
         )
     u = cloud[0]
-    return Told(
+    return UpdateSummary(
         int(u['keyframe']), bool(u['optimized']), int(u['accepted']), int(u['rejected']),
         float(u['wall_ms']),
     )  # fmt: skip

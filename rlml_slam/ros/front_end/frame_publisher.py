@@ -27,7 +27,7 @@ TOPICS = {
     'reflectors/statuses': ('visualization_msgs/msg/MarkerArray', 5),
     'frames': (CLOUD, 50),
 }
-SHORT = 0.005  # [s] steps of several lidars: too short to tell a speed
+SHORT = 0.005  # [s] steps of several lidars: too short for a speed
 
 
 class FramePublisher:
@@ -89,7 +89,7 @@ class FramePublisher:
     def _twist(self, frame: Frame) -> tuple[Array, Array]:
         """Body twist since the last frame, with the covariance of the motion model.
 
-        A place that was found anew is no motion: the twist before it goes on.
+        A pose after relocalization is no motion: the last twist is kept.
         """
         dt = 0.0 if self._last is None else (frame.stamp - self._last.stamp) * 1e-9
         if self._last is not None and dt >= SHORT and not frame.jumped:

@@ -126,7 +126,7 @@ class Slam(SynchronizedSystem):
         return frames
 
     def _look_back(self) -> None:
-        """Make the map again from what the whole run tells, where that is more."""
+        """Associate the whole run again, and rebuild the map where that changes it."""
         frames = self.batch_reassociation.reassociate(
             self.back_end.trajectory()[1], self.back_end.reflectors()
         )

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How often a robot whose place is unknown is looked for in the whole map.
 
-A search costs more than all else, and from where the robot stands it tells the same again. So the
+A search costs more than all else, and from the same pose its result is the same. So the
 longer it stays there, the rarer they are: it is found a tenth later than it could be at worst, or
 half a minute. Once it has moved on, it is looked for at once.
 """
@@ -18,7 +18,7 @@ from rlml_slam.types import Frame
 PERIOD = 300_000_000  # [ns] of stamps between two searches at least
 RARER = 10  # part of the time since the first that is between two where the robot stands
 LONGEST = 30_000_000_000  # [ns] of stamps between two searches at most
-MOVED, TURNED = 1.0, 0.5  # [m], [rad] since the last search: from there, it may see what tells
+MOVED, TURNED = 1.0, 0.5  # [m], [rad] since the last search: from there, it may see more
 
 
 class SearchSchedule:
