@@ -97,7 +97,8 @@ def test_every_file_with_kernels_is_known():
     known = json.loads((package / '__pycache__' / 'kernels.stamp').read_text())
     for compiled in package.rglob('__pycache__/*.nbi'):
         source = compiled.parents[1] / (compiled.name.split('.')[0] + '.py')
-        assert source.relative_to(package).as_posix() in known
+        # those of a file that was moved are never read again
+        assert not source.exists() or source.relative_to(package).as_posix() in known
 
 
 def test_folder_that_cannot_be_written_to_is_no_error(package):

@@ -278,7 +278,7 @@ def test_first_refusal_of_a_stream_is_told_on_the_console(live, node, monkeypatc
             msg.ranges = msg.intensities = array('f')
         node.sensors.add(stream, msg)
     (text,) = said
-    assert re.fullmatch(r'scan: not used: scan at \d+ ns is empty', text)
+    assert re.fullmatch(r'scan: not used: scan at \d+ ns: it is empty', text)
 
 
 def test_what_never_came_is_told_once(live, node, monkeypatch):

@@ -33,6 +33,6 @@ def test_pairs_of_thousands_are_merged_without_a_table_of_all():
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert merged
-    assert len(reflectors.asolver()) == len(posts) - 1
+    assert len(reflectors.alive()) == len(posts) - 1
     assert reflectors.resolve(len(posts) - 1) == 3 * 71 + 2
     assert peak < 50e6

@@ -156,7 +156,7 @@ def test_empty_map_is_not_saved(tmp_path):
 def test_other_and_inconsistent_files_are_refused(saved, tmp_path):
     content = map_file.load(saved)
     newer = Content(content.arrays, {**content.description, 'version': 99})
-    with pytest.raises(FileFormatError, match='99, this program reads'):
+    with pytest.raises(FileFormatError, match='99, but this program reads'):
         map_file.load(map_container.write(tmp_path / 'newer.rlml', newer))
     for name, bad in (
         ('edge_nodes', content.arrays['edge_nodes'] + 1000),
@@ -209,7 +209,7 @@ def test_closure_is_revoked_in_a_saved_map(mapped, tmp_path, capsys):
     assert [r['state'] for r in rows if int(r['number']) == number] == ['revoked']
     map_file.load(f'{path}.previous')  # as it was before
     assert main(['closures', str(path), '--revoke', str(number)]) == 1
-    assert 'revoked already' in capsys.readouterr().err
+    assert 'already revoked' in capsys.readouterr().err
 
 
 def test_parameters_of_a_map_are_those_it_was_made_with(mapped):
