@@ -21,7 +21,7 @@ import os
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -55,15 +55,35 @@ def write(path: str | Path, content: Content) -> Path:
     written; then the old one is untouched.
     """
     path = Path(path)
-    body = _archive(content)
-    head = HEAD.pack(MAGIC, VERSION, len(body), hashlib.sha256(body).digest())
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise MapError(f'{path}: cannot be written: {e.strerror or e}') from e
-    check = hashlib.sha256(head).digest()[:16]
-    write_atomically(path, head, check, body, before=_keep_previous)
+    write_atomically(path, *pack(content), before=_keep_previous)
     return path
+
+
+def pack(content: Content) -> tuple[bytes, memoryview]:
+    """The header and the archive, which together are the bytes of a file."""
+    body = _archive(content)
+    head = HEAD.pack(MAGIC, VERSION, len(body), hashlib.sha256(body).digest())
+    return head + hashlib.sha256(head).digest()[:16], body
+
+
+def read_pieces(path: Path) -> Iterator[Content]:
+    """The contents in a file to which containers were appended, up to the first damaged one.
+
+    Raises MapError if it cannot be read.
+    """
+    try:
+        with path.open('rb') as f:
+            while head := f.read(SIZE):
+                body = memoryview(f.read(_length(path, head)))
+                yield _unpacked(path, _checked(path, head, body))
+    except OSError as e:
+        raise MapError(f'{path}: cannot be read: {e.strerror or e}') from e
+    except FileFormatError:
+        return
 
 
 def _keep_previous(path: Path) -> None:
@@ -130,24 +150,36 @@ def _body(path: Path) -> memoryview:
         data = memoryview(path.read_bytes())
     except OSError as e:
         raise MapError(f'{path}: cannot be read: {e.strerror or e}') from e
-    if bytes(data[:7]) != MAGIC or len(data) < SIZE:
+    return _checked(path, bytes(data[:SIZE]), data[SIZE:])
+
+
+def _length(path: Path, head: bytes) -> int:
+    """How many bytes an archive has by its header, after all checks of the header."""
+    if head[:7] != MAGIC or len(head) < SIZE:
         raise FileFormatError(f'{path}: not a map, or cut off within its first {SIZE} bytes')
-    head = bytes(data[: HEAD.size])
-    if hashlib.sha256(head).digest()[:16] != data[HEAD.size : SIZE]:
+    if hashlib.sha256(head[: HEAD.size]).digest()[:16] != head[HEAD.size :]:
         raise FileFormatError(f'{path}: damaged: the header does not fit its checksum')
-    _, version, length, checksum = HEAD.unpack(head)
+    _, version, length, _ = HEAD.unpack(head[: HEAD.size])
     if version != VERSION:
         raise FileFormatError(f'{path}: layout {version}, this program reads {VERSION}')
-    body = data[SIZE:]
+    return int(length)
+
+
+def _checked(path: Path, head: bytes, body: memoryview) -> memoryview:
+    """The archive, after all checks."""
+    length = _length(path, head)
     if len(body) != length:
         raise FileFormatError(f'{path}: damaged: {len(body)} bytes instead of {length}')
-    if hashlib.sha256(body).digest() != checksum:
+    if hashlib.sha256(body).digest() != HEAD.unpack(head[: HEAD.size])[3]:
         raise FileFormatError(f'{path}: damaged: the content does not fit its checksum')
     return body
 
 
 def _content(path: Path) -> Content:
-    body = _body(path)
+    return _unpacked(path, _body(path))
+
+
+def _unpacked(path: Path, body: memoryview) -> Content:
     arrays: dict[str, NDArray[Any]] = {}
     try:
         with zipfile.ZipFile(io.BytesIO(body)) as archive:

@@ -44,7 +44,15 @@ class Node(Group, prefix=''):
     map_file_name: str = param('map', 'name of the saved map in map_directory, without suffix')
     continue_map: bool = param(
         False,
-        'mapping: load map_file_name.rlml at start, if it exists, and extend it',
+        'mapping: at start, load map_file_name.rlml or a younger autosave of it, and extend it',
+    )
+    journal_period: float = param(
+        5.0,
+        'mapping: period at which new frames are written to a journal in map_directory, from '
+        'which the map is recovered where the process was killed; 0: no journal',
+        's',
+        0.0,
+        60.0,
     )
     map_start_pose: tuple[float, ...] = param(
         (0.0, 0.0, 0.0), 'start pose in the saved map', 'm, m, rad'

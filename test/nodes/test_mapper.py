@@ -18,6 +18,7 @@ from rlml_slam.errors import MapError
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Parameters
+from rlml_slam.ros.back_end.back_end_figures import figures
 from rlml_slam.ros.back_end.last_pose import LastPose
 from rlml_slam.ros.back_end.map_folder import MapFolder
 from rlml_slam.ros.back_end.mapper import Mapper
@@ -51,7 +52,9 @@ class Ear:
         return Publisher(topic, self.sent)
 
     def get_logger(self):
-        return SimpleNamespace(warning=self.warnings.append, info=lambda text: None)
+        return SimpleNamespace(
+            warning=self.warnings.append, info=lambda text: None, error=self.warnings.append
+        )
 
 
 @pytest.fixture
@@ -60,8 +63,9 @@ def ear():
 
 
 @pytest.fixture
-def make(ear):
+def make(ear, monkeypatch, tmp_path_factory):
     """Makes mappers with parameters of the group Node, and ends them with the test."""
+    monkeypatch.chdir(tmp_path_factory.mktemp('maps'))
     made = []
 
     def mapper(**node):
@@ -430,3 +434,104 @@ def test_survey_is_taken_from_the_map_directory_alone(ear, tmp_path):
     mapper = Mapper(ear, dataclasses.replace(p, node=node, back_end=back_end))
     mapper.close()
     np.testing.assert_array_equal(mapper.back_end.survey_frame.survey.points, [[1.0, 2.0]])
+
+
+def journals(folder):
+    return sorted(folder.glob('*.journal-*'))
+
+
+def killed(mapper):
+    """As if the process was killed: nothing is saved, and its locks are gone."""
+    mapper.searcher.close()
+    mapper.worker.close()
+    mapper.journal._file.close()
+    mapper._ended = True
+
+
+def test_end_of_the_node_saves_what_is_in_no_file(make, ear, tmp_path):
+    mapper = make(map_directory=str(tmp_path), journal_period=1e-3)
+    drives(mapper, range(60))
+    assert len(journals(tmp_path)) == 1
+    keys = len(mapper.back_end.keyframes)
+    mapper.close()
+    (saved,) = tmp_path.glob('map.autosave-*.rlml')
+    assert len(map_file.load(saved).arrays['pose']) == keys
+    assert f'the node ends: the map until now is kept: {saved}' in ear.warnings
+    assert journals(tmp_path) == []
+    mapper.close()
+    assert len([*tmp_path.glob('map.autosave-*')]) == 1
+
+
+def test_end_of_the_node_saves_nothing_twice(make, tmp_path):
+    mapper = make(map_directory=str(tmp_path), journal_period=1e-3)
+    drives(mapper, range(60))
+    mapper.back_end.reflectors = lambda: posts(5)
+    mapper.requests.save('map')
+    mapper.close()
+    assert [p for p in tmp_path.iterdir() if 'autosave' in p.name or 'journal' in p.name] == []
+
+
+def test_map_of_a_killed_process_is_recovered(make, ear, tmp_path):
+    mapper = make(map_directory=str(tmp_path), journal_period=1e-3)
+    drives(mapper, range(60))
+    poses = mapper.back_end.graph.poses.copy()
+    killed(mapper)
+    (left,) = journals(tmp_path)
+    again = make(map_directory=str(tmp_path))
+    searched(again)
+    (saved,) = tmp_path.glob('map.autosave-*.rlml')
+    assert any(str(left) in w and 'without saving its map' in w for w in ear.warnings)
+    assert f'recovered: {len(poses)} keyframes in {saved}' in ear.warnings
+    assert np.array_equal(map_file.load(saved).arrays['pose'], poses)
+    assert not left.exists()
+    assert again.system.entry is None
+
+
+def test_continued_map_is_the_recovered_one(make, ear, tmp_path):
+    mapper = make(map_directory=str(tmp_path), journal_period=1e-3)
+    mapper.back_end.reflectors = lambda: posts(5)
+    drives(mapper, range(30))
+    mapper.requests.save('map')
+    drives(mapper, range(30, 60))
+    keys = len(mapper.back_end.keyframes)
+    killed(mapper)
+    again = make(map_directory=str(tmp_path), continue_map=True)
+    assert len(again.back_end.keyframes) == keys
+
+
+def test_journal_of_a_running_process_is_left_alone(make, tmp_path):
+    mapper = make(map_directory=str(tmp_path), journal_period=1e-3)
+    drives(mapper, range(60))
+    other = make(map_directory=str(tmp_path), continue_map=True)
+    assert len(journals(tmp_path)) == 1
+    assert other.back_end.keyframes == []
+
+
+def test_journal_that_cannot_be_written_is_reported_once(make, ear, tmp_path):
+    (tmp_path / 'file').touch()
+    mapper = make(map_directory=str(tmp_path / 'file'), journal_period=1e-3)
+    drives(mapper, range(60))
+    assert len(mapper.back_end.keyframes) > 10
+    assert [w for w in ear.warnings if 'journal' in w] == [
+        f'{tmp_path}/file/map.journal-… cannot be written: File exists; '
+        'if the process is killed now, this map is lost'
+    ]
+    assert 'File exists' in figures(mapper)['journal']
+
+
+def test_journal_begins_again_with_another_map(make, tmp_path):
+    mapper = make(map_directory=str(tmp_path), journal_period=1e-3)
+    drives(mapper, range(60))
+    drives(mapper, range(62, 120), session=2)
+    keys = len(mapper.back_end.keyframes)
+    killed(mapper)
+    searched(make(map_directory=str(tmp_path)))
+    (saved,) = tmp_path.glob('map.autosave-*.rlml')
+    assert len(map_file.load(saved).arrays['pose']) == keys
+
+
+def test_damaged_journal_is_kept_under_another_name(make, ear, tmp_path):
+    (tmp_path / 'map.journal-1').write_bytes(b'nonsense' * 20)
+    searched(make(map_directory=str(tmp_path)))
+    assert (tmp_path / 'map.journal-1.damaged').exists()
+    assert any('no map can be made of it' in w for w in ear.warnings)

@@ -6,7 +6,7 @@ import os
 import pytest
 
 from rlml_slam.errors import MapError, NoMapError
-from rlml_slam.ros.back_end.map_folder import LOST_AGE, LOST_BYTES, MapFolder
+from rlml_slam.ros.back_end.map_folder import AUTOSAVE, LOST, LOST_AGE, LOST_BYTES, MapFolder
 
 
 @pytest.mark.parametrize('name', ['', '..', '../hall', '/etc/hall', 'a/../../hall'])
@@ -31,25 +31,25 @@ def test_suffix_says_which_file_is_missing(suffix, file, tmp_path):
 def test_only_old_automatic_maps_of_the_name_are_removed(tmp_path):
     folder, now = MapFolder(str(tmp_path)), 2.0 * LOST_AGE
     others = [tmp_path / name for name in ('hall.rlml', 'halls.lost-1.rlml', 'hall.lost-1.csv')]
-    young = [folder.lost('hall', 1000 + k) for k in range(20)]
-    old = [folder.lost('hall', 2000 + k) for k in range(3)]
+    young = [folder.free('hall', LOST, 1000 + k) for k in range(20)]
+    old = [folder.free('hall', AUTOSAVE, 2000 + k) for k in range(3)]
     for path in (*others, *old, *young):
         path.write_bytes(b'')
         os.utime(path, (now, now) if path in young else (0, 0))
     previous = old[0].with_name(old[0].name + '.previous')
     previous.write_bytes(b'')
-    assert folder.make_room_for_lost('hall', now) == old
+    assert folder.make_room('hall', now) == old
     assert {*tmp_path.iterdir()} == {*others, *young}
-    assert folder.make_room_for_lost('hall', now) == []
+    assert folder.make_room('hall', now) == []
 
 
 def test_automatic_maps_displace_none_where_they_fill_their_share(tmp_path, monkeypatch):
     folder = MapFolder(str(tmp_path))
-    path = folder.lost('hall', 1)
+    path = folder.free('hall', LOST, 1)
     with path.open('wb') as file:
         file.truncate(LOST_BYTES + 1)  # sparse
-    with pytest.raises(MapError, match=r'hall\.lost-… have 1000 MB; remove those'):
-        folder.make_room_for_lost('hall', path.stat().st_mtime)
+    with pytest.raises(MapError, match=r'hall\.lost-… and \.autosave-… have 1000 MB; remove'):
+        folder.make_room('hall', path.stat().st_mtime)
     assert path.exists()
 
 
@@ -58,6 +58,6 @@ def test_no_automatic_map_is_written_over_another(tmp_path):
     folder = MapFolder(str(tmp_path))
     names = []
     for _ in range(3):
-        folder.lost('hall', 7).write_bytes(b'')
+        folder.free('hall', LOST, 7).write_bytes(b'')
         names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ['hall.lost-7-2.rlml', 'hall.lost-7-3.rlml', 'hall.lost-7.rlml']

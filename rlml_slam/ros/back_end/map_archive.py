@@ -14,7 +14,7 @@ from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.motion import SECOND
 from rlml_slam.params import Parameters
-from rlml_slam.ros.back_end.map_folder import MapFolder
+from rlml_slam.ros.back_end.map_folder import AUTOSAVE, LOST, MapFolder
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.store import map_file
 
@@ -43,20 +43,37 @@ class MapArchive:
         path = self.folder.save(name, current)
         return f'{path}: {contents(current)}{f", no grid: {undrawn}" if undrawn else ""}'
 
-    def keep(self, back_end: BackEnd, grid: OccupancyGrid | None, reason: str) -> None:
-        """Write a map that is about to go under a name of its own, if it is worth it."""
-        keys, name = back_end.keyframes, self._p.node.map_file_name
+    def keep(self, back_end: BackEnd, grid: OccupancyGrid | None, reason: str) -> bool:
+        """Write a map that is about to be replaced to a file of its own, if it is worth it.
+
+        Whether nothing is lost thereby.
+        """
+        keys = back_end.keyframes
         if len(keys) - self._written < WORTH_KEEPING:
-            return
+            return True
+        return self._keep(LOST, keys[-1].stamp // SECOND, back_end, grid, reason)
+
+    def autosave(self, back_end: BackEnd, grid: OccupancyGrid | None) -> bool:
+        """The same at the end of the process, where anything is in no file yet."""
+        keys = len(back_end.keyframes)
+        if keys < WORTH_KEEPING or keys == self._written:
+            return True
+        return self._keep(AUTOSAVE, int(time.time()), back_end, grid, 'the node ends')
+
+    def _keep(
+        self, kind: str, seconds: int, back_end: BackEnd, grid: OccupancyGrid | None, reason: str
+    ) -> bool:
+        name = self._p.node.map_file_name
         try:
-            for old in self.folder.make_room_for_lost(name, time.time()):
+            for old in self.folder.make_room(name, time.time()):
                 self._logger.warning(f'{reason}: an old map is removed: {old}')
-            path = self.folder.lost(name, keys[-1].stamp // SECOND)
+            path = self.folder.free(name, kind, seconds)
             self._write(path, back_end, grid)
         except MapError as e:
             self._logger.warning(f'{reason}: the map until now is not kept: {e}')
-        else:
-            self._logger.warning(f'{reason}: the map until now is kept: {path}')
+            return False
+        self._logger.warning(f'{reason}: the map until now is kept: {path}')
+        return True
 
     def begin(self, back_end: BackEnd) -> None:
         """The map in the making is another one, all of which is in a file."""

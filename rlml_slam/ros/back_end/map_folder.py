@@ -11,7 +11,9 @@ from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.maps.survey import Survey
 from rlml_slam.slam.store import map_file
 
-LOST = '.lost-'  # in the name of a map that was written without a user's request
+# in the names of maps that were written without a user's request: one that another took the place
+# of, and one that was in the making when its process ended
+LOST, AUTOSAVE = '.lost-', '.autosave-'
 LOST_AGE = 30 * 86400.0  # [s] after which such a file is removed
 LOST_BYTES = 1_000_000_000  # of such files: where there are more, no other one is written
 SUFFIXES = ('.rlml', '.yaml', '.csv', '.pgm')
@@ -21,25 +23,25 @@ class MapFolder:
     """The folder of the parameter ``map_directory``."""
 
     def __init__(self, directory: str) -> None:
-        self._folder = Path(directory).expanduser().resolve()
+        self.root = Path(directory).expanduser().resolve()
 
     def path(self, name: str) -> Path:
         """The path of a map without its suffixes; MapError if it lies outside of the folder."""
         name = name.removeprefix('file://')
         for suffix in SUFFIXES:
             name = name.removesuffix(suffix)
-        path = (self._folder / name).resolve()
-        if not name or path == self._folder or not path.is_relative_to(self._folder):
-            raise MapError(f'map {name!r} is not inside of map_directory, {self._folder}')
+        path = (self.root / name).resolve()
+        if not name or path == self.root or not path.is_relative_to(self.root):
+            raise MapError(f'map {name!r} is not inside of map_directory, {self.root}')
         return path
 
     def survey(self, name: str) -> Survey | None:
         """Surveyed reflectors; None without a name. MapError or FileFormatError if unusable."""
         if not name:
             return None
-        path = (self._folder / name).resolve()
-        if not path.is_relative_to(self._folder):
-            raise MapError(f'survey {name!r} is not inside of map_directory, {self._folder}')
+        path = (self.root / name).resolve()
+        if not path.is_relative_to(self.root):
+            raise MapError(f'survey {name!r} is not inside of map_directory, {self.root}')
         return survey.load(path)
 
     def save(self, name: str, saved: SavedMap) -> Path:
@@ -69,21 +71,29 @@ class MapFolder:
         path = self.path(name)
         return path.with_name(path.name + '.rlml')
 
-    def lost(self, name: str, seconds: int) -> Path:
-        """The path for a map that is about to go, made until a time [s]; no file has it yet."""
-        path, k = self.whole(f'{name}{LOST}{seconds}'), 1
+    def free(self, name: str, kind: str, seconds: int) -> Path:
+        """The path for an automatic map of a kind, made until a time [s]; no file has it yet."""
+        path, k = self.whole(f'{name}{kind}{seconds}'), 1
         while path.exists():
             k += 1
-            path = self.whole(f'{name}{LOST}{seconds}-{k}')
+            path = self.whole(f'{name}{kind}{seconds}-{k}')
         return path
 
-    def make_room_for_lost(self, name: str, now: float) -> list[Path]:
-        """Remove files of :meth:`lost` that are older than LOST_AGE at a time [s]; which.
+    def newest(self, name: str) -> Path:
+        """The path of a whole map, or of a younger one of it that was saved automatically."""
+        whole = self.whole(name)
+        begin = self.path(name).name + AUTOSAVE
+        saved = [file for file in whole.parent.glob('*.rlml') if file.name.startswith(begin)]
+        files = [*saved, *([whole] if whole.exists() else [])]
+        return max(files, key=lambda file: file.stat().st_mtime_ns, default=whole)
+
+    def make_room(self, name: str, now: float) -> list[Path]:
+        """Remove automatic maps that are older than LOST_AGE at a time [s]; which.
 
         No other file is ever removed. Raises MapError where the younger ones fill LOST_BYTES.
         """
         path = self.path(name)
-        begin = path.name + LOST
+        begin = (path.name + LOST, path.name + AUTOSAVE)
         try:
             files = [file for file in path.parent.glob('*.rlml') if file.name.startswith(begin)]
             old = [file for file in files if now - file.stat().st_mtime > LOST_AGE]
@@ -92,11 +102,11 @@ class MapFolder:
                 file.with_name(file.name + map_container.PREVIOUS).unlink(missing_ok=True)
             size = sum(file.stat().st_size for file in files if file not in old)
         except OSError as e:
-            raise MapError(f'{begin}…: {e.filename}: {e.strerror}') from e
+            raise MapError(f'{path}: {e.filename}: {e.strerror}') from e
         if size > LOST_BYTES:
             raise MapError(
-                f'{path.parent}: {begin}… have {size / 1e6:.0f} MB; remove those that are not '
-                f'needed, so that others can be kept'
+                f'{path}{LOST}… and {AUTOSAVE}… have {size / 1e6:.0f} MB; remove those that are '
+                f'not needed, so that others can be kept'
             )
         return sorted(old)
 

@@ -12,11 +12,13 @@ import numpy as np
 
 from rlml_slam import se2
 from rlml_slam.errors import MapError
+from rlml_slam.maps.map_container import Content
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Parameters
 from rlml_slam.ros.back_end.correction_smoothing import SmoothedCorrection
 from rlml_slam.ros.back_end.last_pose import LastPose
 from rlml_slam.ros.back_end.map_archive import MapArchive
+from rlml_slam.ros.back_end.map_journal import MapJournal
 from rlml_slam.ros.back_end.map_topics import MapTopics
 from rlml_slam.ros.back_end.searcher import Searcher
 from rlml_slam.ros.back_end.worker import Worker
@@ -49,11 +51,14 @@ class Mapper:
         self._p = params
         self._logger = node.get_logger()
         self.archive = MapArchive(params, self._logger)
+        self.journal = MapJournal(self.archive.folder, params, self._logger)
+        self._is_kept = True  # whether what KeepMap asked for was written
         self.system = System(params, int(time.time()))
         survey = self.archive.folder.survey(params.back_end.survey)
         self.new_back_end = lambda: BackEnd(params, survey)
         self.back_end = self.new_back_end()
-        self.loaded: BackEnd | None = None  # checked, and about to take the place of the graph
+        # checked, and about to take the place of the graph
+        self.loaded: tuple[BackEnd, Content] | None = None
         self.last_pose: LastPose | None = None
         self._survey_found = False
         self.answers: dict[int, Future[say.Answer]] = {}
@@ -65,6 +70,7 @@ class Mapper:
         self._session: int | None = None  # of the newest frame that came
         self._sent = 0
         self._heard = 0.0
+        self._ended = False
         self._tf = TransformPublisher(node)
         self._topics = MapTopics(node, params.node)
         self._command = command or self._topics.send
@@ -82,9 +88,7 @@ class Mapper:
             say.DrawMap: lambda c: self.execute(
                 self.system.on_map_drawn(c.number, self.current())
             ),
-            say.KeepMap: lambda c: self.archive.keep(
-                self.back_end, self.products.grid(self.back_end), c.reason
-            ),
+            say.KeepMap: self._keep_map,
             say.ForgetMap: self._forget_map,
             say.TakeMap: self._take_map,
             say.PublishMap: lambda _: self.publish_map(),
@@ -131,6 +135,7 @@ class Mapper:
     def _map_frame(self, command: say.MapFrame) -> None:
         frame = command.frame
         update = self.back_end.add(frame)
+        self.journal.add(frame, update is not None)
         if update is None:
             return
         self._topics.update(frame.stamp, self.back_end.graph.poses[update.keyframe, :2], update)
@@ -164,17 +169,23 @@ class Mapper:
 
     # --- the map -------------------------------------------------------------------------------
 
+    def _keep_map(self, command: say.KeepMap) -> None:
+        grid = self.products.grid(self.back_end)
+        self._is_kept = self.archive.keep(self.back_end, grid, command.reason)
+
     def _forget_map(self, _: say.ForgetMap) -> None:
         self.back_end.reset()
-        self._begin_map()
+        self._begin_map(None)
 
     def _take_map(self, _: say.TakeMap) -> None:
         assert self.loaded is not None
-        self.back_end, self.loaded = self.loaded, None
-        self._begin_map()
+        (self.back_end, base), self.loaded = self.loaded, None
+        self._begin_map(base)
 
-    def _begin_map(self) -> None:
+    def _begin_map(self, base: Content | None) -> None:
         self.archive.begin(self.back_end)
+        self.journal.restart(base, keep=not self._is_kept)
+        self._is_kept = True
         self.products.restart()
         self._topics.correct(self.stamp, np.zeros(3))
         self._newest = None
@@ -200,6 +211,8 @@ class Mapper:
 
     def settle(self) -> None:
         """Send the map of everything so far where no frame has come for a while."""
+        if self.journal.is_due:
+            self.worker.submit(self.journal.write)
         silent = time.monotonic() - self._heard >= IDLE
         if silent and self.worker.backlog == 0 and self._is_behind():
             self.worker.submit(lambda: self.publish_map() if self._is_behind() else None)
@@ -226,6 +239,11 @@ class Mapper:
         self._tf.publish(self._sent, (n.map_frame, n.odom_frame), T)
 
     def close(self) -> None:
-        """Finish the running jobs and forget the others."""
+        """Finish the running jobs, forget the others, and save what was mapped."""
         self.searcher.close()
         self.worker.close()
+        if self._ended:
+            return
+        self._ended = True
+        saved = self.archive.autosave(self.back_end, self.products.grid(self.back_end))
+        self.journal.close(keep=not saved)

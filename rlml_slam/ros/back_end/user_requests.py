@@ -39,12 +39,15 @@ class UserRequests:
         name = node.map_file_name
         if node.mode == 'localization':
             return self._localize_in(name, is_first=True)
-        begin = system.make_map()
+        begin, journal = system.make_map(), self._mapper.journal
         if not node.continue_map:
+            self._mapper.searcher.worker.submit(journal.recover)
             return begin
-        whole = self._archive.folder.whole(name)
+        journal.recover()
+        whole = self._archive.folder.newest(name)
         if whole.exists():
-            return [*begin, *self._continue(name)]
+            self._logger.info(f'continues {whole}')
+            return [*begin, *self._continue(str(whole.relative_to(self._archive.folder.root)))]
         self._logger.warning(f'{whole} does not exist: another map begins')
         return begin
 
@@ -96,7 +99,7 @@ class UserRequests:
         content, loaded = self._archive.load(name), self._mapper.new_back_end()
         map_file.restore(content, loaded)
         saved = map_file.saved_map(content)
-        self._mapper.loaded = loaded
+        self._mapper.loaded = loaded, content
         return self._mapper.system.continue_map(saved, loaded.reflector_graph.next_key)
 
     def localize(self, on: bool) -> str:
