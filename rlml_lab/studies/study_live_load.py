@@ -26,14 +26,17 @@ from std_srvs.srv import Trigger
 from rlml_slam.cli.support.live_session import node, own_domain
 from rlml_slam.cli.support.processes import Processes, free_domain
 from rlml_slam.errors import RlmlError
+from rlml_slam.motion import SECOND
 from rlml_slam.params import Simulator
 from rlml_slam.ros.back_end.searcher import DELAY
 from rlml_slam.ros.codecs import decode
 from rlml_slam.se2 import Array
+from rlml_slam.simulation.robot import RouteFollower
+from rlml_slam.simulation.world_file import load_world
 
 SYSTEMS = {1: ('slam',), 2: ('front_end', 'back_end')}
 START = 400.0  # [s] for processes to start, and their kernels to be compiled
-DRIVE = 25.0  # [s] of wall clock, before the map is saved
+ROUND = 1.3  # of the route at full speed: the map is saved when the robot has been everywhere
 MOST = 30.0  # [s] in which a map has to be entered, besides the delay
 ERROR = 0.3  # [m] of a good pose
 DEEP = QoSProfile(depth=1000)
@@ -97,6 +100,8 @@ class User(Node):
         self._executor.add_node(self)
         self._true: dict[int, Array] = {}
         self._newest: tuple[int, Array] | None = None
+        world, n = load_world(Simulator().world), Simulator()
+        self._round = n.still_time + ROUND * RouteFollower(world.route, n).length / n.speed
         self._figures: dict[str, str] = {}
         self._diagnosed = 0
         self.create_subscription(PoseWithCovarianceStamped, 'pose', self.on_pose, DEEP)
@@ -153,11 +158,15 @@ class User(Node):
         self.destroy_client(client)
         return future.result()
 
+    def _has_been_everywhere(self) -> bool:
+        return (max(self._true) - min(self._true)) / SECOND > self._round
+
     def loads(self, count: int, most: float) -> int:
         """Drive, save the map, and load it so often; how many were good."""
         if not self.wait(lambda: self._newest is not None, START):
             raise RlmlError('no pose came')
-        self.wait(lambda: False, DRIVE)
+        if not self.wait(self._has_been_everywhere, START):
+            raise RlmlError('the robot does not come round')
         saved = self.ask(Trigger, 'save_map', Trigger.Request())
         if not saved.success:
             raise RlmlError(f'save_map: {saved.message}')
