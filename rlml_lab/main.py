@@ -63,6 +63,10 @@ COMMANDS: Table = {
                 'rlml_lab.studies.study_live_load',
                 'load a map while driving, over DDS',
             ),
+            'contact': Command(
+                'rlml_lab.contact.study_contact',
+                'messages that nobody should send: nodes go on, poses too',
+            ),
             'victoria-park': Command(
                 'rlml_lab.studies.study_victoria_park',
                 'dead reckoning, EKF and RLML among trees, against GPS',

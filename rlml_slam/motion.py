@@ -266,17 +266,21 @@ class MotionBuffer:
         return self._stamps[-1] if self._stamps else None
 
     def add_odometry(self, sample: Odometry) -> None:
-        """Append a sample; its stamp must be later than the newest one's.
+        """Append a sample, unless it is no later than the newest one.
 
         One sample that jumps away and is not followed by another there is a fault and dropped;
         two that agree are odometry that was reset, across which the motion is unknown.
         """
+        if self._stamps and sample.stamp <= self._stamps[-1]:
+            return
         if self._stamps:
             step = self._step(self._stamps[-1], self._poses[-1], sample)
             if step is None:
                 self.jumps += 1
                 parked, self._parked = self._parked, sample
-                if parked is None or self._step(parked.stamp, parked.pose, sample) is None:
+                if parked is None or parked.stamp >= sample.stamp:
+                    return
+                if self._step(parked.stamp, parked.pose, sample) is None:
                     return
                 step = (math.nan, math.nan)
             self._v.append(step[0])
@@ -298,7 +302,9 @@ class MotionBuffer:
         return float(step[0]) / dt, float(step[2]) / dt
 
     def add_imu(self, sample: Imu) -> None:
-        """Append a sample; its stamp must be later than the newest one's."""
+        """Append a sample, unless it is no later than the newest one."""
+        if self._imu_stamps and sample.stamp <= self._imu_stamps[-1]:
+            return
         self._imu_stamps.append(sample.stamp)
         self._rates.append(sample.yaw_rate)
         self._forget(self._imu_stamps, sample.stamp, self._rates)

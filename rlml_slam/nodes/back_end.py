@@ -23,8 +23,8 @@ from rlml_slam.ros.codecs.frame_messages import FrameAssembler, read_points, rea
 from rlml_slam.ros.codecs.reflector_clouds import read_associated
 from rlml_slam.ros.declare import declare
 from rlml_slam.ros.diagnostics import HealthPublisher
+from rlml_slam.ros.message_guard import checked
 from rlml_slam.ros.run import run
-from rlml_slam.ros.sensors import checked
 from rlml_slam.slam.conversation import FrontEndCommand, SessionFrame
 
 DEPTH = 200  # of the front end's answers: none may be lost while the map is drawn
@@ -67,7 +67,7 @@ class BackEndNode(Node):
             for record in add(msg):
                 self.take(record)
 
-        self.create_subscription(PointCloud2, topic, checked(self, callback), DEPTH)
+        self.create_subscription(PointCloud2, topic, checked(self, topic, callback), DEPTH)
 
     def take(self, record: SessionFrame) -> None:
         """Give a whole frame to the mapper."""

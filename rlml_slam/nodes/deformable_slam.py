@@ -17,9 +17,10 @@ from rlml_slam.params import DeformableParameters, Parameters
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.declare import declare
 from rlml_slam.ros.diagnostics import HealthPublisher
+from rlml_slam.ros.message_guard import checked
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensor_input import STREAMS
-from rlml_slam.ros.sensors import RELIABLE, Sensors, checked
+from rlml_slam.ros.sensors import RELIABLE, Sensors
 from rlml_slam.ros.systems.carrier_velocity import VelocityInput
 from rlml_slam.ros.systems.deformable_messages import EstimatePublisher
 from rlml_slam.types import Observation
@@ -45,7 +46,10 @@ class DeformableSlamNode(Node):
         self.sensors = Sensors(self, shared, streams, self.process, self.restart)
         self.health = HealthPublisher(self, self.sensors, self.figures)
         self.create_subscription(
-            PoseWithCovarianceStamped, 'initialpose', checked(self, self.start_at), RELIABLE
+            PoseWithCovarianceStamped,
+            'initialpose',
+            checked(self, 'initialpose', self.start_at),
+            RELIABLE,
         )
 
     def process(self, observation: Observation) -> None:

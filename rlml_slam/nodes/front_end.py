@@ -38,7 +38,11 @@ class FrontEndNode(Node):
         self.take: Callable[[SessionFrame], None] | None = None
         self.control = FrontEndControl(self, self.params, self.answers.begin_session, has_back_end)
         self.sensors = Sensors(self, self.params, STREAMS, self.process, self.control.restart)
-        self.health = HealthPublisher(self, self.sensors)
+        self.health = HealthPublisher(self, self.sensors, problems=self.problems)
+
+    def problems(self) -> tuple[str, ...]:
+        """What is wrong around the estimate."""
+        return (*self.control.problems(), *self.sensors.problems())
 
     @property
     def front_end(self) -> FrontEnd:

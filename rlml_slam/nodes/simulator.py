@@ -14,10 +14,10 @@ from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
 from rlml_slam import warm_up
-from rlml_slam.errors import InputError
 from rlml_slam.params import SimulatorParameters
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.declare import declare
+from rlml_slam.ros.message_guard import checked
 from rlml_slam.ros.playback_clock import PlaybackClock
 from rlml_slam.ros.run import run
 from rlml_slam.ros.systems.simulator_messages import SimulatedTopics
@@ -42,7 +42,9 @@ class SimulatorNode(Node):
         self._pace: PlaybackClock | None = None
         self._finished: float | None = None
         if n.drive == 'cmd_vel':
-            self.create_subscription(Twist, 'cmd_vel', self.on_cmd_vel, 10)
+            self.create_subscription(
+                Twist, 'cmd_vel', checked(self, 'cmd_vel', self.on_cmd_vel), 10
+            )
         warm_up.compile_loaded()
         # steady timers: with use_sim_time, a ROS timer would wait for this node's own clock
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -53,10 +55,7 @@ class SimulatorNode(Node):
 
     def on_cmd_vel(self, msg: Any) -> None:
         """Drive with the commanded velocity."""
-        try:
-            self.simulation.command(*decode.twist(msg))
-        except InputError as e:
-            self.get_logger().warning(str(e), throttle_duration_sec=1.0)
+        self.simulation.command(*decode.twist(msg))
 
     def tick(self) -> None:
         """Bring the simulation up to the wall clock; raises SystemExit when all is done."""

@@ -30,6 +30,14 @@ class Node(Group, prefix=''):
     reflector_poses_topic: str = param(
         'reflector_poses', 'PoseArray topic of reflector detections'
     )
+    max_beams: int = param(20_000, 'a scan with more beams is refused', '', 10, 1_000_000)
+    max_reflectors: int = param(
+        500,
+        'a message with more reflectors is refused: it is something else, such as a 3D lidar',
+        '',
+        1,
+        10_000,
+    )
     use_odom: bool = param(True, 'use odometry; false: constant-velocity model')
     use_imu: bool = param(True, 'use the yaw rate of the IMU, if there is one')
     filter_stamps: bool = param(

@@ -12,6 +12,7 @@ from rclpy.clock_type import ClockType
 
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
+from rlml_slam.ros.message_guard import guard_of
 from rlml_slam.ros.sensors import Sensors
 from rlml_slam.types import Frame, Health, Level, Status
 
@@ -26,7 +27,10 @@ class HealthPublisher:
         node: Any,
         sensors: Sensors | None = None,
         figures: Callable[[], dict[str, object]] = dict,
+        problems: Callable[[], tuple[str, ...]] = tuple,
     ) -> None:
+        self._guard = guard_of(node)
+        self._problems = problems
         self._name = node.get_fully_qualified_name().lstrip('/')
         self._sensors = sensors
         self._figures = figures
@@ -66,7 +70,9 @@ class HealthPublisher:
 
     def publish(self) -> None:
         """Send the status."""
-        figures: dict[str, object] = {'frames': self._frames, **self._inputs()}
+        figures: dict[str, object] = {
+            'frames': self._frames, **self._inputs(), **self._guard.figures(),
+        }  # fmt: skip
         if self._statuses:
             figures |= {f'detections {s.name.lower()}': self._statuses[s] for s in Status}
         health, stamp = Health(Level.DEGRADED, ('no input yet',)), 0
@@ -77,6 +83,10 @@ class HealthPublisher:
                 level = max(health.level, Level.DEGRADED)  # who is lost stays lost in silence
                 health = Health(level, (*health.reasons, 'no new scan or reflectors'))
         self._reported = self._frames
+        problems = self._problems()
+        if problems:
+            level = max(health.level, Level.DEGRADED)
+            health = Health(level, (*health.reasons, *problems))
         message = encode.diagnostics(
             make_rclpy, stamp, self._name, health, {**figures, **self._figures()}
         )

@@ -13,8 +13,9 @@ from rclpy._rclpy_pybind11 import RCLError
 from rclpy.exceptions import InvalidNodeNameException, NameValidationException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
-from rlml_slam.errors import RlmlError
+from rlml_slam.errors import FileFormatError, MapError, RlmlError
 from rlml_slam.ros.memory import keep_large_apart
+from rlml_slam.ros.message_guard import guard_of
 
 
 def run(*factories: Callable[[], Any]) -> int:
@@ -36,7 +37,7 @@ def run(*factories: Callable[[], Any]) -> int:
             executor.add_node(nodes[-1])
         # what is there now stays: looking through all of it again and again would hold up poses
         gc.freeze()
-        executor.spin()
+        _spin(executor, nodes)
     except (RlmlError, NameValidationException, InvalidNodeNameException) as e:
         print(f'rlml_slam: {e}', file=sys.stderr)
         return 1
@@ -54,6 +55,22 @@ def run(*factories: Callable[[], Any]) -> int:
         executor.shutdown(timeout_sec=1.0)
         rclpy.utilities.try_shutdown()
     return 0
+
+
+def _spin(executor: Any, nodes: list[Any]) -> None:
+    """Spin; an error that nobody expected is logged, and the nodes go on.
+
+    What they have mapped is worth more than a process that ends.
+    """
+    while rclpy.utilities.ok():
+        try:
+            executor.spin()
+        except (MapError, FileFormatError, ExternalShutdownException):
+            raise  # a map that a parameter names cannot be used, or a signal came
+        except Exception as e:
+            if not rclpy.utilities.ok():
+                raise
+            guard_of(nodes[-1]).report('any topic', e)
 
 
 def _cause(error: Exception) -> str:

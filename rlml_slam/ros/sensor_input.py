@@ -119,6 +119,11 @@ class SensorInput(Generic[Out]):
         return self.extrinsics.hangs(base, sensor)
 
     def _converted(self, stream: str, msg: Any) -> Odometry | Imu | Scan | Detections:
+        n, size = self._p.node, decode.size(msg)
+        what = 'beams' if stream == 'scan' else 'reflectors'
+        most = n.max_beams if stream == 'scan' else n.max_reflectors
+        if size > most:
+            raise InputError(f'{stream}: {size} {what}, more than max_{what}, {most}')
         if stream == 'scan':
             scan = decode.scan(msg)
             return mirrored_scan(scan) if self.hangs(scan.frame_id) else scan

@@ -5,18 +5,28 @@ from __future__ import annotations
 
 import heapq
 import time
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from typing import Any
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.duration import Duration
+from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
 from rlml_slam.errors import InputError
 from rlml_slam.params import Parameters
 from rlml_slam.ros.codecs.decode import frame
 from rlml_slam.ros.codecs.message_types import rclpy_class
-from rlml_slam.ros.sensor_input import PLACED, STREAMS, USED_BY, SensorInput, topics_of
+from rlml_slam.ros.message_guard import guard_of
+from rlml_slam.ros.sensor_input import (
+    PLACED,
+    STREAMS,
+    USED_BY,
+    SensorInput,
+    counted_as,
+    topics_of,
+)
 from rlml_slam.ros.tf import Extrinsics, subscribe_static
 from rlml_slam.sensing.synchronization.synchronizer import Synchronizer
 from rlml_slam.types import Detections, Observation
@@ -31,6 +41,15 @@ SENSOR = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 MOTION = QoSProfile(depth=MOTION_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 PATIENCE = 5.0  # [s] of the wall clock, after which missing inputs are named in the log
 SILENCE = 1.0  # [s] of the wall clock without any message, after which nothing more is waited for
+MAX_SENSORS = 100  # whose frames are remembered
+REFUSED = ('',)  # in the place of a message that cannot be taken
+# the back end says with it that it runs, so that a front end notices where it does not
+LEASE = 1.0  # [s]
+ALIVE = QoSProfile(
+    depth=50,
+    liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
+    liveliness_lease_duration=Duration(seconds=LEASE),
+)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -38,9 +57,11 @@ class Sensors:
     """Feeds the messages of the streams to a Synchronizer and its observations to ``handle``.
 
     Where the clock jumps back by more than the buffer holds, ``restart`` is called and a new
-    sequencer begins. Scans and detections wait, in order, until /tf_static has where their
-    sensor is, but no longer than TF_PATIENCE. Where all inputs fall silent, what still waits for
-    odometry is used as it is.
+    sequencer begins. At the start, scans and detections wait, in order, until /tf_static has where
+    their sensor is, but no longer than TF_PATIENCE: then a sensor without a transform is taken to
+    sit at ``laser_pose``, one for each topic. Later, a message in another frame without transform
+    is refused, and holds up nothing. Where all inputs fall silent, what still waits for odometry
+    is used as it is.
     """
 
     def __init__(
@@ -53,11 +74,16 @@ class Sensors:
     ) -> None:
         self._logger = node.get_logger()
         self._p = params
-        self._handle = handle
+        self._node = node
+        self._guard = guard_of(node)
+        self._handle = lambda o: self._guard.pass_on('observations', lambda: handle(o))
         self._restart = restart
         self._begin(Extrinsics())
-        self._waits = subscribe_static(node, self._feed.extrinsics)
+        self._has_tf = self._waits = subscribe_static(node, self._feed.extrinsics)
+        self._since: dict[str, int] = {}  # stamp at which a sensor without a transform appeared
         self._held: list[tuple[str, Any]] = []
+        self._frames: defaultdict[str, set[str]] = defaultdict(set)  # of sensors, by stream
+        self._topics: Counter[str] = Counter()  # by stream
         self._queues: list[tuple[str, Any]] = []
         self._heard = self._began = time.monotonic()
         self._told: set[str] = set()
@@ -72,6 +98,7 @@ class Sensors:
 
     def _subscribe(self, node: Any, stream: str, topic: str) -> None:
         index = len(self._queues)
+        self._topics[stream] += 1
         qos = MOTION if stream in ('odom', 'imu') else SENSOR
         kind, callback = rclpy_class(STREAMS[stream][1]), lambda msg: self.receive(index, msg)
         subscription = node.create_subscription(kind, topic, callback, qos)
@@ -122,6 +149,16 @@ class Sensors:
         for observation in self.synchronizer.flush():
             self._handle(observation)
 
+    def problems(self) -> tuple[str, ...]:
+        """Sensors of which there is one, and that several nodes publish."""
+        out = []
+        for stream, subscription in self._queues:
+            found = self._node.get_publishers_info_by_topic(subscription.topic_name)
+            if stream in ('odom', 'imu') and len(found) > 1:
+                names = sorted(f'{i.node_namespace.rstrip("/")}/{i.node_name}' for i in found)
+                out.append(f'{stream} has {len(found)} publishers: {", ".join(names)}')
+        return tuple(out)
+
     def _tell_of_missing(self) -> None:
         """Say once which scans and odometry have never come, PATIENCE after the start."""
         if self._missing and time.monotonic() - self._began > PATIENCE:
@@ -142,41 +179,67 @@ class Sensors:
         """Everything in a queue, in order of arrival."""
         stream, subscription = self._queues[index]
         out: list[tuple[str, Any]] = []
-        with subscription.handle:
-            while len(out) < MOTION_DEPTH:
-                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+        handle, kind = subscription.handle, (subscription.msg_type, subscription.raw)
+        with handle:
+            for _ in range(MOTION_DEPTH):
+                taken = self._guard.pass_on(stream, lambda: handle.take_message(*kind), REFUSED)
                 if taken is None:
                     break
-                out.append((stream, taken[0]))
+                if taken is not REFUSED:
+                    out.append((stream, taken[0]))
         return out
 
     def add(self, stream: str, msg: Any) -> None:
         """One message of a stream."""
         self._heard = time.monotonic()
-        if stream not in PLACED or not self._waits:
+        if stream not in PLACED:
             self._use(stream, msg)
+            return
+        if not self._waits:
+            self._use_placed(stream, msg)
             return
         self._held.append((stream, msg))
         unknown = {frame(m.header.frame_id) for _, m in self._held if not self._is_placed(m)}
-        if unknown and _stamp(msg) - _stamp(self._held[0][1]) <= TF_PATIENCE:
+        late = not 0 <= _stamp(msg) - _stamp(self._held[0][1]) <= TF_PATIENCE
+        if unknown and not late and len(self._held) < DEPTH:
             return
-        if unknown:
-            self._logger.warning(
-                f'no transform from {self._p.node.base_frame} to {", ".join(sorted(unknown))} '
-                f'on /tf_static: the parameter laser_pose is used'
-            )
-            self.stop_waiting()
+        for sensor in unknown:
+            self._since.setdefault(sensor, 0)
         self._release()
 
     def stop_waiting(self) -> None:
-        """Stop waiting for transforms on /tf_static."""
-        self._waits = False
+        """Wait for no transform on /tf_static."""
+        self._has_tf = False
         self._release()
 
     def _release(self) -> None:
+        self._waits = False
         held, self._held = self._held, []
         for item in held:
-            self._use(*item)
+            self._use_placed(*item)
+
+    def _use_placed(self, stream: str, msg: Any) -> None:
+        """A message of a sensor, refused where nobody says where it sits."""
+        sensor, seen = frame(msg.header.frame_id), self._frames[stream]
+        if self._has_tf and sensor not in seen and not self._is_placed(msg):
+            why = f'no transform from {self._p.node.base_frame} to {sensor[:100]!r} on /tf_static'
+            if len(seen) >= self._topics[stream] or self._may_come(sensor, _stamp(msg)):
+                self._count_invalid(stream, f'{stream}: {why}')
+                return
+            self._logger.warning(f'{why}: the parameter laser_pose is used')
+        if len(seen) < MAX_SENSORS:
+            seen.add(sensor)
+        self._use(stream, msg)
+
+    def _may_come(self, sensor: str, stamp: int) -> bool:
+        """Whether the transform of a sensor that has just appeared is still waited for."""
+        if sensor not in self._since and len(self._since) >= MAX_SENSORS:
+            return True
+        return stamp - self._since.setdefault(sensor, stamp) <= TF_PATIENCE
+
+    def _count_invalid(self, stream: str, why: str) -> None:
+        self.synchronizer.inputs.count(counted_as(stream), 'invalid', why)
+        self._tell_of_refused()
 
     def _is_placed(self, msg: Any) -> bool:
         try:
@@ -185,7 +248,12 @@ class Sensors:
             return True
 
     def _use(self, stream: str, msg: Any) -> None:
-        self._observe(lambda: self._feed.add(stream, msg))
+        # whatever a message does to the code costs that message alone
+        use = self._guard.pass_on(
+            stream, lambda: self._observe(lambda: self._feed.add(stream, msg)), REFUSED
+        )
+        if use is REFUSED:
+            self._count_invalid(stream, self._guard.last)
 
     def add_detections(self, detections: Detections) -> None:
         """Detections that are converted already."""
@@ -206,15 +274,3 @@ class Sensors:
 
 def _stamp(msg: Any) -> int:
     return int(msg.header.stamp.sec) * 1_000_000_000 + int(msg.header.stamp.nanosec)
-
-
-def checked(node: Any, callback: Callable[[Any], None]) -> Callable[[Any], None]:
-    """The callback, which warns instead of raising where a message cannot be believed."""
-
-    def call(msg: Any) -> None:
-        try:
-            callback(msg)
-        except InputError as e:
-            node.get_logger().warning(f'not used: {e}')
-
-    return call

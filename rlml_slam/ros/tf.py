@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,11 @@ from rlml_slam.errors import InputError
 from rlml_slam.ros.codecs import decode, encode
 from rlml_slam.ros.codecs.decode import Transform
 from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
+from rlml_slam.ros.message_guard import guard_of
 from rlml_slam.se2 import Array
 
 TF_MESSAGE = 'tf2_msgs/msg/TFMessage'
+MAX_FRAMES = 10_000  # on /tf_static; robots have some hundred
 HALF_TURN = np.diag([1.0, -1.0, -1.0])  # about the x axis
 
 
@@ -32,6 +35,8 @@ class Extrinsics:
     def add(self, transforms: Iterable[Transform]) -> None:
         """Take over transforms; a later one of the same child replaces the earlier."""
         for t in transforms:
+            if t.child not in self._parent and len(self._parent) >= MAX_FRAMES:
+                raise InputError(f'/tf_static: more than {MAX_FRAMES} frames')
             self._parent[t.child] = t
         self._found = {}
 
@@ -72,6 +77,8 @@ class Extrinsics:
     def _between(self, base: str, frame: str) -> tuple[Array, Array] | None:
         """R (3, 3) and t (3,) of T_base_frame."""
         if (base, frame) not in self._found:
+            if len(self._found) >= MAX_FRAMES:  # names in messages may be anything
+                self._found = {}
             self._found[base, frame] = self._find(base, frame)
         return self._found[base, frame]
 
@@ -133,12 +140,14 @@ def subscribe_static(node: Any, extrinsics: Extrinsics) -> bool:
         return False
     latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
+    guard = guard_of(node)
+
+    def take_one(transform: Any) -> None:
+        extrinsics.add(decode.transforms(transform))
+
     def take(msg: Any) -> None:
         for transform in msg.transforms:  # each by itself: a bad one costs none of the others
-            try:
-                extrinsics.add(decode.transforms(transform))
-            except InputError as e:
-                node.get_logger().warning(f'not used: {e}')
+            guard.pass_on('/tf_static', partial(take_one, transform))
 
     node.create_subscription(kind, '/tf_static', take, latched)
     return True

@@ -16,7 +16,7 @@ from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
 from rlml_slam.ros.codecs.reflector_clouds import build_reflector_map
 from rlml_slam.ros.codecs.request_message import build_request
 from rlml_slam.ros.codecs.update_message import build_update
-from rlml_slam.ros.sensors import LATCHED
+from rlml_slam.ros.sensors import ALIVE, LATCHED
 from rlml_slam.se2 import Array
 from rlml_slam.slam.back_end.back_end import Update
 from rlml_slam.slam.conversation import Correct, FrontEndCommand, LocalizeIn
@@ -35,10 +35,14 @@ class MapTopics:
         self._correction = node.create_publisher(pose, 'correction', LATCHED)
         self._jumps = node.create_publisher(pose, 'jumps', 10)
         self._requests = node.create_publisher(cloud, 'session_start', 10)
-        self._graph = node.create_publisher(cloud, 'graph_correction', 50)
+        self._graph = node.create_publisher(cloud, 'graph_correction', ALIVE)
         self._updates = node.create_publisher(cloud, 'updates', 50)
         self._grid = node.create_publisher(grid, 'localization_grid', LATCHED)
         self._reflectors = node.create_publisher(cloud, 'localization_map', LATCHED)
+
+    def show_alive(self) -> None:
+        """Let front ends know that this back end runs."""
+        self._graph.assert_liveliness()
 
     def send(self, command: FrontEndCommand) -> None:
         """A command for the front end."""

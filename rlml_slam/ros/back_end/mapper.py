@@ -23,6 +23,7 @@ from rlml_slam.ros.back_end.map_topics import MapTopics
 from rlml_slam.ros.back_end.searcher import Searcher
 from rlml_slam.ros.back_end.worker import Worker
 from rlml_slam.ros.map_publisher import MapPublisher
+from rlml_slam.ros.message_guard import guard_of
 from rlml_slam.ros.odom_frame import OdomFrame
 from rlml_slam.ros.tf import TransformPublisher
 from rlml_slam.slam import conversation as say
@@ -62,8 +63,10 @@ class Mapper:
         self.last_pose: LastPose | None = None
         self._survey_found = False
         self.answers: dict[int, Future[say.Answer]] = {}
-        self.worker = Worker()
-        self.searcher = Searcher(params, self._on_search_result, search_delay)
+        guard = guard_of(node)
+        self._report = lambda error: guard.report('frames', error)
+        self.worker = Worker(self._report)
+        self.searcher = Searcher(params, self._on_search_result, self._report, search_delay)
         self.products = MapPublisher(node, params.node)
         self._odom = OdomFrame()
         self._newest: Frame | None = None
@@ -210,7 +213,8 @@ class Mapper:
         self.products.publish(self.back_end, self.system.map, self.stamp)
 
     def settle(self) -> None:
-        """Send the map of everything so far where no frame has come for a while."""
+        """Now and then: show that it runs, write the journal, and send the map in a silence."""
+        self._topics.show_alive()
         if self.journal.is_due:
             self.worker.submit(self.journal.write)
         silent = time.monotonic() - self._heard >= IDLE

@@ -26,12 +26,13 @@ class Searcher:
         self,
         params: Parameters,
         on_result: Callable[[int, Relocation], None],
+        report: Callable[[BaseException], None],
         delay: float | None = None,
     ) -> None:
         self._p = params
         self._on_result = on_result
         self.delay = float(os.environ.get(DELAY, '0')) if delay is None else delay
-        self.worker = Worker()
+        self.worker = Worker(report)
         self._ends = threading.Event()
 
     def submit(self, search: Search) -> None:

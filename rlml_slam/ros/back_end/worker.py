@@ -13,13 +13,20 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
+from rlml_slam.errors import FileFormatError, MapError
+
 NICE = 5  # of the thread
 
 
 class Worker:
-    """Runs jobs one after the other. A job that fails is a bug: ``check`` raises its error."""
+    """Runs jobs one after the other.
 
-    def __init__(self) -> None:
+    What a job raises goes to ``report``, in the worker's thread, and the next one runs. A map that
+    cannot be used (MapError, FileFormatError) is raised by ``check``.
+    """
+
+    def __init__(self, report: Callable[[BaseException], None]) -> None:
+        self._report = report
         self._pool = ThreadPoolExecutor(max_workers=1, initializer=_step_back)
         self._failed: BaseException | None = None
         self._given = 0
@@ -40,13 +47,17 @@ class Worker:
 
     def _finish(self, future: Future[Any]) -> None:
         self._done += 1
-        if not future.cancelled() and future.exception() is not None:
-            self._failed = future.exception()
+        failed = None if future.cancelled() else future.exception()
+        if isinstance(failed, MapError | FileFormatError):
+            self._failed = failed
+        elif failed is not None:
+            self._report(failed)
 
     def check(self) -> None:
-        """Raise what a job raised."""
-        if self._failed is not None:
-            raise self._failed
+        """Raise what a job raised, once."""
+        failed, self._failed = self._failed, None
+        if failed is not None:
+            raise failed
 
     def close(self) -> None:
         """Finish the running job and forget the others."""

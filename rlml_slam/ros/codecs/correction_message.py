@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from rlml_slam.errors import InputError
 from rlml_slam.ros.codecs import encode
-from rlml_slam.ros.codecs.decode import stamp
+from rlml_slam.ros.codecs.decode import covariances, stamp
 from rlml_slam.ros.codecs.message_types import Make
-from rlml_slam.ros.codecs.point_cloud import build_cloud, read_cloud
+from rlml_slam.ros.codecs.point_cloud import bounded, build_cloud, read_cloud
 from rlml_slam.slam.conversation import Correct
 from rlml_slam.types import Belief
 
@@ -58,8 +58,9 @@ def read_correction(msg: Any, topic: str = 'graph_correction') -> Correct:
     """The inverse of build_correction; InputError if it is another kind of cloud."""
     rows = read_cloud(msg, topic)
     missing = {'session', 'kind', 'key', 'value', 'cov'} - set(rows.dtype.names or ())
-    if missing or not len(rows) or not np.isfinite(rows['value']).all():
+    if missing or not len(rows) or any(rows[n].ndim > 1 for n in ('session', 'kind', 'key')):
         raise InputError(f'{topic}: not a correction')
+    bounded(rows['value'], f'{topic}: a value')
     kind, value, cov = rows['kind'], rows['value'].astype(np.float64), rows['cov']
     own = kind == CORRECTION
     if own.sum() not in (0, 3) or cov.ndim != 2 or cov.shape[1] < 3:
@@ -68,6 +69,8 @@ def read_correction(msg: Any, topic: str = 'graph_correction') -> Correct:
     cov_map = np.array(cov[own][:, :3], dtype=np.float64) if own.any() else None
     if cov_map is not None and np.isnan(cov_map).any():
         cov_map = None
+    if cov_map is not None:
+        covariances(cov_map, f'{topic}: the covariance')
     return Correct(
         int(rows['session'][0]), stamp(msg, topic), T_map_local, cov_map,
         tuple(rows['key'][kind == REMOVED].tolist()), _belief(rows, value, topic),
@@ -82,6 +85,7 @@ def _belief(rows: NDArray[np.void], value: NDArray[np.float64], topic: str) -> B
     cov = np.array(rows['cov'][kind <= LANDMARK], dtype=np.float64)
     if np.sum(kind == POSE) != 3 or cov.shape != (n, n):
         raise InputError(f'{topic}: {n} values do not fit a covariance {cov.shape}')
+    covariances(cov, f'{topic}: the joint covariance')
     alias = kind == ALIAS
     return Belief(
         value[kind == POSE],

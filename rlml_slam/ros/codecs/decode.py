@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rlml_slam.errors import InputError
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Reflector
-from rlml_slam.ros.codecs.point_cloud import column, read_cloud
+from rlml_slam.ros.codecs.point_cloud import bounded, column, read_cloud
 from rlml_slam.se2 import Array
 from rlml_slam.types import ANONYMOUS, Detections, Imu, Odometry, Scan
 
@@ -27,6 +27,9 @@ MIN_UPRIGHT = math.cos(MAX_TILT)
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # (x, y, yaw) of ROS's 6 x 6 covariances
 MAX_VARIANCE = 1e6  # [m^2], [rad^2] of a start: from 1e9 or so, updates lose all their digits
 _ROUNDING = 1e-9  # of the largest variance
+LARGEST_VARIANCE = 1e15  # [m^2], [rad^2] of what another node of this package sends
+LARGEST_SIGMA = 100.0  # [m], [rad] of a detection
+FASTEST_TURN = 1e3  # [rad/s]
 FARTHEST = 1e4  # [m] beyond any laser
 _NEAR = 1e-3  # [m] nearer than this a bearing has no meaning
 
@@ -51,6 +54,17 @@ class Transform:
     t: Array
 
 
+def covariances(cov: Array, where: str) -> None:
+    """Raise InputError unless every matrix (..., n, n) is symmetric positive semidefinite."""
+    bounded(cov, where, LARGEST_VARIANCE)
+    most = float(np.abs(cov).max(initial=0.0))
+    symmetric = 0.5 * (cov + np.swapaxes(cov, -1, -2))
+    if np.abs(cov - symmetric).max(initial=0.0) > 1e-4 * most:
+        raise InputError(f'{where} is not symmetric')
+    if np.linalg.eigvalsh(symmetric).min(initial=0.0) < -1e-4 * most:
+        raise InputError(f'{where} has an eigenvalue below 0')
+
+
 def frame(frame_id: str) -> str:
     """A frame id without the leading slash that ROS 1 allowed."""
     return frame_id.lstrip('/')
@@ -63,6 +77,15 @@ def stamp(msg: Any, topic: str) -> int:
     if ns <= 0:
         raise InputError(f'{topic}: header.stamp is {ns} ns')
     return ns
+
+
+def size(msg: Any) -> int:
+    """How many beams or points a message of a sensor says that it has; 0 of any other message."""
+    if hasattr(msg, 'ranges'):
+        return len(msg.ranges)
+    if hasattr(msg, 'poses'):
+        return len(msg.poses)
+    return int(msg.width) * int(msg.height) if hasattr(msg, 'point_step') else 0
 
 
 def scan(msg: Any, topic: str = 'scan') -> Scan:
@@ -96,11 +119,10 @@ def imu(msg: Any, topic: str = 'imu', up: Array | None = None) -> Imu:
     """Imu: the yaw rate about the base z axis, which is ``up`` (3,) in the IMU's frame."""
     if msg.angular_velocity_covariance[0] == -1.0:
         raise InputError(f'{topic}: angular_velocity is marked as not measured')
-    w = msg.angular_velocity
-    rate = w.z if up is None else float(up @ [w.x, w.y, w.z])
-    if not np.isfinite(rate):
-        raise InputError(f'{topic}: angular_velocity is not finite')
-    return Imu(stamp(msg, topic), float(rate))
+    w = np.array([msg.angular_velocity.x, msg.angular_velocity.y, msg.angular_velocity.z])
+    used = w[2:] if up is None else w
+    bounded(used, f'{topic}: angular_velocity', FASTEST_TURN)
+    return Imu(stamp(msg, topic), float(w[2] if up is None else up @ w))
 
 
 def detections(msg: Any, noise: Reflector, topic: str = 'reflectors') -> Detections:
@@ -118,8 +140,9 @@ def detections(msg: Any, noise: Reflector, topic: str = 'reflectors') -> Detecti
     finite = np.isfinite(points).all(-1)
     if msg.is_dense and not finite.all():
         raise InputError(f'{topic}: {np.sum(~finite)} points of a dense cloud are not finite')
+    bounded(points[finite], f'{topic}: a position', FARTHEST)
     ids = column(cloud, 'id', ANONYMOUS)[finite]
-    known = np.isfinite(ids) & (ids >= 0)
+    known = (ids >= 0) & (ids < 2**53)
     diameters = column(cloud, 'diameter', np.nan)[finite]
     sigma_r = _positive(column(cloud, 'sigma_range', np.nan)[finite], noise.sigma_range)
     sigma_b = _positive(column(cloud, 'sigma_bearing', np.nan)[finite], noise.sigma_bearing)
@@ -138,8 +161,7 @@ def detections_of_poses(msg: Any, noise: Reflector, topic: str = 'reflector_pose
     """PoseArray of anonymous reflectors; only the positions are read."""
     points = np.array([[p.position.x, p.position.y] for p in msg.poses], dtype=np.float64)
     points = points.reshape(-1, 2)
-    if not np.isfinite(points).all():
-        raise InputError(f'{topic}: a position is not finite')
+    bounded(points, f'{topic}: a position', FARTHEST)
     n = len(points)
     sigma_r, sigma_b = np.full(n, noise.sigma_range), np.full(n, noise.sigma_bearing)
     return Detections(
@@ -153,7 +175,7 @@ def detections_of_poses(msg: Any, noise: Reflector, topic: str = 'reflector_pose
 
 
 def _positive(values: Array, otherwise: float) -> Array:
-    return np.where(np.isfinite(values) & (values > 0.0), values, otherwise)
+    return np.where((values > 0.0) & (values < LARGEST_SIGMA), values, otherwise)
 
 
 def polar_covariance(points: Array, sigma_r: Array, sigma_b: Array, fallback: float) -> Array:
@@ -232,8 +254,7 @@ def transforms(msg: Any, topic: str = '/tf_static') -> list[Transform]:
         where = f'{topic}: {m.header.frame_id} to {m.child_frame_id}'
         v = m.transform.translation
         t = np.array([v.x, v.y, v.z], dtype=np.float64)
-        if not np.isfinite(t).all():
-            raise InputError(f'{where}: translation is not finite')
+        bounded(t, f'{where}: translation', FARTHEST)
         R = rotation_matrix(m.transform.rotation, where)
         out.append(Transform(frame(m.header.frame_id), frame(m.child_frame_id), R, t))
     return out
@@ -242,8 +263,7 @@ def transforms(msg: Any, topic: str = '/tf_static') -> list[Transform]:
 def planar_pose(pose: Any, where: str) -> Array:
     """(x, y, yaw) of a Pose; z and a small tilt are left out, a large tilt is an InputError."""
     x, y = float(pose.position.x), float(pose.position.y)
-    if not (math.isfinite(x) and math.isfinite(y)):
-        raise InputError(f'{where}.position is not finite')
+    bounded((x, y), f'{where}.position')
     return np.array([x, y, yaw(rotation_matrix(pose.orientation, where), where)])
 
 
@@ -279,7 +299,8 @@ def occupancy_grid(msg: Any, topic: str) -> OccupancyGrid | None:
         return None
     x, y = float(info.origin.position.x), float(info.origin.position.y)
     resolution = float(info.resolution)
-    if len(cells) != rows * columns or not (resolution > 0.0 and np.isfinite(resolution + x + y)):
+    bounded((x, y), f'{topic}: info.origin')
+    if len(cells) != rows * columns or not 1e-3 <= resolution <= 1e3:
         raise InputError(f'{topic}: {len(cells)} cells do not fill {rows} x {columns} of a map')
     if abs(float(info.origin.orientation.z)) > 1e-6:
         raise InputError(f'{topic}: a map that is turned cannot be used')

@@ -16,9 +16,9 @@ import numpy as np
 
 from rlml_slam.errors import InputError
 from rlml_slam.ros.codecs import encode
-from rlml_slam.ros.codecs.decode import stamp
+from rlml_slam.ros.codecs.decode import FARTHEST, covariances, stamp
 from rlml_slam.ros.codecs.message_types import Make
-from rlml_slam.ros.codecs.point_cloud import build_cloud, read_cloud
+from rlml_slam.ros.codecs.point_cloud import bounded, build_cloud, column, read_table
 from rlml_slam.ros.codecs.reflector_clouds import Associated
 from rlml_slam.se2 import Array
 from rlml_slam.slam.conversation import SessionFrame
@@ -77,11 +77,15 @@ def build_record(make: Make, record: SessionFrame, local_frame: str) -> Any:
 
 def read_record(msg: Any, topic: str = 'frames') -> Record:
     """The inverse of build_record; InputError if it is another kind of cloud."""
-    cloud = read_cloud(msg, topic)
-    missing = set(RECORD.names or ()) - set(cloud.dtype.names or ())
-    if missing or len(cloud) != 1:
-        raise InputError(f'{topic}: not one frame; missing {", ".join(sorted(missing)) or "none"}')
-    r, time = cloud[0], stamp(msg, topic)
+    r, time = read_table(msg, RECORD, topic, one=True)[0], stamp(msg, topic)
+    for name in ('T_local_base', 'T_map_base', 'delta'):
+        bounded(r[name], f'{topic}: {name}')
+    for name in ('cov_local', 'cov_map', 'cov'):
+        covariances(r[name].reshape(3, 3), f'{topic}: {name}')
+    for name in ('odom_pose', 'origin'):
+        bounded(np.nan_to_num(r[name]), f'{topic}: {name}')
+    if r['level'] > max(Level):
+        raise InputError(f'{topic}: {r["level"]} is no level of health')
 
     def array(name: str) -> Array:
         value = np.array(r[name], dtype=np.float64)
@@ -116,8 +120,6 @@ def read_record(msg: Any, topic: str = 'frames') -> Record:
         iterations=int(r['iterations']),
         wall_ms=float(r['wall_ms']),
     )
-    if not (np.isfinite(frame.T_local_base).all() and np.isfinite(frame.cov_local).all()):
-        raise InputError(f'{topic}: the pose is not finite')
     of = SessionFrame(int(r['session']), frame, int(r['request']), int(r['mode']))
     return Record(of, bool(r['has_points']), bool(r['has_detections']))
 
@@ -131,8 +133,10 @@ def build_points(make: Make, time: int, base_frame: str, points: Array) -> Any:
 
 def read_points(msg: Any, topic: str = 'deskewed_points') -> Array:
     """Points (n, 2)."""
-    cloud = read_cloud(msg, topic)
-    return np.stack([cloud['x'], cloud['y']], -1).astype(np.float64)
+    cloud = read_table(msg, POINT, topic)
+    points = np.stack([column(cloud, 'x', 0.0), column(cloud, 'y', 0.0)], -1)
+    bounded(points, f'{topic}: a point', FARTHEST)
+    return points
 
 
 class FrameAssembler:

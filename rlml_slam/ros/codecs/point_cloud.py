@@ -7,13 +7,15 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rlml_slam.errors import InputError
 from rlml_slam.ros.codecs.message_types import Make
 
 # sensor_msgs/PointField: the constants INT8 = 1 .. FLOAT64 = 8
 _DATATYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
+LARGEST = 1e7  # [m]: no place on a floor is that far from another
+MAX_FIELDS = 100  # of a point
 _NUMBERS = {code: number for number, code in _DATATYPES.items()}
 
 
@@ -24,27 +26,52 @@ def read_cloud(msg: Any, topic: str = 'cloud') -> NDArray[np.void]:
     """
     dtype = _dtype(msg, topic)
     data = np.frombuffer(memoryview(msg.data), dtype=np.uint8)
-    used = msg.width * msg.point_step
-    row = msg.row_step or used
-    if row < used or len(data) < (msg.height - 1) * row + used * (msg.height > 0):
+    rows, used = int(msg.height), int(msg.width) * int(msg.point_step)
+    row = int(msg.row_step) or used
+    if rows * int(msg.width) == 0:
+        return np.zeros(0, dtype)
+    if used == 0 or row < used or len(data) < (rows - 1) * row + used:
         raise InputError(
-            f'{topic}: {len(data)} bytes of data do not hold {msg.height} x {msg.width} points '
+            f'{topic}: {len(data)} bytes of data do not hold {rows} x {msg.width} points '
             f'of {msg.point_step} bytes in rows of {msg.row_step}'
         )
-    if msg.width * msg.height == 0:
-        return np.zeros(0, dtype)
-    rows = [data[k * row : k * row + used] for k in range(msg.height)]
-    return np.concatenate(rows).view(dtype)
+    packed = np.lib.stride_tricks.as_strided(data, (rows, used), (row, 1), writeable=False)
+    return np.ascontiguousarray(packed).reshape(-1).view(dtype)
+
+
+def read_table(
+    msg: Any, dtype: np.dtype[np.void], topic: str, one: bool = False
+) -> NDArray[np.void]:
+    """The points (n,) of a cloud of this package, which has the fields of ``dtype``.
+
+    Raises InputError if it has others, or where it should have ``one`` point and has not.
+    """
+    cloud = read_cloud(msg, topic)
+    names = cloud.dtype.names or ()
+    missing = [n for n in dtype.names or () if n not in names or cloud.dtype[n] != dtype[n]]
+    if missing or (one and len(cloud) != 1):
+        raise InputError(
+            f'{topic}: {len(cloud)} points; missing fields: {", ".join(missing) or "none"}'
+        )
+    return cloud
+
+
+def bounded(values: ArrayLike, where: str, largest: float = LARGEST) -> None:
+    """Raise InputError where a value is not finite, or larger than any that makes sense."""
+    if not (np.abs(values) <= largest).all():  # NaN as well
+        raise InputError(f'{where} is not finite, or beyond {largest:.3g}')
 
 
 def _dtype(msg: Any, topic: str) -> np.dtype[np.void]:
+    if len(msg.fields) > MAX_FIELDS:
+        raise InputError(f'{topic}: {len(msg.fields)} fields, more than {MAX_FIELDS}')
     fields = tuple((f.name, int(f.offset), int(f.datatype), int(f.count)) for f in msg.fields)
     for name, _, datatype, _ in fields:
         if datatype not in _DATATYPES:
             raise InputError(f'{topic}: field {name!r} has the unknown datatype {datatype}')
     try:
         return _layout(fields, int(msg.point_step), bool(msg.is_bigendian))
-    except ValueError as e:
+    except (ValueError, TypeError, OverflowError, MemoryError) as e:
         raise InputError(f'{topic}: fields do not fit point_step {msg.point_step}: {e}') from e
 
 
@@ -71,7 +98,10 @@ def column(points: NDArray[np.void], name: str, absent: float) -> NDArray[np.flo
     """One field (n,) as float64, ``absent`` everywhere if the cloud has no such field."""
     if name not in (points.dtype.names or ()):
         return np.full(len(points), absent)
-    return points[name].astype(np.float64)
+    if points[name].ndim != 1:
+        raise InputError(f'cloud: field {name!r} has several values in a point')
+    with np.errstate(invalid='ignore'):  # of a NaN with a payload
+        return points[name].astype(np.float64)
 
 
 def build_cloud(make: Make, header: Any, points: NDArray[np.void]) -> Any:

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.errors import InputError
 from rlml_slam.ros.codecs import encode
-from rlml_slam.ros.codecs.decode import frame, stamp
+from rlml_slam.ros.codecs.decode import covariances, frame, stamp
 from rlml_slam.ros.codecs.message_types import Make
-from rlml_slam.ros.codecs.point_cloud import build_cloud, read_cloud
+from rlml_slam.ros.codecs.point_cloud import bounded, build_cloud, column, read_table
 from rlml_slam.se2 import Array
 from rlml_slam.types import Detections, Frame, Reflectors
 
@@ -100,16 +99,17 @@ def read_reflector_map(msg: Any, topic: str = 'reflector_map_points') -> Reflect
 
 
 def _read(msg: Any, dtype: np.dtype[np.void], topic: str) -> NDArray[np.void]:
-    cloud = read_cloud(msg, topic)
-    missing = set(dtype.names or ()) - set(cloud.dtype.names or ())
-    if missing:
-        raise InputError(f'{topic}: cloud has no field {", ".join(sorted(missing))}')
+    cloud = read_table(msg, dtype, topic)
+    points, cov = _places(cloud)
+    bounded(points, f'{topic}: a position')
+    covariances(cov, f'{topic}: a covariance')
     return cloud
 
 
 def _places(cloud: NDArray[np.void]) -> tuple[Array, Array]:
     """Points (n, 2) and covariances (n, 2, 2)."""
     cov = np.empty((len(cloud), 2, 2))
-    cov[:, 0, 0], cov[:, 1, 1] = cloud['cov_xx'], cloud['cov_yy']
-    cov[:, 0, 1] = cov[:, 1, 0] = cloud['cov_xy']
-    return np.stack([cloud['x'], cloud['y']], -1).astype(np.float64), cov
+    x, y, xx, xy, yy = (column(cloud, n, 0.0) for n in ('x', 'y', 'cov_xx', 'cov_xy', 'cov_yy'))
+    cov[:, 0, 0], cov[:, 1, 1] = xx, yy
+    cov[:, 0, 1] = cov[:, 1, 0] = xy
+    return np.stack([x, y], -1), cov

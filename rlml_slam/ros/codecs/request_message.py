@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from rlml_slam.errors import InputError
 from rlml_slam.ros.codecs import encode
-from rlml_slam.ros.codecs.decode import stamp
+from rlml_slam.ros.codecs.decode import covariances, stamp
 from rlml_slam.ros.codecs.message_types import Make
-from rlml_slam.ros.codecs.point_cloud import build_cloud, read_cloud
+from rlml_slam.ros.codecs.point_cloud import bounded, build_cloud, read_table
 from rlml_slam.slam.conversation import Relocate, StartSession
 
 START, RELOCATE = range(2)  # `kind`
@@ -40,17 +39,11 @@ def build_request(make: Make, command: StartSession | Relocate, map_frame: str) 
 
 def read_request(msg: Any, topic: str = 'session_start') -> StartSession | Relocate:
     """The inverse of build_request; InputError if it is another kind of cloud."""
-    cloud = read_cloud(msg, topic)
-    missing = set(REQUEST.names or ()) - set(cloud.dtype.names or ())
-    if missing or len(cloud) != 1:
-        raise InputError(
-            f'{topic}: not one request; missing {", ".join(sorted(missing)) or "none"}'
-        )
-    r = cloud[0]
+    r = read_table(msg, REQUEST, topic, one=True)[0]
     pose = np.array(r['pose'], dtype=np.float64)
     cov = np.array(r['cov'], dtype=np.float64).reshape(3, 3)
-    if not (np.isfinite(pose).all() and np.isfinite(cov).all()):
-        raise InputError(f'{topic}: the pose is not finite')
+    bounded(pose, f'{topic}: the pose')
+    covariances(cov, f'{topic}: the covariance')
     # a request about the pose of now has no stamp
     time = msg.header.stamp.sec * 1_000_000_000 + msg.header.stamp.nanosec
     number, session = int(r['number']), int(r['session'])

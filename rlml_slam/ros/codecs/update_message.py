@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from rlml_slam.errors import InputError
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import Make
-from rlml_slam.ros.codecs.point_cloud import build_cloud, read_cloud
+from rlml_slam.ros.codecs.point_cloud import build_cloud, read_table
 from rlml_slam.se2 import Array
 from rlml_slam.slam.back_end.back_end import Update
 
@@ -48,13 +47,7 @@ def build_update(make: Make, stamp: int, map_frame: str, place: Array, update: U
 
 def read_update(msg: Any, topic: str = 'updates') -> UpdateSummary:
     """The inverse of build_update; InputError if it is another kind of cloud."""
-    cloud = read_cloud(msg, topic)
-    missing = set(UPDATE.names or ()) - set(cloud.dtype.names or ())
-    if missing or len(cloud) != 1:
-        raise InputError(
-            f'{topic}: not one keyframe; missing {", ".join(sorted(missing)) or "none"}'
-        )
-    u = cloud[0]
+    u = read_table(msg, UPDATE, topic, one=True)[0]
     return UpdateSummary(
         int(u['keyframe']), bool(u['optimized']), int(u['accepted']), int(u['rejected']),
         float(u['wall_ms']),

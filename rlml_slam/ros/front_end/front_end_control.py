@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from rclpy.event_handler import SubscriptionEventCallbacks
 
 from rlml_slam.errors import InputError
 from rlml_slam.maps.occupancy import OccupancyGrid
@@ -19,11 +20,13 @@ from rlml_slam.ros.codecs.correction_message import read_correction
 from rlml_slam.ros.codecs.message_types import rclpy_class
 from rlml_slam.ros.codecs.reflector_clouds import read_reflector_map
 from rlml_slam.ros.codecs.request_message import read_request
-from rlml_slam.ros.sensors import LATCHED, RELIABLE, checked
+from rlml_slam.ros.message_guard import checked
+from rlml_slam.ros.sensors import ALIVE, LATCHED, LEASE, RELIABLE
 from rlml_slam.slam.conversation import FrontEndCommand, LocalizeIn
 from rlml_slam.slam.front_end_session import FrontEndSession
 from rlml_slam.types import Reflectors
 
+ABSENT = 2.0  # [s] without a sign of the back end, after which it is reported
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 CLOUD = 'sensor_msgs/msg/PointCloud2'
 GRID = 'nav_msgs/msg/OccupancyGrid'
@@ -48,16 +51,32 @@ class FrontEndControl:
         self._grids: dict[int, OccupancyGrid | None] = {}
         self._reflectors: dict[int, Reflectors | None] = {}
         topics: tuple[tuple[str, str, Callable[[Any], None], Any], ...] = (
-            (CLOUD, 'graph_correction', self.on_correction, RELIABLE),
+            (CLOUD, 'graph_correction', self.on_correction, ALIVE),
             (CLOUD, 'session_start', self.on_request, RELIABLE),
             (GRID, 'localization_grid', self.on_grid, LATCHED),
             (CLOUD, 'localization_map', self.on_map, LATCHED),
         )
+        self._absent: float | None = None if has_back_end else time.monotonic()
         for kind, topic, callback, qos in (
             (POSE, 'initialpose', self.start_at, RELIABLE),
             *(() if has_back_end else topics),
         ):
-            node.create_subscription(rclpy_class(kind), topic, checked(node, callback), qos)
+            events = SubscriptionEventCallbacks(liveliness=self._on_liveliness)
+            node.create_subscription(
+                rclpy_class(kind), topic, checked(node, topic, callback), qos,
+                event_callbacks=events if qos is ALIVE else None,
+            )  # fmt: skip
+
+    def _on_liveliness(self, event: Any) -> None:
+        """A back end has come, or gives no sign any more."""
+        self._absent = None if event.alive_count else time.monotonic() - LEASE
+
+    def problems(self) -> tuple[str, ...]:
+        """What makes the front end's health DEGRADED besides its estimate."""
+        silent = 0.0 if self._absent is None else time.monotonic() - self._absent
+        if silent < ABSENT:
+            return ()
+        return (f'no correction for {silent:.1f} s: is back_end running?',)
 
     def restart(self) -> None:
         """Begin at ``map_start_pose``: the clock jumped back."""

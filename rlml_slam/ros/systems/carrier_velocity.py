@@ -9,7 +9,8 @@ from typing import Any
 from rlml_slam.deformable.window import CarrierVelocity
 from rlml_slam.params import Node
 from rlml_slam.ros.codecs.message_types import rclpy_class
-from rlml_slam.ros.sensors import DEPTH, SENSOR, checked
+from rlml_slam.ros.message_guard import checked, guard_of
+from rlml_slam.ros.sensors import DEPTH, REFUSED, SENSOR
 from rlml_slam.ros.systems.deformable_messages import read_velocity
 
 
@@ -23,9 +24,10 @@ class VelocityInput:
     def __init__(
         self, node: Any, params: Node, announce: Callable[[int, CarrierVelocity, bool], None]
     ) -> None:
-        self.receive = checked(node, lambda msg: announce(*read_velocity(msg, params)))
+        self._guard, topic = guard_of(node), 'carrier_velocity'
+        self.receive = checked(node, topic, lambda msg: announce(*read_velocity(msg, params)))
         self._subscription = node.create_subscription(
-            rclpy_class('geometry_msgs/msg/TwistStamped'), 'carrier_velocity', self.receive,
+            rclpy_class('geometry_msgs/msg/TwistStamped'), topic, self.receive,
             SENSOR,
         )  # fmt: skip
 
@@ -34,7 +36,14 @@ class VelocityInput:
         subscription = self._subscription
         with subscription.handle:
             for _ in range(DEPTH):
-                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+                taken = self._guard.pass_on(
+                    'carrier_velocity',
+                    lambda: subscription.handle.take_message(
+                        subscription.msg_type, subscription.raw
+                    ),
+                    REFUSED,
+                )
                 if taken is None:
                     return
-                self.receive(taken[0])
+                if taken is not REFUSED:
+                    self.receive(taken[0])

@@ -18,6 +18,8 @@ from rlml_slam.slam.front_end.joint_state import JointState
 # them has a rounding error that averages out along a wall; that of a parallel grid would shift the
 # whole wall by up to half a cell.
 GRID_TURN = 0.53
+# [m] from a submap's anchor: no scan of it is as far away unless the pose was wrong
+FAR = 500.0
 
 Placed: TypeAlias = tuple[Array, Array]  # end points and sensor origin in the submap's frame
 
@@ -59,7 +61,11 @@ class Submaps:
         points = voxel_filter.thin(points, self._p.resolution, self._p.max_points)
         for slot, scans in enumerate(self._pending):
             T = se2.between(state.anchor(slot), pose)
-            scans.append((se2.transform(T, points), se2.transform(T, origin[None])[0]))
+            placed = se2.transform(T, points), se2.transform(T, origin[None])[0]
+            if not all((np.abs(part) < FAR).all() for part in placed):
+                self.start_again()  # the pose or the anchor is wrong, and no grid spans that
+                return False
+            scans.append(placed)
         return True
 
     def start_again(self) -> None:

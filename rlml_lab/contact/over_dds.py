@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Mutated messages and random bytes to a running ``slam``, beside those of a simulator."""
+
+from __future__ import annotations
+
+import copy
+import math
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from rlml_lab.contact.good_messages import stream_of_room
+from rlml_lab.contact.mutation import mutated, random_bytes
+from rlml_slam.cli.support.live_session import node, own_domain
+from rlml_slam.cli.support.processes import Processes, free_domain
+from rlml_slam.errors import RlmlError
+from rlml_slam.params import Simulator
+from rlml_slam.ros.codecs import decode
+from rlml_slam.se2 import Array
+
+START = 400.0  # [s] for processes to start, and their kernels to be compiled
+QOS = QoSProfile(depth=1000)
+BYTES = 0.05  # share of random bytes
+TOPICS = ('scan', 'odom', 'imu', 'reflectors')
+
+
+class Intruder(Node):
+    """Sends mutated messages of the present moment on the sensors' topics."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__('intruder')
+        self._rng = np.random.default_rng(seed)
+        self._good = dict(stream_of_room(3.0))
+        self.true: dict[int, Array] = {}
+        self.poses: dict[int, Array] = {}
+        self.refused: dict[str, str] = {}
+        self.sent = 0
+        self._out = {
+            topic: self.create_publisher(type(self._good[topic]), topic, QOS) for topic in TOPICS
+        }
+        self.create_subscription(PoseWithCovarianceStamped, 'pose', self.on_pose, QOS)
+        self.create_subscription(Odometry, 'ground_truth', self.on_truth, QOS)
+        self.create_subscription(DiagnosticArray, '/diagnostics', self.on_diagnostics, QOS)
+
+    def on_pose(self, msg: Any) -> None:
+        """A pose of the front end."""
+        pose = decode.pose_estimate(msg)
+        self.poses[pose.stamp] = pose.pose
+
+    def on_truth(self, msg: Any) -> None:
+        """Where the robot is."""
+        stamp = decode.stamp(msg, 'ground_truth')
+        self.true[stamp] = decode.planar_pose(msg.pose.pose, 'ground_truth')
+
+    def on_diagnostics(self, msg: Any) -> None:
+        """What was refused."""
+        for status in msg.status:
+            if status.name.endswith('front_end'):
+                self.refused = {v.key: v.value for v in status.values}
+
+    def send(self) -> None:
+        """One message that nobody should send."""
+        topic = str(self._rng.choice(TOPICS))
+        if self._rng.random() < BYTES:
+            self._out[topic].publish(random_bytes(self._rng))
+        else:
+            msg = copy.deepcopy(self._good[topic])
+            sec, nanosec = divmod(max(self.true, default=0), 1_000_000_000)
+            msg.header.stamp.sec, msg.header.stamp.nanosec = sec, nanosec
+            self._out[topic].publish(mutated(msg, self._rng))
+        self.sent += 1
+
+
+def drive(messages: int, rate: float, seed: int, log: Path, seconds: float) -> Intruder:
+    """Drive for a while [s] with ``messages`` intruding at a rate [Hz]; RlmlError if one ends."""
+    domain = free_domain()
+    environment = {'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+    with (
+        tempfile.TemporaryDirectory(prefix='rlml_map_') as maps,
+        own_domain(domain, environment),
+        Processes(log, environment) as children,
+    ):
+        values = {'map_directory': maps, 'laser_pose': list(Simulator().laser_pose)}
+        children.start('slam', node('slam', values))
+        children.start(
+            'simulator', node('simulator', {'repeat': 'true', 'wait_for_subscribers': 1})
+        )
+        intruder = Intruder(seed)
+        executor = SingleThreadedExecutor()
+        executor.add_node(intruder)
+        try:
+            _run(intruder, executor, children, messages, rate, seconds)
+            children.check('slam', 'simulator')
+        finally:
+            executor.shutdown(timeout_sec=1.0)
+            intruder.destroy_node()
+    return intruder
+
+
+def _run(
+    intruder: Intruder, executor: Any, children: Processes, messages: int, rate: float,
+    seconds: float,
+) -> None:  # fmt: skip
+    end = time.monotonic() + START
+    while not intruder.poses:
+        if time.monotonic() > end:
+            raise RlmlError('no pose came')
+        executor.spin_once(timeout_sec=0.1)
+        children.check('slam', 'simulator')
+    began = time.monotonic()
+    while intruder.sent < messages or time.monotonic() - began < seconds:
+        executor.spin_once(timeout_sec=0.5 / rate)
+        while intruder.sent < min(messages, rate * (time.monotonic() - began)):
+            intruder.send()
+        children.check('slam', 'simulator')
+
+
+def figures(of: Intruder) -> tuple[float, float]:
+    """Poses per second of the simulator, and their root mean square error [m]."""
+    stamps = sorted(of.poses.keys() & of.true.keys())
+    steps = [math.hypot(*(of.poses[t] - of.true[t])[:2]) for t in stamps]
+    known = sorted(of.poses)
+    if len(known) < 2:
+        return 0.0, math.nan
+    rate = (len(known) - 1) / ((known[-1] - known[0]) * 1e-9)
+    return rate, float(np.sqrt(np.mean(np.square(steps)))) if steps else math.nan
