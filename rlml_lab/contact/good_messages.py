@@ -53,11 +53,11 @@ def private_messages(record: SessionFrame) -> dict[str, list[Any]]:
     assert frame.observation.points is not None
     return {
         'initialpose': [encode.pose_with_covariance(make, frame.stamp, 'map', pose, cov)],
-        'graph_correction': [build_correction(make, correct, 'map')],
-        'session_start': [build_request(make, start, 'map') for start in starts],
-        'localization_grid': [encode.occupancy_grid(make, 9, 'map', grid)],
-        'localization_map': [build_reflector_map(make, 9, 'map', map_)],
-        'frames': [build_record(make, record, 'rlml_local')],
+        'rlml/graph_correction': [build_correction(make, correct, 'map')],
+        'rlml/session_start': [build_request(make, start, 'map') for start in starts],
+        'rlml/localization_grid': [encode.occupancy_grid(make, 9, 'map', grid)],
+        'rlml/localization_map': [build_reflector_map(make, 9, 'map', map_)],
+        'rlml/frames': [build_record(make, record, 'rlml_local')],
         'deskewed_points': [
             build_points(make, frame.stamp, 'base_link', frame.observation.points)
         ],

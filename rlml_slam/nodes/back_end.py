@@ -58,7 +58,7 @@ class BackEndNode(Node):
 
     def _subscribe(self) -> None:
         join, stamp = self.join, decode.stamp
-        self._listen('frames', lambda m: join.add_record(read_record(m)))
+        self._listen('rlml/frames', lambda m: join.add_record(read_record(m)))
         self._listen('deskewed_points', lambda m: join.add_points(stamp(m, ''), read_points(m)))
         self._listen('reflectors/associated', lambda m: join.add_associated(read_associated(m)))
 

@@ -52,11 +52,11 @@ def start(live, **values):
     for topic, kind in MAP_TOPICS.items():
         live.listen(topic, kind, LATCHED)
     live.listen(*TF)
-    talk = ('frames', 'deskewed_points', 'reflectors/associated', 'pose')
+    talk = ('rlml/frames', 'deskewed_points', 'reflectors/associated', 'pose')
     live.spin_until(
         lambda: (
             all(front.count_subscribers(topic) == 1 for topic in talk)
-            and front.count_publishers('graph_correction') == 1
+            and front.count_publishers('rlml/graph_correction') == 1
             and front.control.session.mode
         )
     )

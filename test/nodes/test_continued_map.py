@@ -78,8 +78,8 @@ class Front:
         self.mapper.add(record)
         searched(self.mapper)
         for topic, read in (
-            ('session_start', read_request),
-            ('graph_correction', read_correction),
+            ('rlml/session_start', read_request),
+            ('rlml/graph_correction', read_correction),
         ):
             before = self.session.session
             for msg in self.ear.sent[topic]:

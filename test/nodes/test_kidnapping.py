@@ -65,8 +65,13 @@ def test_carried_robot_is_lost_and_found_again(live, localizes):
     back = live.start(BackEndNode, laser_pose=list(P.node.laser_pose))
     events = iter(Simulation(load_world('room'), P, seed=1))
     front.sensors.stop_waiting()
-    talk = ('frames', 'deskewed_points', 'reflectors/associated')
-    heard = ('session_start', 'graph_correction', 'localization_grid', 'localization_map')
+    talk = ('rlml/frames', 'deskewed_points', 'reflectors/associated')
+    heard = (
+        'rlml/session_start',
+        'rlml/graph_correction',
+        'rlml/localization_grid',
+        'rlml/localization_map',
+    )
     live.spin_until(
         lambda: (
             all(front.count_subscribers(topic) == 1 for topic in talk)

@@ -386,7 +386,7 @@ def switched_off(make, tmp_path):
 
 
 def told(ear):
-    return [read_request(m).pose[:2] for m in ear.sent['session_start']]
+    return [read_request(m).pose[:2] for m in ear.sent['rlml/session_start']]
 
 
 def test_robot_starts_where_it_was_switched_off(make, ear, switched_off):

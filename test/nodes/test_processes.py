@@ -86,10 +86,10 @@ def test_processes_map_a_recording_and_stop_cleanly(live, start):
 def test_both_in_one_process_stop_cleanly(live, start):
     live.listen('pose', POSE)
     both = start('slam')
-    live.spin_until(lambda: live.ear.count_publishers('frames') == 1, timeout=60.0)
+    live.spin_until(lambda: live.ear.count_publishers('rlml/frames') == 1, timeout=60.0)
     live.spin_until(lambda: live.ear.count_publishers('graph') == 1, timeout=60.0)
     # frames pass from one to the other as they are
-    assert live.ear.count_subscribers('frames') == 0
+    assert live.ear.count_subscribers('rlml/frames') == 0
     both.interrupt()
     assert ended(both)[0] == 0
 

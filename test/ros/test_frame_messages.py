@@ -217,7 +217,7 @@ def test_belief_that_contradicts_itself_is_refused():
     belief = Belief(np.zeros(3), np.array([1]), np.zeros((1, 2)), np.eye(5), {})
     msg = build_correction(make_bag, Correct(1, 1, np.zeros(3), None, (), belief), 'map')
     msg.width -= 1  # the last landmark row
-    with pytest.raises(InputError, match='graph_correction: 4 values do not fit'):
+    with pytest.raises(InputError, match='rlml/graph_correction: 4 values do not fit'):
         read_correction(msg)
 
 

@@ -78,7 +78,7 @@ class Recorder(Node):
         self._settled = time.monotonic() + SETTLE
         listen = self.create_subscription
         listen(PoseWithCovarianceStamped, 'pose', self.on_pose, DEEP)
-        listen(PointCloud2, 'frames', self.on_frame, DEEP)
+        listen(PointCloud2, 'rlml/frames', self.on_frame, DEEP)
         listen(PointCloud2, 'reflectors/associated', self.on_associated, DEEP)
         listen(PointCloud2, 'updates', self.on_update, DEEP)
         listen(Odometry, 'ground_truth', self.on_truth, DEEP)

@@ -34,11 +34,11 @@ class MapTopics:
         grid = rclpy_class('nav_msgs/msg/OccupancyGrid')
         self._correction = node.create_publisher(pose, 'correction', LATCHED)
         self._jumps = node.create_publisher(pose, 'jumps', 10)
-        self._requests = node.create_publisher(cloud, 'session_start', 10)
-        self._graph = node.create_publisher(cloud, 'graph_correction', ALIVE)
+        self._requests = node.create_publisher(cloud, 'rlml/session_start', 10)
+        self._graph = node.create_publisher(cloud, 'rlml/graph_correction', ALIVE)
         self._updates = node.create_publisher(cloud, 'updates', 50)
-        self._grid = node.create_publisher(grid, 'localization_grid', LATCHED)
-        self._reflectors = node.create_publisher(cloud, 'localization_map', LATCHED)
+        self._grid = node.create_publisher(grid, 'rlml/localization_grid', LATCHED)
+        self._reflectors = node.create_publisher(cloud, 'rlml/localization_map', LATCHED)
 
     def show_alive(self) -> None:
         """Let front ends know that this back end runs."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topic ``graph_correction``: what the graph knows better than the front end.
+"""The topic ``rlml/graph_correction``: what the graph knows better than the front end.
 
 A PointCloud2 with one point per value: those of T_map_local with the rows of the keyframe's
 covariance in the map, keys of removed reflectors, and the belief, whose values have the landmark
@@ -54,7 +54,7 @@ def build_correction(make: Make, command: Correct, map_frame: str) -> Any:
     return build_cloud(make, encode.header(make, command.stamp, map_frame), cloud)
 
 
-def read_correction(msg: Any, topic: str = 'graph_correction') -> Correct:
+def read_correction(msg: Any, topic: str = 'rlml/graph_correction') -> Correct:
     """The inverse of build_correction; InputError if it is another kind of cloud."""
     rows = read_cloud(msg, topic)
     missing = {'session', 'kind', 'key', 'value', 'cov'} - set(rows.dtype.names or ())

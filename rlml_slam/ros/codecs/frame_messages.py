@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A front end's frame on its way to the back end, as clouds that RViz shows as well.
 
-``frames`` has one point, the local pose, whose fields are all figures of the frame, exactly.
+``rlml/frames`` has one point, the local pose, whose fields are all figures of the frame, exactly.
 ``deskewed_points`` are the end points of its scan, ``reflectors/associated`` its detections, both
 in the base frame. The back end sees no sensor: it works on what the front end saw.
 """
@@ -75,7 +75,7 @@ def build_record(make: Make, record: SessionFrame, local_frame: str) -> Any:
     return build_cloud(make, encode.header(make, frame.stamp, local_frame), r)
 
 
-def read_record(msg: Any, topic: str = 'frames') -> Record:
+def read_record(msg: Any, topic: str = 'rlml/frames') -> Record:
     """The inverse of build_record; InputError if it is another kind of cloud."""
     r, time = read_table(msg, RECORD, topic, one=True)[0], stamp(msg, topic)
     for name in ('T_local_base', 'T_map_base', 'delta'):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topic ``session_start``: where the front end is to begin a session, or to go on.
+"""The topic ``rlml/session_start``: where the front end is to begin a session, or to go on.
 
 A PointCloud2 of one point, the place, whose fields are those of the request, exactly.
 """
@@ -37,7 +37,7 @@ def build_request(make: Make, command: StartSession | Relocate, map_frame: str) 
     return build_cloud(make, encode.header(make, command.stamp, map_frame), r)
 
 
-def read_request(msg: Any, topic: str = 'session_start') -> StartSession | Relocate:
+def read_request(msg: Any, topic: str = 'rlml/session_start') -> StartSession | Relocate:
     """The inverse of build_request; InputError if it is another kind of cloud."""
     r = read_table(msg, REQUEST, topic, one=True)[0]
     pose = np.array(r['pose'], dtype=np.float64)

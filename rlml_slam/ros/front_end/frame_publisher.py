@@ -25,7 +25,7 @@ TOPICS = {
     'deskewed_points': (CLOUD, 50),
     'reflectors/associated': (CLOUD, 50),
     'reflectors/statuses': ('visualization_msgs/msg/MarkerArray', 5),
-    'frames': (CLOUD, 50),
+    'rlml/frames': (CLOUD, 50),
 }
 SHORT = 0.005  # [s] steps of several lidars: too short for a speed
 
@@ -70,8 +70,8 @@ class FramePublisher:
                 associated = build_associated(make, frame, p.base_frame)
                 self._publishers['reflectors/associated'].publish(associated)
             self._show_statuses(frame, observation.detections)
-        if self._is_heard('frames'):
-            self._publishers['frames'].publish(build_record(make, record, p.local_frame))
+        if self._is_heard('rlml/frames'):
+            self._publishers['rlml/frames'].publish(build_record(make, record, p.local_frame))
         self._last = frame
 
     def _is_heard(self, topic: str) -> bool:

@@ -51,10 +51,10 @@ class FrontEndControl:
         self._grids: dict[int, OccupancyGrid | None] = {}
         self._reflectors: dict[int, Reflectors | None] = {}
         topics: tuple[tuple[str, str, Callable[[Any], None], Any], ...] = (
-            (CLOUD, 'graph_correction', self.on_correction, ALIVE),
-            (CLOUD, 'session_start', self.on_request, RELIABLE),
-            (GRID, 'localization_grid', self.on_grid, LATCHED),
-            (CLOUD, 'localization_map', self.on_map, LATCHED),
+            (CLOUD, 'rlml/graph_correction', self.on_correction, ALIVE),
+            (CLOUD, 'rlml/session_start', self.on_request, RELIABLE),
+            (GRID, 'rlml/localization_grid', self.on_grid, LATCHED),
+            (CLOUD, 'rlml/localization_map', self.on_map, LATCHED),
         )
         self._absent: float | None = None if has_back_end else time.monotonic()
         for kind, topic, callback, qos in (
@@ -100,16 +100,16 @@ class FrontEndControl:
 
     def on_grid(self, msg: Any) -> None:
         """The grid of a map; one without cells is none."""
-        self._grids = {number_of(msg, 'localization_grid'): decode.occupancy_grid(
-            msg, 'localization_grid'
+        self._grids = {number_of(msg, 'rlml/localization_grid'): decode.occupancy_grid(
+            msg, 'rlml/localization_grid'
         )}  # fmt: skip
         self._use_map()
 
     def on_map(self, msg: Any) -> None:
         """The reflectors of a map; without fields, there is none to localize in."""
         self._reflectors = {
-            number_of(msg, 'localization_map'): (
-                read_reflector_map(msg, 'localization_map') if msg.fields else None
+            number_of(msg, 'rlml/localization_map'): (
+                read_reflector_map(msg, 'rlml/localization_map') if msg.fields else None
             )
         }
         self._use_map()
