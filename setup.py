@@ -31,6 +31,7 @@ setup(
         'matplotlib',
         'numba',
         'numpy',
+        'pillow',
         'pyyaml',
         'rich',
         'rosbags',
@@ -41,7 +42,7 @@ setup(
         # a machine without ROS 2 gets it from wheels
         'ros': ['ros-jazzy-common-interfaces', 'ros-jazzy-rclpy[fastrtps]'],
         'dev': ['hypothesis', 'mypy', 'pytest', 'pytest-xdist', 'ruff'],
-        'bench': ['g2o-python', 'gtsam', 'pyceres', 'yag-slam'],
+        'bench': ['evo', 'g2o-python', 'g2opy', 'gtsam', 'pyceres', 'yag-slam'],
     },
     zip_safe=False,
     entry_points={

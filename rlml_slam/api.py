@@ -25,7 +25,7 @@ from rlml_slam.evaluation.ate import trajectory_errors
 from rlml_slam.evaluation.metrics import metrics
 from rlml_slam.evaluation.relations import Relations, read_relations, relation_errors
 from rlml_slam.evaluation.run_record import FrameLog, Run
-from rlml_slam.maps import map_container, occupancy, reflector_file, saved_map
+from rlml_slam.maps import map_container, nav2_map, reflector_file, saved_map
 from rlml_slam.maps.map_container import Content
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved_map import SavedMap
@@ -126,12 +126,12 @@ class Map:
 
 
 def load_map(path: File) -> Map:
-    """The map of a .rlml file, or of a folder of ``rlml replay`` or ``save_map``.
+    """The map of a .rlml file, of a folder of ``rlml replay`` or ``save_map``, or of nav2 (.yaml).
 
     Raises MapError if there is none, FileFormatError if it is damaged.
     """
     path = Path(path)
-    if path.is_dir() and not (path / 'map.rlml').exists():
+    if path.suffix == '.yaml' or (path.is_dir() and not (path / 'map.rlml').exists()):
         plain = saved_map.load(path)
         return Map(plain.reflectors, plain.grid)
     content = map_file.load(path / 'map.rlml' if path.is_dir() else path)
@@ -158,7 +158,7 @@ def save_map(map_: Map, path: File) -> Path:
         raise MapError(f'{path}: cannot be written: {e.strerror or e}') from e
     reflector_file.save(map_.reflectors, path / 'reflectors.csv')
     if map_.grid is not None:
-        occupancy.save(map_.grid, path / 'map')
+        nav2_map.save(map_.grid, path / 'map')
     return path
 
 

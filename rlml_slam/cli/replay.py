@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -60,8 +61,8 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument(
         '--map', metavar='MAP', type=Path,
-        help='localize in this map: a .rlml file, or a folder that a replay wrote or save_map as '
-        '`map`',
+        help='localize in this map: a .rlml file, a .yaml file of nav2, or a folder that a replay '
+        'wrote or save_map as `map`',
     )  # fmt: skip
     parser.add_argument(
         '--continue', metavar='MAP', type=Path, dest='go_on',
@@ -98,8 +99,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def load_known(path: Path) -> SavedMap:
-    """A map to localize in, of a file or a folder."""
-    return map_file.saved_map(map_file.load(path)) if path.is_file() else saved_map.load(path)
+    """A map to localize in: a .rlml file, a .yaml of nav2 or a .csv of reflectors, a folder."""
+    if path.suffix in ('.yaml', '.csv') or path.is_dir():
+        return saved_map.load(path)
+    content = map_file.load(path)
+    if note := saved_map.newer_image(path):
+        print(f'rlml: {note}', file=sys.stderr)
+    return map_file.saved_map(content)
 
 
 def replay(

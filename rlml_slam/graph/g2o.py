@@ -306,8 +306,6 @@ def _g2o_lines(
 ) -> list[str]:
     out = [_row('VERTEX_SE2', [i], x) for i, x in zip(pose_ids, graph.poses, strict=True)]
     out += [_row('VERTEX_XY', [i], m) for i, m in zip(landmark_ids, graph.landmarks, strict=True)]
-    out += [f'FIX {i}' for i in pose_ids[graph.fixed_poses]]
-    out += [f'FIX {i}' for i in landmark_ids[graph.fixed_landmarks]]
     e, s, p, q = graph.edges, graph.sightings, graph.pose_priors, graph.landmark_priors
     for k in np.flatnonzero(e.enabled):
         upper = _pick(e.information[k], UPPER_3)
@@ -325,6 +323,9 @@ def _g2o_lines(
     for k in np.flatnonzero(q.enabled):
         upper = _pick(q.information[k], UPPER_2)
         out.append(_row('EDGE_PRIOR_XY', landmark_ids[q.nodes[k]], q.measured[k], upper))
+    # last: readG2o of GTSAM reads no edge behind a line that it does not know
+    out += [f'FIX {i}' for i in pose_ids[graph.fixed_poses]]
+    out += [f'FIX {i}' for i in landmark_ids[graph.fixed_landmarks]]
     return out
 
 

@@ -3,26 +3,18 @@
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from rlml_slam.compiled import kernel
-from rlml_slam.errors import FileFormatError, MapError
-from rlml_slam.maps.atomic_file import write_atomically
+from rlml_slam.errors import MapError
 from rlml_slam.se2 import Array, transform
 
 UNKNOWN = -1
-OCCUPIED_THRESH = 0.65
-FREE_THRESH = 0.196  # below the 50/255 of an unknown pixel, which 0.25 would read as free
-PGM_OCCUPIED, PGM_UNKNOWN, PGM_FREE = 0, 205, 254
 MAX_CELLS = 400_000_000  # a larger grid is a mistake in the poses, not a map
 
 
@@ -30,13 +22,19 @@ MAX_CELLS = 400_000_000  # a larger grid is a mistake in the poses, not a map
 class OccupancyGrid:
     """``cells`` (rows = y, columns = x) int8: -1 unknown, 0 free .. 100 occupied.
 
-    ``origin`` (x, y) [m]: the lower left corner of cells[0, 0] in the map frame;
-    ``resolution`` [m].
+    ``origin`` (x, y) [m]: the lower left corner of cells[0, 0] in the map frame, about which the
+    grid is turned by ``yaw`` [rad]; ``resolution`` [m].
     """
 
     resolution: float
     origin: tuple[float, float]
     cells: NDArray[np.int8]
+    yaw: float = 0.0
+
+    @property
+    def T_map_grid(self) -> Array:
+        """Pose (3,) of the grid's corner and axes in the map frame."""
+        return np.array([*self.origin, self.yaw])
 
 
 def render(
@@ -104,69 +102,6 @@ def count_beams(
                 next_i += per_i
         visits[end_i, end_j] += 1
         hits[end_i, end_j] += 1
-
-
-def save(grid: OccupancyGrid, path: str | Path) -> tuple[Path, Path]:
-    """Write ``path``.pgm and ``path``.yaml (nav2's convention, trinary); the two paths.
-
-    Each file appears whole or not at all. A cell of 65 or more is occupied, of 19 or less free.
-    Raises MapError if the folder cannot be written.
-    """
-    base = Path(path)
-    pgm, meta = base.with_name(base.name + '.pgm'), base.with_name(base.name + '.yaml')
-    image = np.full(grid.cells.shape, PGM_UNKNOWN, dtype=np.uint8)
-    image[(grid.cells >= 0) & (grid.cells <= 100 * FREE_THRESH)] = PGM_FREE
-    image[grid.cells >= 100 * OCCUPIED_THRESH] = PGM_OCCUPIED
-    rows = len(image)
-    columns = image.size // max(rows, 1)
-    header = f'P5\n# resolution {grid.resolution:g} m\n{columns} {rows}\n255\n'.encode()
-    text = (
-        f'image: {pgm.name}\nmode: trinary\nresolution: {grid.resolution!r}\n'
-        f'origin: [{grid.origin[0]!r}, {grid.origin[1]!r}, 0.0]\nnegate: 0\n'
-        f'occupied_thresh: {OCCUPIED_THRESH}\nfree_thresh: {FREE_THRESH}\n'
-    )
-    write_atomically(pgm, header + image[::-1].tobytes())
-    write_atomically(meta, text.encode())
-    return pgm, meta
-
-
-def load(path: str | Path) -> OccupancyGrid:
-    """The grid of a nav2 map: ``path`` is the .yaml file. Cells are -1, 0 or 100.
-
-    Raises MapError if a file is missing, FileFormatError if one is malformed.
-    """
-    path = Path(path)
-    try:
-        meta = yaml.safe_load(path.read_text(encoding='utf-8'))
-        image_path = path.parent / str(meta['image'])
-        resolution, negate = float(meta['resolution']), int(meta.get('negate', 0))
-        x, y, _ = (float(v) for v in meta['origin'])
-        occupied, free = float(meta['occupied_thresh']), float(meta['free_thresh'])
-        data = image_path.read_bytes()
-    except OSError as e:
-        raise MapError(f'{e.filename}: cannot be read: {e.strerror}') from e
-    except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError) as e:
-        raise FileFormatError(f'{path}: not a map description: {e}') from e
-    if not (resolution > 0.0 and math.isfinite(resolution + x + y)):
-        raise FileFormatError(f'{path}: resolution or origin is not usable')
-    share = parse_pgm(data, image_path) / 255.0
-    p = share if negate else 1.0 - share
-    cells = np.full(p.shape, UNKNOWN, dtype=np.int8)
-    cells[p < free] = 0
-    cells[p > occupied] = 100
-    return OccupancyGrid(resolution, (x, y), np.ascontiguousarray(cells[::-1]))
-
-
-def parse_pgm(data: bytes, path: Path) -> NDArray[np.uint8]:
-    """Image (rows from the top, columns) of a binary PGM with 255 grey values."""
-    head = re.match(rb'P5(?:\s+#[^\n]*)*\s+(\d+)(?:\s+#[^\n]*)*\s+(\d+)\s+255\s', data)
-    if head is None:
-        raise FileFormatError(f'{path}: not a binary PGM image of 8 bits')
-    columns, rows = int(head[1]), int(head[2])
-    body = np.frombuffer(data, dtype=np.uint8, offset=head.end())
-    if len(body) != rows * columns:
-        raise FileFormatError(f'{path}: {len(body)} pixels, {columns} x {rows} expected')
-    return body.reshape(rows, columns)
 
 
 def warm_up() -> None:

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map as it is saved and loaded: reflectors and a grid."""
+"""A map as it is saved and loaded: reflectors and a grid; its text files."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from rlml_slam.errors import MapError
-from rlml_slam.maps import occupancy, reflector_file
+import numpy as np
+
+from rlml_slam.errors import MapError, NoMapError, RlmlError
+from rlml_slam.maps import nav2_map, reflector_file
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.types import Reflectors
 
@@ -27,15 +29,52 @@ def require_contents(saved: SavedMap) -> SavedMap:
     return saved
 
 
-def load(folder: str | Path) -> SavedMap:
-    """The map of a folder: that which a replay wrote, or the one that was saved as ``map``.
+def require_reflectors(saved: SavedMap) -> SavedMap:
+    """The map itself; MapError where it has none, of who localizes by reflectors alone."""
+    if not len(saved.reflectors):
+        raise MapError('the map has no reflectors, and the EKF localizes by reflectors alone')
+    return saved
 
-    Raises MapError if there is none, FileFormatError if one of its files is malformed.
+
+def load(path: str | Path) -> SavedMap:
+    """The map of text files: of a folder, or of NAME.yaml and NAME.csv, one of which is named.
+
+    A folder is that of a replay (reflectors.csv, map.yaml) or of a map saved as ``map``. Where one
+    of the two files is missing, so is that part of the map. Raises MapError if none is there,
+    FileFormatError if one is malformed.
     """
-    folder = Path(folder)
-    tables = [folder / name for name in ('reflectors.csv', 'map.csv')]
+    path = Path(path)
+    if path.is_dir():
+        tables, meta = [path / 'reflectors.csv', path / 'map.csv'], path / 'map.yaml'
+    elif path.exists():
+        tables, meta = [path.with_suffix('.csv')], path.with_suffix('.yaml')
+    else:
+        raise NoMapError(f'{path}: there is no such map')
     table = next((t for t in tables if t.exists()), None)
-    if table is None:
-        raise MapError(f'{folder}: neither reflectors.csv nor map.csv is there')
-    meta = folder / 'map.yaml'
-    return SavedMap(reflector_file.load(table), occupancy.load(meta) if meta.exists() else None)
+    if table is None and not meta.exists():
+        raise NoMapError(f'{path}: neither reflectors.csv nor map.csv nor map.yaml is there')
+    return SavedMap(
+        no_reflectors() if table is None else reflector_file.load(table),
+        nav2_map.load(meta) if meta.exists() else None,
+    )
+
+
+def no_reflectors() -> Reflectors:
+    """A reflector map with nothing in it."""
+    none = np.zeros(0, dtype=np.int64)
+    return Reflectors(none, np.zeros((0, 2)), np.zeros((0, 2, 2)), none, none, np.zeros(0))
+
+
+def newer_image(whole: Path) -> str:
+    """What to say where the image of a map was changed after its .rlml file; else empty."""
+    meta = whole.with_suffix('.yaml')
+    try:
+        image = nav2_map.describe(meta).image
+        if image.stat().st_mtime_ns <= whole.stat().st_mtime_ns:
+            return ''
+    except (RlmlError, OSError):
+        return ''
+    return (
+        f'{image} is newer than {whole.name}, which is used: what was edited in the image is not. '
+        f'To localize in the image, name {meta.name}'
+    )

@@ -49,7 +49,9 @@ class Node(Group, prefix=''):
         'mapping', 'build a map, or localize in a saved one', choices=('mapping', 'localization')
     )
     map_directory: str = param('maps', 'the only folder that maps are saved to and loaded from')
-    map_file_name: str = param('map', 'name of the saved map in map_directory, without suffix')
+    map_file_name: str = param(
+        'map', 'name of the saved map in map_directory, without suffix; NAME.yaml is a map of nav2'
+    )
     continue_map: bool = param(
         False,
         'mapping: at start, load map_file_name.rlml or a younger autosave of it, and extend it',

@@ -16,7 +16,8 @@ from rlml_slam.evaluation.metrics import RunErrors, metrics, run_errors
 from rlml_slam.evaluation.run_record import Run
 from rlml_slam.maps import map_container, reflector_file
 from rlml_slam.maps.atomic_file import write_atomically
-from rlml_slam.maps.occupancy import UNKNOWN, OccupancyGrid, save
+from rlml_slam.maps.nav2_map import save
+from rlml_slam.maps.occupancy import UNKNOWN, OccupancyGrid
 from rlml_slam.slam.landmarks.reflector_states import state_table
 
 

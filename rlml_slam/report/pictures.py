@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.transforms import Affine2D
 
 from rlml_slam import se2
 from rlml_slam.evaluation.metrics import RunErrors
@@ -120,9 +121,9 @@ def _extent(run: Run) -> tuple[Array, Array]:
     if run.grid is not None:
         rows, columns = np.nonzero(run.grid.cells >= 0)
         if len(rows):
-            first, last = (np.min(columns), np.min(rows)), (np.max(columns), np.max(rows))
-            corners = np.array([first, last]) + np.array([[0], [1]])
-            points.append(np.array(run.grid.origin) + corners * run.grid.resolution)
+            sides = [(np.min(v), np.max(v) + 1) for v in (columns, rows)]
+            corners = np.array(list(itertools.product(*sides))) * run.grid.resolution
+            points.append(se2.transform(run.grid.T_map_grid, corners))
     every = np.concatenate([*points, np.zeros((1, 2))])
     low, high = every.min(axis=0), every.max(axis=0)
     margin = 0.03 * float((high - low).max()) + 0.2
@@ -134,10 +135,12 @@ def _draw_grid(axes: Any, grid: OccupancyGrid) -> None:
     rows, columns = grid.cells.shape
     (x, y), r = grid.origin, grid.resolution
     axes.set_facecolor(UNKNOWN_COLOUR)
-    axes.imshow(
+    image = axes.imshow(
         cells, cmap=GRID_MAP, vmin=0, vmax=100, origin='lower', interpolation='antialiased',
         extent=(x, x + columns * r, y, y + rows * r), zorder=0,
     )  # fmt: skip
+    if grid.yaw:
+        image.set_transform(Affine2D().rotate_around(x, y, grid.yaw) + axes.transData)
 
 
 def _draw_reflectors(axes: Any, run: Run) -> Any:

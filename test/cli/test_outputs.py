@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose
 
 from rlml_slam.datasets.tum import read_tum
 from rlml_slam.errors import MapError
-from rlml_slam.maps import occupancy, reflector_file
+from rlml_slam.maps import nav2_map, reflector_file
 from rlml_slam.report.outputs import make_folder, write_outputs
 from rlml_slam.report.pictures import ellipse
 from rlml_slam.report.report import bad_spells, report_html
@@ -49,7 +49,7 @@ def test_files_hold_the_run(written):
     assert_allclose(
         reflector_file.load(folder / 'reflectors.csv').points, run.reflectors.points, atol=1e-6
     )
-    grid = occupancy.load(folder / 'map.yaml')
+    grid = nav2_map.load(folder / 'map.yaml')
     assert np.array_equal(grid.cells, run.grid.cells)
 
 
@@ -97,7 +97,7 @@ def test_run_without_scans_truth_and_timing_has_a_report(tmp_path):
     run.problem = 'bag: damaged after 3 messages'
     write_outputs(run, tmp_path)
     # a map without knowledge, around the path
-    grid = occupancy.load(tmp_path / 'map.yaml')
+    grid = nav2_map.load(tmp_path / 'map.yaml')
     assert (grid.cells == -1).all()
     assert 'damaged after 3 messages' in (tmp_path / 'report.html').read_text()
     assert not (tmp_path / 'errors.png').exists()

@@ -2,10 +2,15 @@
 """Maps by name in one folder."""
 
 import os
+import re
 
+import numpy as np
 import pytest
 
-from rlml_slam.errors import MapError, NoMapError
+from rlml_slam.errors import FileFormatError, MapError, NoMapError
+from rlml_slam.maps import nav2_map
+from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.maps.saved_map import SavedMap, newer_image, no_reflectors
 from rlml_slam.ros.back_end.map_folder import AUTOSAVE, LOST, LOST_AGE, LOST_BYTES, MapFolder
 
 
@@ -22,10 +27,46 @@ def test_map_that_is_not_there_is_named_by_the_file_that_it_would_be(name, tmp_p
         MapFolder(str(tmp_path)).load(name)
 
 
-@pytest.mark.parametrize(('suffix', 'file'), [('.rlml', '.rlml'), ('.yaml', '.csv')])
+@pytest.mark.parametrize(
+    ('suffix', 'file'),
+    [('.rlml', '.rlml'), ('.csv', '.csv'), ('.yaml', '.yaml'), ('.png', '.yaml')],
+)
 def test_suffix_says_which_file_is_missing(suffix, file, tmp_path):
     with pytest.raises(NoMapError, match=rf'there is no hall\{file}$'):
         MapFolder(str(tmp_path)).load('hall' + suffix)
+
+
+GRID = OccupancyGrid(0.05, (1.0, 2.0), np.full((3, 3), 100, dtype=np.int8), 0.3)
+
+
+@pytest.mark.parametrize('name', ['hall', 'hall.yaml', 'hall.pgm'])
+def test_map_of_nav2_is_a_map_without_reflectors(name, tmp_path):
+    nav2_map.save(GRID, tmp_path / 'hall')
+    saved = MapFolder(str(tmp_path)).load(name)
+    assert len(saved.reflectors) == 0
+    np.testing.assert_array_equal(saved.grid.T_map_grid, [1.0, 2.0, 0.3])
+
+
+@pytest.mark.parametrize('name', ['hall', 'hall.yaml', 'hall.csv'])
+def test_reflectors_beside_the_grid_belong_to_the_map(name, tmp_path):
+    folder = MapFolder(str(tmp_path))
+    folder.save('hall', SavedMap(no_reflectors(), GRID))
+    assert folder.load(name).grid is not None
+    (tmp_path / 'hall.csv').write_text('x,y\n1,2\n')
+    with pytest.raises(FileFormatError, match='not the columns of a reflector map'):
+        folder.load(name)
+
+
+def test_image_that_was_edited_after_the_whole_map_is_pointed_out(tmp_path):
+    whole = tmp_path / 'hall.rlml'
+    whole.write_bytes(b'')
+    assert newer_image(whole) == ''  # there is none
+    nav2_map.save(GRID, tmp_path / 'hall')
+    os.utime(whole)
+    assert newer_image(whole) == ''
+    later = whole.stat().st_mtime_ns + 1_000_000
+    os.utime(tmp_path / 'hall.pgm', ns=(later, later))
+    assert re.search(r'hall\.pgm is newer than hall\.rlml.*name hall\.yaml', newer_image(whole))
 
 
 def test_only_old_automatic_maps_of_the_name_are_removed(tmp_path):

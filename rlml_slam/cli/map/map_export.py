@@ -10,7 +10,7 @@ from typing import Any
 from rlml_slam.datasets.tum import Trajectory, write_tum
 from rlml_slam.graph.g2o import write_graph
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.maps import occupancy, reflector_file
+from rlml_slam.maps import nav2_map, reflector_file
 from rlml_slam.maps.map_container import Content
 from rlml_slam.report.outputs import make_folder
 from rlml_slam.slam.back_end import trajectory as frame_path
@@ -49,6 +49,6 @@ def export(content: Content, folder: Path) -> list[str]:
     write_tum(folder / 'trajectory.tum', Trajectory(a['path']['stamp'], poses))
     names = ['graph.g2o', 'reflectors.csv', 'keyframes.tum', 'trajectory.tum']
     if known.grid is not None:
-        occupancy.save(known.grid, folder / 'map')
+        nav2_map.save(known.grid, folder / 'map')
         names += ['map.pgm', 'map.yaml']
     return names

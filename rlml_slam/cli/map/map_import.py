@@ -20,7 +20,7 @@ from rlml_slam.datasets.tum import read_tum
 from rlml_slam.errors import FileFormatError, MapError
 from rlml_slam.graph.g2o import read_graph
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.maps import map_container, occupancy, reflector_file
+from rlml_slam.maps import map_container, nav2_map, reflector_file
 from rlml_slam.maps.map_container import Content
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import between
@@ -76,7 +76,7 @@ def import_map(folder: Path) -> Content:
         for column in map_file.COLUMNS:
             arrays[f'{name}_{column}'] = getattr(table, column)
     map_file.restore(Content(arrays, {}), back_end)
-    grid = occupancy.load(meta) if meta.exists() else None
+    grid = nav2_map.load(meta) if meta.exists() else None
     return map_file.content_of(back_end, params, grid)
 
 

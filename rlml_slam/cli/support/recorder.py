@@ -167,8 +167,8 @@ class Recorder(Node):
         """The newest map."""
         info = msg.info
         cells = np.frombuffer(msg.data, dtype=np.int8).reshape(info.height, info.width)
-        origin = (info.origin.position.x, info.origin.position.y)
-        self._grid = OccupancyGrid(round(info.resolution, 6), origin, cells)
+        x, y, yaw = decode.planar_pose(info.origin, 'map').tolist()
+        self._grid = OccupancyGrid(round(info.resolution, 6), (x, y), cells, yaw)
 
     def on_trajectory(self, msg: Path) -> None:
         """The newest optimised trajectory."""

@@ -11,10 +11,10 @@ from rlml_slam.errors import MapError
 from rlml_slam.maps import map_container
 from rlml_slam.maps.map_container import Content
 from rlml_slam.maps.occupancy import OccupancyGrid
-from rlml_slam.maps.saved_map import SavedMap
+from rlml_slam.maps.saved_map import SavedMap, newer_image
 from rlml_slam.motion import SECOND
 from rlml_slam.params import Parameters
-from rlml_slam.ros.back_end.map_folder import AUTOSAVE, LOST, MapFolder
+from rlml_slam.ros.back_end.map_folder import AUTOSAVE, LOST, SUFFIXES, MapFolder
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.store import map_file
 
@@ -32,15 +32,33 @@ class MapArchive:
 
     def load(self, name: str) -> Content:
         """A whole map of the folder. Raises MapError or FileFormatError."""
-        return map_file.load(self.folder.whole(name))
+        whole = self.folder.whole(name)
+        if name.endswith(SUFFIXES) and not name.endswith(whole.suffix):
+            raise MapError(f'{name} can be localized in; only a .rlml file can be continued')
+        content = map_file.load(whole)
+        self._compare_image(whole)
+        return content
+
+    def load_saved(self, name: str) -> SavedMap:
+        """A map of the folder to localize in. Raises MapError or FileFormatError."""
+        saved = self.folder.load(name)
+        if not name.endswith(SUFFIXES) or name.endswith('.rlml'):
+            self._compare_image(self.folder.whole(name))
+        return saved
+
+    def _compare_image(self, whole: Path) -> None:
+        if note := newer_image(whole):
+            self._logger.warning(note)
 
     def save(self, name: str, back_end: BackEnd, current: SavedMap, undrawn: str) -> str:
         """Write a map under a name; what was written. Raises MapError."""
         if current.grid is None and len(current.reflectors) == 0:
             raise MapError(undrawn or 'there is no map yet')
-        if back_end.keyframes:
-            self._write(self.folder.whole(name), back_end, current.grid)
-        path = self.folder.save(name, current)
+        try:
+            path = self.folder.save(name, current)
+        finally:  # after its image, which would be newer otherwise
+            if back_end.keyframes:
+                self._write(self.folder.whole(name), back_end, current.grid)
         return f'{path}: {contents(current)}{f", no grid: {undrawn}" if undrawn else ""}'
 
     def keep(self, back_end: BackEnd, grid: OccupancyGrid | None, reason: str) -> bool:

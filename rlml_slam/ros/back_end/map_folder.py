@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from rlml_slam.errors import MapError, NoMapError
-from rlml_slam.maps import map_container, occupancy, reflector_file, survey
+from rlml_slam.maps import map_container, nav2_map, reflector_file, saved_map, survey
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.maps.survey import Survey
 from rlml_slam.slam.store import map_file
@@ -16,7 +16,8 @@ from rlml_slam.slam.store import map_file
 LOST, AUTOSAVE = '.lost-', '.autosave-'
 LOST_AGE = 30 * 86400.0  # [s] after which such a file is removed
 LOST_BYTES = 1_000_000_000  # of such files: where there are more, no other one is written
-SUFFIXES = ('.rlml', '.yaml', '.csv', '.pgm')
+IMAGES = ('.pgm', '.png', '.bmp')
+SUFFIXES = ('.rlml', '.yaml', '.csv', *IMAGES)
 
 
 class MapFolder:
@@ -56,7 +57,7 @@ class MapFolder:
             raise MapError(f'{path.parent}: cannot be made: {e.strerror}') from e
         reflector_file.save(saved.reflectors, path.with_name(path.name + '.csv'))
         if saved.grid is not None:
-            occupancy.save(saved.grid, path)
+            nav2_map.save(saved.grid, path)
             return path
         for suffix in ('.yaml', '.pgm'):
             old = path.with_name(path.name + suffix)
@@ -116,18 +117,16 @@ class MapFolder:
         NoMapError names the files that are not there; MapError or FileFormatError says what is
         wrong with which file.
         """
-        path, whole = self.path(name), self.whole(name)
-        table = path.with_name(path.name + '.csv')
-        files = [whole, table]
-        if name.endswith(SUFFIXES):
-            files = [whole] if name.endswith('.rlml') else [table]
+        path = self.path(name)
+        files = [path.with_name(path.name + suffix) for suffix in ('.rlml', '.csv', '.yaml')]
+        if name.endswith(IMAGES):
+            files = files[2:]
+        elif name.endswith(SUFFIXES):
+            files = [file for file in files if name.endswith(file.suffix)]
         found = next((file for file in files if file.exists()), None)
         if found is None:
-            raise NoMapError(
-                f'{path.parent}: there is no {" and no ".join(f.name for f in files)}'
-            )
-        if found == whole:
-            return map_file.saved_map(map_file.load(whole))
-        reflectors = reflector_file.load(table)
-        meta = path.with_name(path.name + '.yaml')
-        return SavedMap(reflectors, occupancy.load(meta) if meta.exists() else None)
+            names = ' and no '.join(f.name for f in files)
+            raise NoMapError(f'{path.parent}: there is no {names}')
+        if found.suffix == '.rlml':
+            return map_file.saved_map(map_file.load(found))
+        return saved_map.load(found)

@@ -84,7 +84,7 @@ class UserRequests:
     def _localize_in(self, name: str, is_first: bool = False) -> list[Command]:
         """Localize in a saved map; at first from the pose of the last run, if that fits."""
         folder = self._archive.folder
-        saved, last, pose = folder.load(name), None, None
+        saved, last, pose = self._archive.load_saved(name), None, None
         if self._p.node.restore_pose:
             path = folder.path(name)
             last = LastPose(path.with_name(path.name + '.pose'))

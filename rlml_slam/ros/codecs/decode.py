@@ -292,17 +292,14 @@ def rotation_matrix(q: Any, where: str) -> Array:
 
 
 def occupancy_grid(msg: Any, topic: str) -> OccupancyGrid | None:
-    """An OccupancyGrid that is not turned; None where it has no cells."""
+    """The grid of a message; None where it has no cells."""
     info, cells = msg.info, np.asarray(msg.data, dtype=np.int8)
     rows, columns = int(info.height), int(info.width)
     if rows * columns == 0:
         return None
-    x, y = float(info.origin.position.x), float(info.origin.position.y)
+    x, y, turn = planar_pose(info.origin, f'{topic}: info.origin').tolist()
     resolution = float(info.resolution)
-    bounded((x, y), f'{topic}: info.origin')
     if len(cells) != rows * columns or not 1e-3 <= resolution <= 1e3:
         raise InputError(f'{topic}: {len(cells)} cells do not fill {rows} x {columns} of a map')
-    if abs(float(info.origin.orientation.z)) > 1e-6:
-        raise InputError(f'{topic}: a map that is turned cannot be used')
     # the message has 32 bits for it, of 0.05 m as well
-    return OccupancyGrid(round(resolution, 7), (x, y), cells.reshape(rows, columns))
+    return OccupancyGrid(round(resolution, 7), (x, y), cells.reshape(rows, columns), turn)

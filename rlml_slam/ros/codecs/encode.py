@@ -195,7 +195,7 @@ def map_metadata(make: Make, stamp: int, grid: OccupancyGrid) -> Any:
         resolution=float(grid.resolution),
         width=int(grid.cells.shape[1]),
         height=int(grid.cells.shape[0]),
-        origin=pose(make, np.array([*grid.origin, 0.0])),
+        origin=pose(make, grid.T_map_grid),
     )
 
 

@@ -11,7 +11,7 @@ from std_srvs.srv import Trigger
 
 from rlml_slam.ekf.estimator import Estimator
 from rlml_slam.errors import MapError, RlmlError
-from rlml_slam.maps.saved_map import SavedMap
+from rlml_slam.maps.saved_map import SavedMap, require_reflectors
 from rlml_slam.params import Node
 from rlml_slam.ros.back_end.map_folder import MapFolder
 from rlml_slam.ros.back_end.map_services import refuse_map
@@ -33,7 +33,7 @@ class EkfServices:
         self._folder = MapFolder(params.map_directory)
         self.saved: SavedMap | None = None
         if params.mode == 'localization':
-            self.saved = self._folder.load(params.map_file_name)
+            self.saved = require_reflectors(self._folder.load(params.map_file_name))
         node.create_service(Trigger, '~/save_map', self.save_map)
         node.create_service(LoadMap, '~/load_map', self.load_map)
         node.create_service(Trigger, '~/reset', self.reset)
@@ -57,7 +57,8 @@ class EkfServices:
     def load_map(self, request: Any, response: Any) -> Any:
         """Localise in another map of map_directory, from map_start_pose; map_url is its name."""
         try:
-            self.saved = self._folder.load(request.map_url or self._p.map_file_name)
+            name = request.map_url or self._p.map_file_name
+            self.saved = require_reflectors(self._folder.load(name))
         except RlmlError as e:
             refuse_map(self._node, response, e)
             return response

@@ -141,7 +141,9 @@ class FrontEnd:
             matches.num_used, matches.agree_with_map, self._map.grid_match,
         )  # fmt: skip
         expected, seen = self._reflectors.expected_and_seen(observation, matches)
-        detections = observation.detections
+        detections, saved = observation.detections, self._map.saved
+        if saved is not None and not len(saved.reflectors):
+            detections = None  # a map of walls alone says nothing of them
         lasts = self.kidnapping.has_lasted(stamp, self._p.health.lost_time)
         return self.health.evaluate(
             stamp,

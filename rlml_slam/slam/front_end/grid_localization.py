@@ -20,7 +20,7 @@ from rlml_slam.matching.scans.scan_match import match
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.front_end.joint_state import JointState
-from rlml_slam.slam.relocalization.scan_relocalization import possible, submap_of
+from rlml_slam.slam.relocalization.grid_submap import possible, submap_of
 
 GATE_PROBABILITY = 0.9999  # of the gate of a match against the prior
 BEAM_STEP = 4  # of a scan that does not match, every n-th beam is traced through the grid
@@ -46,7 +46,7 @@ class GridLocalizer:
 
     def __init__(self, grid: OccupancyGrid, params: Parameters) -> None:
         self._p = params
-        self._submap = submap_of(grid, params.submap)
+        self._saved = submap_of(grid, params.submap)
         self._floor = np.zeros((3, 3))
         self._floor[[0, 1, 2], [0, 1, 2]] = params.submap.grid_bias_variance
         self._gate = [gate(GATE_PROBABILITY, dof) for dof in (1, 2, 3)]
@@ -64,18 +64,20 @@ class GridLocalizer:
         """Match end points (n, 2), base frame, and update the state if the match is accepted."""
         p = self._p.scan_match
         points = voxel_filter.thin(points, p.voxel_size, p.max_points)
-        prior, cov = state.pose, state.pose_cov
+        submap, yaw = self._saved.submap, self._saved.yaw
+        prior, cov = self._saved.from_map(state.pose), state.pose_cov
         strength = np.asarray(np.linalg.inv(cov + self._floor), dtype=np.float64)
-        found = match(self._submap, points, prior, strength, p, searched=False)
+        strength = se2.rotate_cov(strength, -yaw)
+        found = match(submap, points, prior, strength, p, searched=False)
         if found.score < p.search_threshold:
-            searched = match(self._submap, points, prior, strength, p)
+            searched = match(submap, points, prior, strength, p)
             found = searched if searched.score > found.score else found
         if found.score < p.min_score:
             may_be = possible(
-                self._submap, points[::BEAM_STEP], found.pose, found.score, p.search_threshold
+                submap, points[::BEAM_STEP], found.pose, found.score, p.search_threshold
             )
             return GridMatch(found.score, contradicts=may_be < p.min_score)
-        information = scan_information.information(self._submap, points, found.pose, p)
+        information = scan_information.information(submap, points, found.pose, p)
         # the error of the map at this place, which more beams do not lower
         information = np.asarray(
             np.linalg.solve(np.eye(3) + information @ self._floor, information), dtype=np.float64
@@ -86,6 +88,7 @@ class GridLocalizer:
         offset = found.pose - prior
         offset[2] = se2.wrap(offset[2])
         v = root @ offset
+        root = root @ se2.rotation3(yaw).T  # from here on in the axes of the map
         d2 = float(v @ np.linalg.solve(root @ cov @ root.T + np.eye(len(v)), v))
         if not len(v) or d2 > self._gate[len(v) - 1]:
             return GridMatch(found.score)

@@ -15,7 +15,7 @@ from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Parameters
 from rlml_slam.slam.front_end.grid_localization import GridLocalizer, GridMatch
 from rlml_slam.slam.front_end.joint_state import JointState
-from rlml_slam.slam.relocalization.scan_relocalization import is_mapped
+from rlml_slam.slam.relocalization.grid_submap import is_mapped
 from rlml_slam.types import Observation, Reflectors
 
 

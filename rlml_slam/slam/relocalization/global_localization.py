@@ -17,11 +17,11 @@ from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.matching.reflectors.constellation import Candidate, Constellation, locate
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
+from rlml_slam.slam.relocalization.grid_submap import is_mapped
 from rlml_slam.slam.relocalization.scan_relocalization import (
     MAX_SECOND,
     SPREAD,
     Relocation,
-    is_mapped,
     relocalize,
     scan_fits,
 )

@@ -13,7 +13,8 @@ from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.conversation import Search
 from rlml_slam.slam.relocalization.global_localization import localize_globally
-from rlml_slam.slam.relocalization.scan_relocalization import Relocation, is_mapped, scan_fits
+from rlml_slam.slam.relocalization.grid_submap import is_mapped
+from rlml_slam.slam.relocalization.scan_relocalization import Relocation, scan_fits
 from rlml_slam.types import Frame, Reflectors, Verdict
 
 # [m, m, rad] of a robot that nobody moved: a pose that needs more to fit is of another place

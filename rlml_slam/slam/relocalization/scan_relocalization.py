@@ -10,15 +10,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rlml_slam import params, se2
+from rlml_slam import se2
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.matching.scans import branch_and_bound, scan_information, voxel_filter
-from rlml_slam.matching.scans.scan_match import UNKNOWN, match
-from rlml_slam.matching.scans.submap import P_MAX, P_MIN, Submap, value_of
+from rlml_slam.matching.scans.scan_match import match
+from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
+from rlml_slam.slam.relocalization.grid_submap import is_mapped, possible, submap_of
 from rlml_slam.types import Verdict
 
 SEARCHED = 150  # end points of the search; all of them count when its places are compared
@@ -26,10 +26,6 @@ SPREAD = np.array([0.5, 0.5, 0.2])  # [m, m, rad] a refined place lies within th
 # Share of the best score that the next place may reach. Stricter than a closure's, which other
 # edges may contradict: in a truly symmetric hall, the scores of twins differ by up to 7 %.
 MAX_SECOND = 0.85
-# A map that was saved knows occupied and free alone. The cells beside a wall, which a beam hits as
-# often where the wall lies near their border, have become free: given back half of the wall's.
-BESIDE = 0.5
-WALL = 0.25  # probability from which a cell of the map may stop a beam
 OPEN_SIGMA = 0.5  # [m] a pose with a larger sigma in a direction is not unique
 
 
@@ -60,7 +56,8 @@ def relocalize(
         return Relocation(Verdict.IMPOSSIBLE, 'there is no map of scans yet')
     if points is None or len(points) < p.scan_match.min_points:
         return Relocation(Verdict.IMPOSSIBLE, 'the newest frame has no usable scan')
-    submap = submap_of(grid, p.submap)
+    saved = submap_of(grid, p.submap)
+    submap = saved.submap
     points = voxel_filter.thin(points, p.scan_match.voxel_size, p.scan_match.max_points)
     few = voxel_filter.thin(points, p.scan_match.voxel_size, SEARCHED)
     middle = 0.5 * (submap.bounds[:2] + submap.bounds[2:])
@@ -83,7 +80,7 @@ def relocalize(
     second = places[1][1] if len(places) > 1 else 0.0
     if not complete and second:
         second = possible(submap, points, places[1][0], second, score)
-    cov = _covariance(submap, points, pose, p)
+    cov = se2.rotate_cov(_covariance(submap, points, pose, p), saved.yaw)
     sigma = float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]))
     verdict, why = Verdict.UNIQUE, f'score {score:.2f}, the next best pose {second:.2f}'
     if second > MAX_SECOND * score:
@@ -96,12 +93,7 @@ def relocalize(
             Verdict.AMBIGUOUS,
             f'the scan does not observe one direction: sigma {sigma:.1f} m',
         )
-    return Relocation(verdict, why, pose, cov, score, second)
-
-
-def is_mapped(grid: OccupancyGrid) -> bool:
-    """Whether there is anything in the grid that a scan could fit."""
-    return bool((grid.cells > 0).any())
+    return Relocation(verdict, why, saved.to_map(pose), cov, score, second)
 
 
 def scan_fits(grid: OccupancyGrid, points: Array, poses: Array, p: Parameters) -> Array:
@@ -109,35 +101,12 @@ def scan_fits(grid: OccupancyGrid, points: Array, poses: Array, p: Parameters) -
 
     The second of each is what the score may be where parts of the place are not mapped.
     """
-    submap = submap_of(grid, p.submap)
+    saved = submap_of(grid, p.submap)
+    submap = saved.submap
     points = voxel_filter.thin(points, p.scan_match.voxel_size, p.scan_match.max_points)
-    places = [_refined(submap, points, pose, p) for pose in poses]
+    places = [_refined(submap, points, pose, p) for pose in saved.from_map(poses)]
     best = max(score for _, score in places)
     return np.array([[s, possible(submap, points, pose, s, best)] for pose, s in places])
-
-
-def submap_of(grid: OccupancyGrid, parameters: params.Submap) -> Submap:
-    """A grid of the map as a submap in the map frame; unknown cells stay unknown."""
-    submap = Submap(parameters)
-    submap.resolution = grid.resolution
-    known = np.clip(grid.cells.astype(np.float64), 0.0, 100.0) / 100.0
-    if not ((grid.cells > 0) & (grid.cells < 100)).any():
-        known = np.maximum(known, BESIDE * _beside(known))
-    submap.values = np.where(
-        (grid.cells < 0) & (known == 0.0),
-        np.uint16(0),
-        value_of(P_MIN + (P_MAX - P_MIN) * known),
-    )
-    x, y = (round(v / grid.resolution) for v in grid.origin)
-    submap.corner = (x, y)
-    return submap
-
-
-def _beside(cells: Array) -> Array:
-    """Largest of the four neighbours of each cell (rows, columns)."""
-    padded = np.pad(cells, 1)
-    sides = (padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:])
-    return np.asarray(np.maximum.reduce(sides))
 
 
 def _refined(submap: Submap, points: Array, near: Array, p: Parameters) -> tuple[Array, float]:
@@ -145,32 +114,6 @@ def _refined(submap: Submap, points: Array, near: Array, p: Parameters) -> tuple
     weak = np.diag(1.0 / SPREAD**2)
     result = match(submap, points, near, weak, p.scan_match, searched=False)
     return result.pose, result.score
-
-
-def possible(submap: Submap, points: Array, pose: Array, score: float, best: float) -> float:
-    """The score at a pose if end points where nothing is mapped fitted as at the best place.
-
-    A map in the making has one half of a symmetric hall before the other: that the known half
-    fits better says nothing. An end point behind a wall of the map does not fit in any case.
-    """
-    ends = se2.transform(pose, points)
-    reach = float(np.hypot(points[:, 0], points[:, 1]).max())
-    share = np.linspace(0.0, 1.0, max(2, int(reach / submap.resolution)))
-    # the laser is near enough to the base for this
-    way = pose[:2] + share[None, :, None] * (ends - pose[:2])[:, None, :]
-    walls = _values(submap, way) > value_of(WALL)
-    free = (_values(submap, ends) == 0) & ~walls.any(axis=1)
-    return score + float(np.mean(free)) * max(best - UNKNOWN, 0.0)
-
-
-def _values(submap: Submap, points: Array) -> NDArray[np.uint16]:
-    """Cell values (...) at points (..., 2), 0 outside."""
-    (j, i), (rows, columns) = submap.corner, submap.values.shape
-    cells = np.floor(points / submap.resolution).astype(np.int64) - (j, i)
-    inside = ((cells >= 0) & (cells < (columns, rows))).all(axis=-1)
-    out = np.zeros(points.shape[:-1], dtype=np.uint16)
-    out[inside] = submap.values[cells[inside][:, 1], cells[inside][:, 0]]
-    return out
 
 
 def _covariance(submap: Submap, points: Array, pose: Array, p: Parameters) -> Array:

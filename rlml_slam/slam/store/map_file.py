@@ -102,6 +102,8 @@ def content_of(back_end: BackEnd, params: Parameters, grid: OccupancyGrid | None
     if grid is not None:
         arrays['grid'] = grid.cells
         description['grid'] = {'resolution': grid.resolution, 'origin': list(grid.origin)}
+        if grid.yaw:
+            description['grid']['yaw'] = grid.yaw
     return Content(arrays, description)
 
 
@@ -146,8 +148,9 @@ def saved_map(content: Content) -> SavedMap:
     )  # fmt: skip
     if 'grid' not in a:
         return SavedMap(reflectors)
-    x, y = d['grid']['origin']
-    return SavedMap(reflectors, OccupancyGrid(float(d['grid']['resolution']), (x, y), a['grid']))
+    (x, y), yaw = d['grid']['origin'], float(d['grid'].get('yaw', 0.0))
+    grid = OccupancyGrid(float(d['grid']['resolution']), (x, y), a['grid'], yaw)
+    return SavedMap(reflectors, grid)
 
 
 def survey_of(content: Content) -> Survey | None:

@@ -8,7 +8,8 @@ import pytest
 from made_worlds import CORRIDOR, OTHER_ROOM, ROOM, TinyWorld, drive, points_of, polygon, scan_at
 
 from rlml_slam import se2
-from rlml_slam.maps.occupancy import OccupancyGrid, load, render, save
+from rlml_slam.maps.nav2_map import load, save
+from rlml_slam.maps.occupancy import OccupancyGrid, render
 from rlml_slam.params import Parameters
 from rlml_slam.slam.relocalization.scan_relocalization import relocalize
 from rlml_slam.types import Verdict

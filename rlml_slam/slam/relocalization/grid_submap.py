@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The grid of a saved map as a submap that scans are matched with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam import params, se2
+from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.matching.scans.scan_match import UNKNOWN
+from rlml_slam.matching.scans.submap import P_MAX, P_MIN, Submap, value_of
+from rlml_slam.se2 import Array
+
+# A map that was saved knows occupied and free alone. The cells beside a wall, which a beam hits as
+# often where the wall lies near their border, have become free: given back half of the wall's.
+BESIDE = 50
+WALL = 0.25  # probability from which a cell of the map may stop a beam
+
+
+@dataclass(frozen=True)
+class GridSubmap:
+    """``submap`` with the lattice of the grid, and ``T_map_submap`` (3,).
+
+    The frames are the same where the grid is not turned and its origin is a multiple of the
+    resolution, as those are that the back end draws.
+    """
+
+    submap: Submap
+    T_map_submap: Array
+
+    @property
+    def yaw(self) -> float:
+        """By which the submap is turned in the map [rad]."""
+        return float(self.T_map_submap[2])
+
+    def from_map(self, poses: Array) -> Array:
+        """Poses (..., 3) of the map frame in that of the submap."""
+        return se2.between(self.T_map_submap, poses) if self.T_map_submap.any() else poses
+
+    def to_map(self, poses: Array) -> Array:
+        """The other way."""
+        return se2.compose(self.T_map_submap, poses) if self.T_map_submap.any() else poses
+
+
+def is_mapped(grid: OccupancyGrid) -> bool:
+    """Whether there is anything in the grid that a scan could fit."""
+    return bool((grid.cells > 0).any())
+
+
+def submap_of(grid: OccupancyGrid, parameters: params.Submap) -> GridSubmap:
+    """A grid as a submap; unknown cells stay unknown."""
+    submap, cells = Submap(parameters), grid.cells
+    submap.resolution = grid.resolution
+    if not ((cells > 0) & (cells < 100)).any():
+        beside = np.where(_beside(cells) > 0, np.int8(BESIDE), np.int8(-1))
+        cells = np.maximum(cells, beside)
+    # of cells from 0 on, then of the unknown ones from -1 down
+    known = np.clip(np.arange(128), 0, 100) / 100.0
+    levels = value_of(P_MIN + (P_MAX - P_MIN) * known)
+    submap.values = np.concatenate([levels, np.zeros(128, dtype=np.uint16)])[cells.view(np.uint8)]
+    corner = se2.rotation(-grid.yaw) @ np.array(grid.origin)
+    lattice = np.round(corner / grid.resolution)
+    submap.corner = (int(lattice[0]), int(lattice[1]))
+    rest = se2.rotation(grid.yaw) @ (corner - lattice * grid.resolution)
+    return GridSubmap(submap, np.array([*rest, grid.yaw]))
+
+
+def _beside(cells: NDArray[np.int8]) -> NDArray[np.int8]:
+    """Largest of the four neighbours of each cell (rows, columns)."""
+    padded = np.pad(cells, 1, constant_values=-1)
+    sides = (padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:])
+    return np.asarray(np.maximum.reduce(sides))
+
+
+def possible(submap: Submap, points: Array, pose: Array, score: float, best: float) -> float:
+    """The score at a pose if end points where nothing is mapped fitted as at the best place.
+
+    A map in the making has one half of a symmetric hall before the other: that the known half
+    fits better says nothing. An end point behind a wall of the map does not fit in any case.
+    """
+    ends = se2.transform(pose, points)
+    reach = float(np.hypot(points[:, 0], points[:, 1]).max())
+    share = np.linspace(0.0, 1.0, max(2, int(reach / submap.resolution)))
+    # the laser is near enough to the base for this
+    way = pose[:2] + share[None, :, None] * (ends - pose[:2])[:, None, :]
+    walls = _values(submap, way) > value_of(WALL)
+    free = (_values(submap, ends) == 0) & ~walls.any(axis=1)
+    return score + float(np.mean(free)) * max(best - UNKNOWN, 0.0)
+
+
+def _values(submap: Submap, points: Array) -> NDArray[np.uint16]:
+    """Cell values (...) at points (..., 2), 0 outside."""
+    (j, i), (rows, columns) = submap.corner, submap.values.shape
+    cells = np.floor(points / submap.resolution).astype(np.int64) - (j, i)
+    inside = ((cells >= 0) & (cells < (columns, rows))).all(axis=-1)
+    out = np.zeros(points.shape[:-1], dtype=np.uint16)
+    out[inside] = submap.values[cells[inside][:, 1], cells[inside][:, 0]]
+    return out
