@@ -55,7 +55,7 @@ def test_evo_measures_the_error_that_was_made(tmp_path):
     poses = np.stack([np.cos(t), np.sin(t), t + 0.5 * np.pi], -1)
     stamps = 1_700_000_000_000_000_000 + (t * 1e9).astype(np.int64)
     write_tum(tmp_path / 'true.tum', Trajectory(stamps, poses))
-    write_tum(tmp_path / 'ours.tum', Trajectory(stamps, poses + [0.03, 0.04, 0.0]))
+    write_tum(tmp_path / 'ours.tum', Trajectory(stamps, poses + np.array([0.03, 0.04, 0.0])))
     paths = [file_interface.read_tum_trajectory_file(str(tmp_path / f'{n}.tum'))
              for n in ('true', 'ours')]  # fmt: skip
     pair = sync.associate_trajectories(*paths)

@@ -141,16 +141,13 @@ class FrontEnd:
             matches.num_used, matches.agree_with_map, self._map.grid_match,
         )  # fmt: skip
         expected, seen = self._reflectors.expected_and_seen(observation, matches)
-        detections, saved = observation.detections, self._map.saved
-        if saved is not None and not len(saved.reflectors):
-            detections = None  # a map of walls alone says nothing of them
         lasts = self.kidnapping.has_lasted(stamp, self._p.health.lost_time)
         return self.health.evaluate(
             stamp,
             HealthInputs(
                 scan=scan,
                 has_odometry=observation.motion.known or not self._p.node.use_odom,
-                detections=None if detections is None else len(detections),
+                detections=self._map.num_comparable(observation.detections),
                 matched=matches.num_used,
                 cov_map=self.in_map(self.state.pose, self.state.pose_cov)[1],
                 unconfirmed=confirmation.reason,

@@ -16,7 +16,7 @@ from rlml_slam.params import Parameters
 from rlml_slam.slam.front_end.grid_localization import GridLocalizer, GridMatch
 from rlml_slam.slam.front_end.joint_state import JointState
 from rlml_slam.slam.relocalization.grid_submap import is_mapped
-from rlml_slam.types import Observation, Reflectors
+from rlml_slam.types import Detections, Observation, Reflectors
 
 
 class MapLocalization:
@@ -42,6 +42,12 @@ class MapLocalization:
         self._grid = None
         if grid is not None and is_mapped(grid):
             self._grid = GridLocalizer(grid, self._p)
+
+    def num_comparable(self, detections: Detections | None) -> int | None:
+        """Number of detections; None also for a saved map of walls alone, which has none."""
+        if detections is None or (self.saved is not None and not len(self.saved.reflectors)):
+            return None
+        return len(detections)
 
     def update(self, state: JointState, observation: Observation) -> None:
         """Match the scan with the grid and update the state, once per keyframe distance."""
