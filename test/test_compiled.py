@@ -91,6 +91,17 @@ def test_kernel_goes_with_a_source_that_it_is_made_of(package, changed):
     assert not compiled.exists()
 
 
+def test_kernel_stays_where_only_the_api_changes(package):
+    (package / '__init__.py').write_text('def f():\n    from some.api import g\n')
+    (package / 'api.py').write_text('g = 1\n')
+    remove_stale(package)
+    compiled = package / '__pycache__' / 'kernels.answer.nbi'
+    compiled.touch()
+    (package / 'api.py').write_text('g = 2\n')
+    remove_stale(package)
+    assert compiled.exists()
+
+
 def test_every_file_with_kernels_is_known():
     """One that is not would keep kernels of other sources."""
     package = Path(rlml_slam.__file__).parent
