@@ -23,6 +23,14 @@ COMMANDS: Table = {
             'worlds': Command(
                 'rlml_lab.studies.study_worlds', 'accuracy and consistency over seeds and worlds'
             ),
+            'faults': Command(
+                'rlml_lab.faults.study_faults',
+                'faults put into a recording: error, health and cost of each',
+            ),
+            'stalls': Command(
+                'rlml_lab.faults.study_stalls',
+                'odometry that stands still while the robot drives, then catches up',
+            ),
             'lifelong': Command(
                 'rlml_lab.studies.study_lifelong',
                 'hours in one hall: size of the map and cost of a keyframe',

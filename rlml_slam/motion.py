@@ -2,7 +2,8 @@
 """The motion model: odometry and IMU between two stamps become one relative pose and covariance.
 
 The midpoint model of eq. 7 is applied per interval between two samples, and the intervals of a
-scan are composed, so that curved motion and rates of any mix are right.
+scan are composed, so that curved motion and rates of any mix are right. Wheel odometry is
+integrated on the robot: its pose after a gap tells the motion during it, whatever was lost.
 """
 
 from __future__ import annotations
@@ -32,7 +33,14 @@ STANDING = 0.02
 
 @brief
 def integrate(
-    v: Array, w: Array, dt: Array, var_v: Array, var_w: Array, var_lat: Array, gyro: Array
+    v: Array,
+    w: Array,
+    dt: Array,
+    var_v: Array,
+    var_w: Array,
+    var_lat: Array,
+    gyro: Array,
+    lateral: Array,
 ) -> Array:
     """Compose control intervals (eq. 5, 7-9); all arguments ``(n,)``.
 
@@ -49,9 +57,9 @@ def integrate(
     for k in range(len(v)):
         h = dt[k]
         c, s = math.cos(th + 0.5 * w[k] * h), math.sin(th + 0.5 * w[k] * h)
-        d = v[k] * h
+        dx, dy = h * (c * v[k] - s * lateral[k]), h * (s * v[k] + c * lateral[k])
         # G_x P G_x^T, eq. 8: only the heading column differs from the identity
-        gx, gy = -d * s, d * c
+        gx, gy = -dy, dx
         p02, p12, p22 = P[0, 2], P[1, 2], P[2, 2]
         P[0, 0] += 2.0 * gx * p02 + gx * gx * p22
         P[0, 1] += gx * p12 + gy * p02 + gx * gy * p22
@@ -60,7 +68,7 @@ def integrate(
         P[1, 2] += gy * p22
         # G_u Sigma_u G_u^T, eq. 9, with the sideways velocity as a third control
         ux, uy = h * c, h * s
-        wx, wy = -0.5 * d * h * s, 0.5 * d * h * c
+        wx, wy = -0.5 * dy * h, 0.5 * dx * h
         P[0, 0] += ux * ux * var_v[k] + wx * wx * var_w[k] + uy * uy * var_lat[k]
         P[0, 1] += ux * uy * var_v[k] + wx * wy * var_w[k] - uy * ux * var_lat[k]
         P[1, 1] += uy * uy * var_v[k] + wy * wy * var_w[k] + ux * ux * var_lat[k]
@@ -74,8 +82,8 @@ def integrate(
         sx += gx * st + more * wx
         sy += gy * st + more * wy
         st += more * h
-        x += d * c
-        y += d * s
+        x += dx
+        y += dy
         th += w[k] * h
     out = np.empty((6, 3))
     out[0, 0], out[0, 1], out[0, 2] = x, y, th
@@ -114,6 +122,35 @@ def compose_motion(first: Motion, second: Motion) -> Motion:
 STILL = Motion(np.zeros(3), np.zeros((3, 3)))
 
 
+def motion_of(delta: Array, dt: float, noise: MotionNoise) -> Motion:
+    """The motion that led to a relative pose ``delta`` (3,) in ``dt`` [s], by the wheels alone.
+
+    Its covariance is that of one arc, in pieces of a control interval: what the heading errs by
+    early moves the end.
+    """
+    n = max(math.ceil(dt / noise.noise_interval), 1)
+    step = se2.log(delta)
+    v, w = math.hypot(step[0], step[1]) / dt, step[2] / dt
+    guess = noise.long_interval_noise if n > 2 else 0.0
+    sigma = np.array([
+        (noise.speed_noise + guess) * v + noise.speed_noise_floor,
+        (noise.turn_noise + guess) * abs(w) + noise.turn_noise_floor,
+        noise.lateral_noise * v,
+    ])  # fmt: skip
+    piece = np.array([v, w, dt / n, *(sigma**2 * (noise.noise_interval * n / dt)), 0.0, 0.0])
+    return Motion(delta, integrate(*np.tile(piece[:, None], n))[1:4])
+
+
+def is_possible(delta: Array, dt: float, noise: MotionNoise) -> bool:
+    """Whether a robot can move by ``delta`` (3,) in ``dt`` [s]; one interval at least counts.
+
+    Stamps of one burst are too close to divide by.
+    """
+    over = max(dt, noise.noise_interval)
+    far = math.hypot(delta[0], delta[1])
+    return far <= noise.max_speed * over and abs(delta[2]) <= noise.max_turn_rate * over
+
+
 class _Noise(NamedTuple):
     """MotionNoise as kernels take it."""
 
@@ -136,17 +173,17 @@ def _drive(
     start: int,
     end: int,
     stamps: Stamps,
-    v: Array,
-    w: Array,
+    twists: Array,
     imu_stamps: Stamps,
     rates: Array,
     n: _Noise,
 ) -> tuple[Array, bool, float, float, float]:
     """Motion between two stamps: that of integrate(), known, bias, its variance, bias_turn.
 
-    ``v``, ``w`` (k,) are the velocities of the intervals that end at the odometry's ``stamps``,
+    ``twists`` (k, 3) are the velocities of the intervals that end at the odometry's ``stamps``,
     ``rates`` those measured by the IMU at its own. Between two stamps of either, the control is
-    that of the middle (eq. 6).
+    that of the middle (eq. 6). Of a gap that is all between the two stamps, the odometry says
+    where it led to. A part of one longer than max_gap is unknown.
     """
     cuts = np.empty(len(stamps) + len(imu_stamps) + 2, np.int64)
     cuts[0], m, i, j = start, 1, 0, 0
@@ -157,11 +194,13 @@ def _drive(
         else:
             stamp = imu_stamps[j]
             j += 1
+            if _is_bridged(i, start, end, stamps, n.max_gap):
+                continue  # the rates say how it turned, but not where it was then
         if cuts[m - 1] < stamp < end:
             cuts[m] = stamp
             m += 1
     cuts[m] = end
-    rows = np.empty((7, m))
+    rows = np.empty((8, m))
     all_known = True
     weight = weighted = turned = 0.0
     for k in range(m):
@@ -171,22 +210,33 @@ def _drive(
         # a robot goes within a control interval before its first odometry as at its beginning
         if at == 0 and len(stamps) > 1 and stamps[0] - start <= n.noise_interval * SECOND:
             at = 1
-        known = 0 < at < len(stamps) and not math.isnan(v[at])
+        known = 0 < at < len(stamps) and not math.isnan(twists[at, 0])
         gap = (stamps[at] - stamps[at - 1]) / SECOND if known else 0.0
-        known = known and gap <= n.max_gap
-        speed = turn = 0.0
+        bridged = _is_bridged(at, start, end, stamps, n.max_gap)
+        known = known and (gap <= n.max_gap or bridged)
+        speed = sideways = turn = 0.0
         sigma_v, sigma_w = n.max_speed / 5.0, n.max_turn_rate / 5.0
         if known:
-            speed, turn = v[at], w[at]
-            # when inside a long interval the motion happened is uncertain
-            long_interval_noise = n.long_interval_noise if gap > 2.0 * n.noise_interval else 0.0
-            sigma_v = (n.speed_noise + long_interval_noise) * abs(speed) + n.speed_noise_floor
-            sigma_w = (n.turn_noise + long_interval_noise) * abs(turn) + n.turn_noise_floor
+            speed, turn = twists[at, 0], twists[at, 2]
+            fast, quick, long_interval_noise = abs(speed), abs(turn), 0.0
+            if gap > 2.0 * n.noise_interval:
+                # when inside a long interval the motion happened is uncertain; what is left of it
+                # at the end is less than what was driven: at least as fast as before, and no arc
+                long_interval_noise = n.long_interval_noise
+                if at > 1 and not math.isnan(twists[at - 1, 0]):
+                    fast = max(fast, abs(twists[at - 1, 0]))
+                    quick = max(quick, abs(twists[at - 1, 2]))
+                # a constant twist leads along an arc, which is longer than its chord
+                half = 0.5 * turn * (cuts[k + 1] - cuts[k]) / SECOND
+                chord = math.sin(half) / half if abs(half) > 1e-4 else 1.0
+                speed, sideways = chord * speed, chord * twists[at, 1]
+            sigma_v = (n.speed_noise + long_interval_noise) * fast + n.speed_noise_floor
+            sigma_w = (n.turn_noise + long_interval_noise) * quick + n.turn_noise_floor
         # the wheels do not turn: so does the robot not, and the IMU shows its bias
-        stands = known and speed == 0.0 and turn == 0.0
+        stands = known and speed == 0.0 and sideways == 0.0 and turn == 0.0
         if stands:
             sigma_v, sigma_w = STANDING * n.speed_noise_floor, STANDING * n.turn_noise_floor
-        rate = _rate(middle, imu_stamps, rates, n.max_gap)
+        rate = np.nan if bridged else _rate(middle, imu_stamps, rates, n.max_gap)
         sigma_rate = n.imu_turn_noise * abs(rate) + n.imu_turn_noise_floor
         bias, bias_sigma = rate - turn, math.hypot(sigma_rate, sigma_w)
         says_bias = known and not math.isnan(rate)
@@ -197,7 +247,7 @@ def _drive(
         # Where the motion is too fast for its interval, the stamps are wrong, not the noise.
         lasted = max(dt, abs(speed) * dt / n.max_speed, abs(turn) * dt / n.max_turn_rate)
         scale = along = n.noise_interval / lasted
-        lateral = n.lateral_noise * abs(speed)
+        lateral = n.lateral_noise * math.hypot(speed, sideways)
         if not known:
             # one unknown speed for all of a gap: the variance of the way goes with the square of
             # the time since odometry ended, and that of a part is what it grows by
@@ -205,16 +255,26 @@ def _drive(
             along = max(n.noise_interval, 2.0 * since) / dt
         rows[0, k], rows[1, k], rows[2, k], rows[6, k] = speed, turn, dt, gyro
         rows[3, k], rows[4, k] = sigma_v**2 * along, sigma_w**2 * scale
-        rows[5, k] = lateral**2 * along
+        rows[5, k], rows[7, k] = lateral**2 * along, sideways
         all_known = all_known and known
         if says_bias:
             weight += 1.0 / (bias_sigma**2 * scale)
             weighted += bias / (bias_sigma**2 * scale)
             turned += gyro * rate / (bias_sigma**2 * scale)
-    out = integrate(rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6])
+    out = integrate(
+        rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6], rows[7]
+    )  # fmt: skip
     if weight > 0.0:
         return out, all_known, weighted / weight, 1.0 / weight, turned / weight
     return out, all_known, 0.0, np.inf, 0.0
+
+
+@part
+def _is_bridged(at: int, start: int, end: int, stamps: Stamps, max_gap: float) -> bool:
+    """Whether the interval that ends at sample ``at`` is a long gap, all of it inside."""
+    if not 0 < at < len(stamps) or stamps[at] - stamps[at - 1] <= max_gap * SECOND:
+        return False
+    return bool(start <= stamps[at - 1] and stamps[at] <= end)
 
 
 @part
@@ -252,9 +312,8 @@ class MotionBuffer:
         self._memory = int(memory * SECOND)
         self._stamps: list[int] = []
         self._poses: list[Array] = []
-        # velocities of the interval that ends at the sample of the same index
-        self._v: list[float] = [0.0]
-        self._w: list[float] = [0.0]
+        # velocity (3,) of the interval that ends at the sample of the same index
+        self._twists: list[Array] = [np.zeros(3)]
         self._imu_stamps: list[int] = []
         self._rates: list[float] = []
         self._parked: Odometry | None = None
@@ -282,24 +341,20 @@ class MotionBuffer:
                     return
                 if self._step(parked.stamp, parked.pose, sample) is None:
                     return
-                step = (math.nan, math.nan)
-            self._v.append(step[0])
-            self._w.append(step[1])
+                step = np.full(3, np.nan)
+            self._twists.append(step)
         self._parked = None
         self._stamps.append(sample.stamp)
         self._poses.append(np.array(sample.pose, dtype=np.float64))
-        self._forget(self._stamps, sample.stamp, self._poses, self._v, self._w)
+        self._forget(self._stamps, sample.stamp, self._poses, self._twists)
 
-    def _step(self, stamp: int, pose: Array, sample: Odometry) -> tuple[float, float] | None:
-        """Speed and turn rate since an earlier sample, None where no robot moves like that."""
+    def _step(self, stamp: int, pose: Array, sample: Odometry) -> Array | None:
+        """Velocity (3,) since an earlier sample, None where no robot moves like that."""
         dt = (sample.stamp - stamp) / SECOND
         step = se2.log(se2.between(pose, sample.pose))
-        n = self._noise
-        # stamps of one burst are too close to divide by: a jump is judged over an interval
-        over = max(dt, n.noise_interval)
-        if abs(step[0]) > n.max_speed * over or abs(step[2]) > n.max_turn_rate * over:
+        if not is_possible(step, dt, self._noise):
             return None
-        return float(step[0]) / dt, float(step[2]) / dt
+        return step / dt
 
     def add_imu(self, sample: Imu) -> None:
         """Append a sample, unless it is no later than the newest one."""
@@ -332,17 +387,17 @@ class MotionBuffer:
         unmeasured = self.motion(begin, end)
         has_gyro = bool(unmeasured.bias_gain.any())
         coasted = min(until, COAST) - min(since, COAST)
-        v, w = self._v[-1], self._w[-1]
+        twist = self._twists[-1]
         lasted = len(self._stamps) > 1 and self._stamps[-1] - self._stamps[-2] >= SECOND // 100
-        if math.isnan(v) or not lasted:
-            v = w = 0.0
-        turn = unmeasured.delta[2] if has_gyro else w * coasted
+        if math.isnan(twist[0]) or not lasted:
+            twist = np.zeros(3)
+        turn = unmeasured.delta[2] if has_gyro else twist[2] * coasted
         n = self._noise
         cov = np.diag([n.max_speed / 5.0, n.max_speed / 20.0, n.max_turn_rate / 5.0]) ** 2
         cov *= until**2 - since**2
         if has_gyro:
             cov[2, 2] = unmeasured.cov[2, 2]
-        delta = se2.exp(np.array([v * coasted, 0.0, turn]))
+        delta = se2.exp(np.array([twist[0] * coasted, twist[1] * coasted, turn]))
         turn_gain = np.zeros(3) if has_gyro else np.array([0.0, 0.0, turn])
         rest = Motion(delta, cov, False, unmeasured.bias_gain, turn_gain=turn_gain)
         return compose_motion(covered, rest)
@@ -350,11 +405,9 @@ class MotionBuffer:
     def forget_after(self, stamp: int) -> None:
         """Drop all samples later than a stamp: their clock was wrong."""
         k = bisect_right(self._stamps, stamp)
-        for column in (self._stamps, self._poses, self._v, self._w):
-            del column[k:]
-        if not self._v:
-            self._v.append(0.0)
-            self._w.append(0.0)
+        del self._stamps[k:], self._poses[k:], self._twists[k:]
+        if not self._twists:
+            self._twists.append(np.zeros(3))
         k = bisect_right(self._imu_stamps, stamp)
         del self._imu_stamps[k:], self._rates[k:]
 
@@ -386,8 +439,7 @@ class MotionBuffer:
         out, known, bias, variance, turned = _drive(
             start, end,
             np.array(self._stamps[odometry], dtype=np.int64),
-            np.array(self._v[odometry], dtype=np.float64),
-            np.array(self._w[odometry], dtype=np.float64),
+            np.array(self._twists[odometry], dtype=np.float64).reshape(-1, 3),
             np.array(self._imu_stamps[imu], dtype=np.int64),
             np.array(self._rates[imu], dtype=np.float64),
             self._noise_values,
@@ -398,6 +450,6 @@ class MotionBuffer:
 
 def warm_up() -> None:
     """Compile the kernels."""
-    integrate(*np.ones((7, 1)))
+    integrate(*np.ones((8, 1)))
     buffer = MotionBuffer(MotionNoise(), 1.0)
     buffer.motion(1, 2)

@@ -35,7 +35,7 @@ def simulate(parameters: SimulatorParameters, seed: int) -> tuple[list[Message],
 def feed(slam: Slam | EkfSlam, messages: Sequence[Message]) -> list[list[Frame]]:
     """All messages in order of arrival; the frames that they gave."""
     warm_up.compile_loaded()
-    return [*(_add(slam, m) for m in messages), slam.finish()]
+    return [*(feed_one(slam, m) for m in messages), slam.finish()]
 
 
 def observe(
@@ -44,7 +44,7 @@ def observe(
     """What a system's sequencer makes of all messages: the same for every system."""
     synchronizer = Synchronizer(params)
     synchronizer.set_sensor_pose(simulator.node.laser_frame, np.array(simulator.node.laser_pose))
-    return [o for m in messages for o in _add(synchronizer, m)] + synchronizer.flush()
+    return [o for m in messages for o in feed_one(synchronizer, m)] + synchronizer.flush()
 
 
 def process(slam: Slam | EkfSlam, observations: Sequence[Observation]) -> list[list[Frame]]:
@@ -53,7 +53,8 @@ def process(slam: Slam | EkfSlam, observations: Sequence[Observation]) -> list[l
     return [*(slam.process([o]) for o in observations), slam.finish()]
 
 
-def _add(target: Target[Out], message: Message) -> list[Out]:
+def feed_one(target: Target[Out], message: Message) -> list[Out]:
+    """One message to a system or a synchronizer; what became ready by it."""
     if isinstance(message, Odometry):
         return target.add_odometry(message)
     if isinstance(message, Imu):

@@ -22,13 +22,13 @@ from rlml_slam.estimation.landmark_tracks import LandmarkTracks
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
+from rlml_slam.sensing.velocity_deskew import Sweep
 from rlml_slam.slam.front_end.joint_state import JointState
 from rlml_slam.slam.front_end.map_localization import MapConfirmation, MapLocalization
 from rlml_slam.slam.front_end.motion_term import MotionTerm
 from rlml_slam.slam.front_end.reflector_term import USED, Matches, ReflectorTerm
 from rlml_slam.slam.front_end.scan_term import ScanTerm
 from rlml_slam.slam.front_end.submaps import Submaps
-from rlml_slam.slam.front_end.velocity_deskew import Sweep
 from rlml_slam.types import Belief, Frame, Health, Observation, Reflectors
 
 
@@ -48,7 +48,7 @@ class FrontEnd:
         self.state = JointState(
             pose, cov, m.imu_bias_sigma, m.constant_velocity_sigma, m.scale_error_sigma
         )
-        self._motion = MotionTerm(m)
+        self._motion = MotionTerm(self._p)
         self._reflectors = ReflectorTerm(self._p, self.state)
         self._scans = ScanTerm(self._p, self.state, self._motion)
         self._map = MapLocalization(self._p)
@@ -66,6 +66,7 @@ class FrontEnd:
         were ambiguous or outside their gates with the prior; each detection is used once.
         """
         began = self._finish_last_step()
+        observation = self._scans.likeliest(self._motion.hypotheses(observation))
         self._motion.predict(self.state, observation)
         observation, sweep = self._scans.deskew(observation)
         matches = self._reflectors.update(observation, self._reflectors.select(observation))

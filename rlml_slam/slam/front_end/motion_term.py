@@ -17,13 +17,13 @@ from dataclasses import replace
 import numpy as np
 
 from rlml_slam import se2
-from rlml_slam.params import MotionNoise
+from rlml_slam.params import MotionNoise, Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.front_end.constant_velocity import ConstantVelocity
 from rlml_slam.slam.front_end.joint_state import STANDING, JointState
+from rlml_slam.slam.front_end.motion_hypotheses import FRESH, Hypothesis, MotionHypotheses
 from rlml_slam.types import Observation
 
-FRESH = 1.0  # [s] for which a velocity is assumed to last: a robot takes about as long to stop
 # [ns] shortest time over which a velocity is computed. Scans that arrive in a burst are too close:
 # a pose error of 2 mm would be 0.4 m/s over 5 ms, and is .04 m/s over this time.
 MIN_INTERVAL = 50_000_000
@@ -37,9 +37,10 @@ class MotionTerm:
     by the constant-velocity model. ``velocity`` (3,) [m/s, m/s, rad/s] is that of the base.
     """
 
-    def __init__(self, params: MotionNoise) -> None:
-        self._p = params
-        self._constant_velocity = ConstantVelocity(params)
+    def __init__(self, params: Parameters) -> None:
+        self._p = params.motion
+        self._constant_velocity = ConstantVelocity(params.motion)
+        self._hypotheses = MotionHypotheses(params)
         self.stamp: int | None = None
         self.has_odometry = self.is_constant_velocity = False
         self.forget_velocity()
@@ -47,7 +48,14 @@ class MotionTerm:
     def forget_velocity(self) -> None:
         """Start again with velocity 0: the pose was moved."""
         self.velocity = np.zeros(3)
+        self._is_velocity_known = False
+        self._hypotheses.forget()
         self._since: tuple[int, Array] | None = None  # stamp and pose of the last velocity
+
+    def hypotheses(self, observation: Observation) -> list[Hypothesis]:
+        """What may have happened since the last observation, the odometry's motion first."""
+        velocity = self.velocity if self._is_velocity_known else None
+        return self._hypotheses.of(observation, velocity)
 
     def predict(self, state: JointState, observation: Observation) -> None:
         """Move the pose to the stamp of the observation (eq. 5 to 9)."""
@@ -66,6 +74,7 @@ class MotionTerm:
     def corrected(self, state: JointState, observation: Observation) -> Observation:
         """The observation with its motion as estimated now; measures the velocity."""
         self._measure_velocity(observation.stamp, state.pose)
+        self._hypotheses.learn(observation, state.pose)
         if self.is_constant_velocity:
             motion = self._constant_velocity.estimated(state, observation.motion)
         else:
@@ -77,6 +86,7 @@ class MotionTerm:
             self._since = (stamp, pose)
         elif stamp - self._since[0] >= MIN_INTERVAL:
             dt = (stamp - self._since[0]) * 1e-9
+            self._is_velocity_known = True
             self.velocity = se2.log(se2.between(self._since[1], pose)) / dt
             self._since = (stamp, pose)
 

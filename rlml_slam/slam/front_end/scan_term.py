@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,18 +18,23 @@ from rlml_slam.matching.scans.scan_match import UNKNOWN, ScanMatchResult, match
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
+from rlml_slam.sensing.velocity_deskew import Sweep, deskewed
 from rlml_slam.slam.front_end.degeneracy import Degeneracy
 from rlml_slam.slam.front_end.joint_state import JointState
+from rlml_slam.slam.front_end.motion_hypotheses import Hypothesis
 from rlml_slam.slam.front_end.motion_term import MotionTerm
 from rlml_slam.slam.front_end.scan_update import fuse, prior_of, relative
 from rlml_slam.slam.front_end.submaps import Submaps
-from rlml_slam.slam.front_end.velocity_deskew import Sweep, deskewed
 from rlml_slam.slam.relocalization.local_recovery import AS_USUAL, TURN, recover_locally
 from rlml_slam.types import Observation
 
 FAR = 3.0  # [sigma] half width of a search without odometry
 # [m] 1 sigma in its submap of a robot without odometry, beyond which it starts another submap
 MAX_SIGMA_IN_SUBMAP = 0.5
+NEAR = 0.3  # [m] of a reflector, a detection may be one of it
+PENALTY = 0.1  # share of a fit that a motion loses which no robot has
+DOUBT = 0.02  # by which motions other than the odometry's have to fit better
+OPEN = 0.03  # motions whose fits differ by less are both possible
 MIN_KNOWN = 0.33  # share of end points in known cells below which a scan cannot contradict
 
 
@@ -72,6 +79,51 @@ class ScanTerm:
             return first, sweep
         self._fuse(state, found, self._information(submap, points, found), sweep)
         return deskewed(observation, state.velocity, max_range)
+
+    def likeliest(self, hypotheses: Sequence[Hypothesis]) -> Observation:
+        """The observation with the motion that its scan and its reflectors fit best.
+
+        While several fit about as well, the covariance of the motion is that of their mixture.
+        Where nothing was seen, it is the first one, the odometry's.
+        """
+        if len(hypotheses) == 1:
+            return hypotheses[0].observation
+        seen = [self._fit(h.observation) for h in hypotheses]
+        if seen[0] is None:
+            return hypotheses[0].observation
+        fits = [
+            (fit or 0.0) - PENALTY * h.penalty for fit, h in zip(seen, hypotheses, strict=True)
+        ]
+        fits[0] += DOUBT
+        best = int(np.argmax(fits))
+        chosen = hypotheses[best].observation
+        cov = chosen.motion.cov.copy()
+        for fit, other in zip(fits, hypotheses, strict=True):
+            if fit > fits[best] - OPEN:
+                away = se2.between(chosen.motion.delta, other.observation.motion.delta)
+                cov += np.outer(away, away)
+        return replace(chosen, motion=replace(chosen.motion, cov=cov))
+
+    def _fit(self, observation: Observation) -> float | None:
+        """How well scan and reflectors fit after a motion: 0 to 1, None without any."""
+        state, p = copy.deepcopy(self._state), self._p.scan_match
+        state.predict(observation.motion, 0.0)
+        submap, detections, fits = self.submaps.target, observation.detections, []
+        points = observation.points
+        if submap is not None and points is not None and len(points) >= p.min_points:
+            points = voxel_filter.thin(points, p.voxel_size, p.max_points)
+            nothing = Sweep()
+            floor2 = np.array(p.variance_floor)
+            prior = prior_of(state.x, state.P, floor2, nothing.half, nothing.velocity)
+            found = match(submap, points, *prior, p, searched=False)
+            fits.append(found.score + DOUBT * found.prior_weight)
+            state.x[:3] = se2.compose(state.anchor(0), found.pose)
+        landmarks = state.landmarks()
+        if detections is not None and len(detections) and len(landmarks):
+            at = se2.transform(state.pose, detections.points)
+            away = np.linalg.norm(at[:, None] - landmarks[None], axis=-1).min(axis=1)
+            fits.append(float(np.mean(away < NEAR)))
+        return float(np.mean(fits)) if fits else None
 
     def update(
         self, observation: Observation, sweep: Sweep, reflectors_agree: bool

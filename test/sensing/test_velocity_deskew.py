@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from rlml_slam import se2
-from rlml_slam.slam.front_end.velocity_deskew import deskewed
+from rlml_slam.sensing.velocity_deskew import deskewed
 from rlml_slam.types import Motion, Observation, Scan
 
 RAY = 2e-4  # [s] from one beam to the next

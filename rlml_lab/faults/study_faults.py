@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``rlml-lab study faults``: what faults in a recording cost, and whether the system says so."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rlml_lab.faults import recording
+from rlml_lab.faults.fault_catalog import FAULTS, chosen
+from rlml_lab.faults.fault_run import FaultFigures
+from rlml_lab.faults.fault_run import run as run_fault
+from rlml_slam.cli.support.progress import Progress
+from rlml_slam.cli.support.text_table import aligned
+from rlml_slam.params import Parameters, from_mapping, read_yaml
+
+HEADINGS = (
+    'fault', 'seed', 'error [m]', '× clean', 'heading [°]', 'LOST', 'DEGRADED', 'OK and wrong',
+    'longest [s]', 'CPU [ms/scan]', '× real time',
+)  # fmt: skip
+
+
+def add_parser(subparsers: Any) -> None:
+    """Declare ``rlml-lab study faults``."""
+    parser = subparsers.add_parser(
+        'faults',
+        help='faults put into a recording: error, health, cost',
+        description='Puts faults of odometry, laser and reflector detector into a recording and '
+        'replays it. OK and wrong: the pose is off by more than 0.5 m or 10° beyond 3 sigma and '
+        'its health is OK. Without truth, published poses are compared with the replay without '
+        'a fault.',
+    )
+    parser.add_argument('recording', metavar='BAG', help='a bag, or the name of a world')
+    parser.add_argument(
+        'reference', nargs='?', type=Path, metavar='REFERENCE',
+        help='relations (*.relations), or the truth as a TUM file in the map frame',
+    )  # fmt: skip
+    parser.add_argument(
+        '--fault', nargs='+', metavar='WORD',
+        help=f'only those whose name has one of these words, of: {", ".join(FAULTS)}'
+        .replace('%', '%%'),
+    )  # fmt: skip
+    parser.add_argument('--seeds', type=int, default=1, metavar='N', help='default: %(default)s')
+    parser.add_argument('--config', type=Path, metavar='YAML', help="the system's parameters")
+    parser.add_argument('--json', action='store_true', help='print one JSON object and no more')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Replay with each fault and each seed, and print a row for each."""
+    params = from_mapping(read_yaml(args.config)) if args.config else Parameters()
+    given = recording.load(args.recording, args.reference, params)
+    faults = list(chosen(args.fault))
+    rows: list[tuple[str, int, FaultFigures]] = []
+    reference = None
+    with Progress('study', 1 + (len(faults) - 1) * args.seeds, args.json) as progress:
+        for name, fault in faults:
+            for seed in range(1 if name == 'none' else args.seeds):
+                figures, path, _ = run_fault(given, fault, seed, params, reference)
+                reference = reference or path
+                rows.append((name, seed, figures))
+                progress.update(len(rows), f'{name}: {figures.mean_m:.3f} m')
+    if args.json:
+        listed = [{'fault': name, 'seed': seed, **asdict(f)} for name, seed, f in rows]
+        print(json.dumps({'recording': given.name, 'runs': listed}))
+    else:
+        print(table(rows))
+    return 0
+
+
+def table(rows: Sequence[tuple[str, int, FaultFigures]]) -> str:
+    """One line per run; the first one has no fault."""
+    clean = rows[0][2].mean_m
+    lines = [list(HEADINGS)]
+    for name, seed, f in rows:
+        lines.append([
+            name, str(seed), f'{f.mean_m:.4f} ± {f.std_m:.4f}',
+            f'{f.mean_m / clean:.2f}' if clean > 0.0 else '', f'{f.rot_deg:.2f}',
+            f'{f.lost:.2%}', f'{f.degraded:.2%}', f'{f.ok_and_wrong:.2%}', f'{f.longest_s:.1f}',
+            f'{f.cpu_ms:.2f}', f'{f.real_time_factor:.0f}',
+        ])  # fmt: skip
+    return aligned(lines)

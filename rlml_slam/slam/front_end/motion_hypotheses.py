@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several predictions where the sources of motion disagree.
+
+Odometry may stall: it repeats its pose while the robot drives, and then catches up in one step.
+Scans have shown the motion meanwhile, so the step must not be added to it. Wheels are integrated
+on the robot: the odometry since the last frame at which it was trusted is one measurement,
+whatever came in between. So there are up to three hypotheses: odometry since the last frame,
+odometry since it was trusted, and that the robot goes on as it went. Scan and reflectors
+choose (:meth:`ScanTerm.likeliest`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rlml_slam import se2
+from rlml_slam.motion import is_possible, motion_of
+from rlml_slam.params import Parameters
+from rlml_slam.se2 import Array
+from rlml_slam.sensing.velocity_deskew import deskewed
+from rlml_slam.types import Motion, Observation
+
+FRESH = 1.0  # [s] for which a velocity is assumed to last: a robot takes about as long to stop
+# [m/s^2, m/s^2, rad/s^2] 1 sigma of what a robot's velocity changes by
+ACCELERATION = np.array([1.0, 0.3, 3.0])
+SUDDEN = 3.0  # [sigma] a robot does not start as suddenly as that; it may stop so
+SHORTEST = 0.1  # [s] over which a velocity is known well enough to say so
+MOVED = np.array([0.05, 0.05, 0.05])  # [m, m, rad] by scans, while the odometry stands still
+SAME = np.array([0.02, 0.02, 0.01])  # [m, m, rad] hypotheses that are closer are one
+LONGEST = 5.0  # [s] of a stall; after that, odometry is what it is
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """An observation with one of the motions, and scan de-skewed by it.
+
+    ``penalty`` is 0 to 1, for accelerations that no robot has.
+    """
+
+    observation: Observation
+    penalty: float
+
+
+class MotionHypotheses:
+    """The last frame at which odometry was trusted: its stamp [ns], pose and raw odometry (3,)."""
+
+    def __init__(self, params: Parameters) -> None:
+        self._p = params
+        self.forget()
+
+    def forget(self) -> None:
+        """The pose was moved: what comes is not compared with what was before."""
+        self._trusted: tuple[int, Array, Array] | None = None
+        self._last: tuple[int, Array] | None = None  # stamp and pose of the last frame
+
+    def of(self, observation: Observation, velocity: Array | None) -> list[Hypothesis]:
+        """What may have happened since the last frame, the odometry's motion first.
+
+        It is the only one where nothing speaks against it. ``velocity`` (3,) is that until then,
+        None if it is unknown.
+        """
+        plain = observation.motion
+        single = [Hypothesis(observation, 0.0)]
+        if self._last is None or self._trusted is None or velocity is None:
+            return single
+        dt = (observation.stamp - self._last[0]) * 1e-9
+        if not 0.0 < dt <= FRESH:
+            return single
+        since, goes_on = self._since_trusted(observation), se2.exp(velocity * dt)
+        stands = not plain.delta.any() and bool((np.abs(goes_on) > MOVED).any())
+        is_sudden = _penalty(plain.delta, velocity, dt) > 0.5
+        if plain.known and since is None and not (stands or is_sudden):
+            return single
+        sigma = ACCELERATION * max(dt, SHORTEST) * dt
+        onward = Motion(goes_on, np.diag(sigma**2 + (0.5 * SAME) ** 2), known=False)
+        motions = [plain]
+        for other in (since, onward):
+            if other is not None and all(_differ(other.delta, m.delta) for m in motions):
+                motions.append(other)
+        return [
+            Hypothesis(self._moved(observation, m, dt), _penalty(m.delta, velocity, dt))
+            for m in motions
+        ]
+
+    def _moved(self, observation: Observation, motion: Motion, dt: float) -> Observation:
+        """The observation with another motion, and its scan de-skewed by that."""
+        if motion is observation.motion:
+            return observation
+        max_range = self._p.submap.max_laser_range
+        observation = replace(observation, motion=motion)
+        return deskewed(observation, se2.log(motion.delta) / dt, max_range)[0]
+
+    def _since_trusted(self, observation: Observation) -> Motion | None:
+        """The motion since the last frame by the odometry since it was trusted, if it is open."""
+        assert self._trusted is not None
+        assert self._last is not None
+        stamp, pose, odometry = self._trusted
+        if stamp == self._last[0] or observation.odom_pose is None:
+            return None
+        dt = (observation.stamp - stamp) * 1e-9
+        way = se2.between(odometry, observation.odom_pose)
+        if not is_possible(way, dt, self._p.motion):
+            return None
+        delta = se2.between(self._last[1], se2.compose(pose, way))
+        # what the scans have shown since then is not without error either
+        return Motion(delta, motion_of(way, dt, self._p.motion).cov + np.diag(SAME**2))
+
+    def learn(self, observation: Observation, pose: Array) -> None:
+        """Take the pose (3,) of the newest frame; trust the odometry where it agrees.
+
+        One that stands exactly still is not trusted later than the frame at which it began to, and
+        one that was missing or stood still only when what it says is where the scans are.
+        """
+        last, self._last = self._last, (observation.stamp, pose)
+        odometry = observation.odom_pose
+        if odometry is None:
+            return
+        if last is not None and self._trusted is not None:
+            stamp, there, then = self._trusted
+            dt = (observation.stamp - stamp) * 1e-9
+            way = se2.between(then, odometry)
+            is_open = stamp != last[0] or not observation.motion.delta.any()
+            if is_open and dt < LONGEST and not self._agrees(observation, way, dt, there, last[1]):
+                return
+        self._trusted = (observation.stamp, pose, np.asarray(odometry))
+
+    def _agrees(
+        self, observation: Observation, way: Array, dt: float, there: Array, last: Array
+    ) -> bool:
+        """Whether odometry has moved, as the pose did since it was trusted or since the last."""
+        if not way.any():
+            return False
+        assert self._last is not None
+        whole, plain = motion_of(way, dt, self._p.motion), observation.motion
+        return any(
+            bool((np.abs(error) < MOVED + SUDDEN * np.sqrt(np.diag(motion.cov))).all())
+            for motion, error in (
+                (whole, se2.between(way, se2.between(there, self._last[1]))),
+                (plain, se2.between(plain.delta, se2.between(last, self._last[1]))),
+            )
+            if motion.known
+        )
+
+
+def _penalty(delta: Array, velocity: Array, dt: float) -> float:
+    """Share to which a motion (3,) in ``dt`` [s] is too sudden: Geman and McClure's loss."""
+    sigma = ACCELERATION * max(dt, SHORTEST) * dt
+    faster = np.maximum(np.abs(delta) - np.abs(velocity) * dt, 0.0)
+    u2 = float(np.max(faster / sigma)) ** 2
+    return u2 / (u2 + SUDDEN**2)
+
+
+def _differ(a: Array, b: Array) -> bool:
+    return bool((np.abs(se2.between(a, b)) > SAME).any())

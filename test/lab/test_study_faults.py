@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rlml_lab.faults import fault_catalog as faults
+from rlml_lab.faults import study_stalls
+from rlml_lab.faults.fault_run import is_wrong, longest
+from rlml_slam import se2
+from rlml_slam.datasets.tum import Trajectory
+from rlml_slam.evaluation.run_record import FrameLog
+from rlml_slam.params import Parameters
+from rlml_slam.types import Detections, Odometry, Scan
+
+SECOND = 10**9
+
+
+def drive(duration=130.0):
+    """Odometry and scans at 5 Hz along an arc."""
+    out = []
+    for k in range(round(5 * duration)):
+        stamp = SECOND + k * SECOND // 5
+        out.append(Odometry(stamp, se2.exp(np.array([0.1, 0.0, 0.05]) * k)))
+        ranges = np.full(90, 5.0 + 0.01 * k, dtype=np.float32)
+        out.append(Scan(stamp, 'laser', -1.5, 0.034, 0.0, 0.1, 30.0, ranges, np.zeros(0)))
+    return out
+
+
+def odometry(messages):
+    return np.array([m.pose for m in messages if isinstance(m, Odometry)])
+
+
+def applied(fault, messages, seed=3):
+    return fault(messages, np.random.default_rng(seed))
+
+
+def test_same_seed_gives_the_same_fault():
+    a, b = (applied(faults.cut(3.0), drive()) for _ in range(2))
+    assert [m.stamp for m in a] == [m.stamp for m in b]
+
+
+def test_cut_takes_all_messages_of_its_windows_and_keeps_the_rest():
+    before = drive()
+    after = applied(faults.cut(3.0), before)
+    stamps = np.unique([m.stamp for m in after])
+    gaps = np.diff(stamps)
+    assert int((gaps > SECOND).sum()) == 2
+    assert gaps.max() == pytest.approx(3.2 * SECOND, abs=0.2 * SECOND)
+    assert all(any(m is n for n in before) for m in after[:10])
+
+
+def test_stall_repeats_a_pose_and_catches_up():
+    before, after = (odometry(m) for m in (drive(), applied(faults.stall(2.0, True), drive())))
+    still = (np.diff(after, axis=0) == 0.0).all(axis=1)
+    assert still.sum() == pytest.approx(20, abs=2)
+    np.testing.assert_allclose(after[-1], before[-1], atol=1e-9)
+
+
+def test_stall_that_does_not_catch_up_loses_its_motion_and_no_more():
+    before, after = (odometry(m) for m in (drive(), applied(faults.stall(2.0, False), drive())))
+    steps = se2.between(before[:-1], before[1:])
+    after_steps = se2.between(after[:-1], after[1:])
+    moved = np.abs(after_steps).sum(axis=1) > 1e-9
+    assert (~moved).sum() == pytest.approx(20, abs=2)
+    np.testing.assert_allclose(after_steps[moved], steps[moved], atol=1e-9)
+
+
+def test_reset_odometry_begins_at_zero():
+    after = odometry(applied(faults.reset, drive()))
+    assert (np.abs(after[1:]).sum(axis=1) == 0.0).sum() == 2
+
+
+def test_scans_are_decimated_frozen_dirty_and_blocked():
+    def scans(fault):
+        return [m for m in applied(fault, drive(80.0)) if isinstance(m, Scan)]
+
+    assert len(scans(faults.decimate(1.0))) == 80
+    frozen = [s.ranges[0] for s in scans(faults.frozen(3.0))]
+    assert (np.diff(frozen) == 0.0).sum() == pytest.approx(15, abs=1)
+    dirty = {tuple(np.isnan(s.ranges).tolist()) for s in scans(faults.dirt(0.3))}
+    assert len(dirty) == 1
+    assert 0.1 < np.mean(next(iter(dirty))) < 0.5
+    near = scans(faults.blocked(0.4, 0.4))[0].ranges
+    assert (near == np.float32(0.4)).sum() == pytest.approx(0.4 / 0.034, abs=2)
+    assert min(s.ranges.min() for s in scans(faults.people(3))) < 2.3
+
+
+def test_reflectors_are_missed_invented_and_confused():
+    n = 6
+    seen = [
+        Detections(
+            SECOND * k, 'laser', np.ones((n, 2)), np.tile(np.eye(2), (n, 1, 1)),
+            np.arange(n), np.full(n, np.nan),
+        )
+        for k in range(1, 200)
+    ]  # fmt: skip
+    kept = np.mean([len(d) for d in applied(faults.misses(0.5), seen)])
+    assert kept == pytest.approx(3.0, abs=0.3)
+    assert np.mean([len(d) for d in applied(faults.ghosts(3.0), seen)]) == pytest.approx(9.0, 0.1)
+    changed = np.mean([d.ids != np.arange(n) for d in applied(faults.wrong_ids(0.5), seen)])
+    assert changed == pytest.approx(0.5 * (1.0 - 1.0 / n), abs=0.05)
+
+
+def test_pose_is_wrong_beyond_its_own_covariance_only():
+    truth = Trajectory(np.arange(4) * SECOND, np.zeros((4, 3)))
+    log = FrameLog()
+    for k, (x, turn, sigma) in enumerate(
+        [(0.6, 0, 0.01), (0.6, 0, 0.1), (0, 0.3, 0.01), (0, 0, 1)]
+    ):
+        log.add_pose(k * SECOND, np.array([x, 0.0, turn]), sigma**2 * np.eye(3))
+    wrong = is_wrong(log, truth)
+    assert wrong.tolist() == [True, False, True, False]
+    assert longest(np.array(log.stamps), np.array([True, True, False, True])) == 1.0
+
+
+def test_stalls_in_a_fast_turn_among_furniture_cost_nothing():
+    """Counted twice, the step after this stall once turned the map by 67 degrees."""
+    world = str(Path(study_stalls.__file__).with_name('cluttered.yaml'))
+    given = study_stalls.Drive(0.97, 1.11, 1.05, catches_up=True)
+    figures = study_stalls.evaluate(world, 6, Parameters(), given)
+    assert max(figures['headings']) < 2.0
+    assert figures['ok_and_wrong'] == 0.0
+    assert figures['mean_m'] < 1.5 * figures['clean_m']

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+
+from rlml_slam import se2
+from rlml_slam.motion import motion_of
+from rlml_slam.params import Parameters
+from rlml_slam.slam.front_end.motion_hypotheses import MotionHypotheses
+from rlml_slam.types import Motion, Observation
+
+PARAMS = Parameters()
+DT = 0.2
+TWIST = np.array([0.85, 0.0, 1.0])
+STEP = se2.exp(TWIST * DT)
+
+
+class Drive:
+    """A robot that turns at a constant velocity; its odometry says what the test wants."""
+
+    def __init__(self):
+        self.hypotheses = MotionHypotheses(PARAMS)
+        self.stamp, self.pose, self.odometry = 10**9, np.zeros(3), np.zeros(3)
+        self.hypotheses.learn(self.observation(np.zeros(3)), self.pose)
+
+    def observation(self, delta, known=True):
+        motion = motion_of(delta, DT, PARAMS.motion)
+        motion = Motion(motion.delta, motion.cov, known)
+        return Observation(self.stamp, motion, odom_pose=self.odometry if known else None)
+
+    def go(self, odometry=None, known=True, moved=STEP):
+        """The hypotheses of one step; ``odometry`` is what it measured, all of it by default."""
+        odometry = STEP if odometry is None else odometry
+        self.stamp += round(DT * 1e9)
+        self.odometry = se2.compose(self.odometry, odometry)
+        seen = self.observation(odometry, known)
+        found = self.hypotheses.of(seen, TWIST)
+        self.pose = se2.compose(self.pose, moved)
+        self.hypotheses.learn(seen, self.pose)
+        return [h.observation.motion.delta for h in found]
+
+
+def test_odometry_that_agrees_is_the_only_hypothesis():
+    drive = Drive()
+    for _ in range(5):
+        found = drive.go()
+        assert len(found) == 1
+        np.testing.assert_array_equal(found[0], STEP)
+
+
+def test_odometry_that_stands_while_the_robot_drives_is_doubted():
+    drive = Drive()
+    drive.go()
+    found = drive.go(np.zeros(3))
+    np.testing.assert_array_equal(found[0], 0.0)
+    np.testing.assert_allclose(found[-1], STEP, atol=1e-9)
+
+
+@pytest.mark.parametrize('known', [True, False], ids=['stands still', 'is missing'])
+def test_step_after_a_stall_is_compared_with_what_scans_have_shown(known):
+    drive = Drive()
+    drive.go()
+    for _ in range(4):
+        drive.go(np.zeros(3), known)
+    step = se2.exp(TWIST * 5 * DT)
+    plain, since, *_ = drive.go(step)
+    np.testing.assert_allclose(plain, step)
+    np.testing.assert_allclose(since, STEP, atol=1e-9)
+    assert len(drive.go()) == 1  # odometry is trusted again
+
+
+def test_odometry_that_lost_a_stall_is_right_since_then():
+    drive = Drive()
+    drive.go()
+    for _ in range(4):
+        drive.go(np.zeros(3))
+    np.testing.assert_array_equal(drive.go()[0], STEP)
+    assert len(drive.go()) == 1
+
+
+def test_robot_that_stops_has_stopped():
+    drive = Drive()
+    drive.go()
+    first = drive.go(np.zeros(3), moved=np.zeros(3))
+    assert len(first) == 2  # scans have to say that it does not go on
+    drive.hypotheses.learn(drive.observation(np.zeros(3)), drive.pose)
+    drive.stamp += round(DT * 1e9)
+    assert len(drive.hypotheses.of(drive.observation(np.zeros(3)), np.zeros(3))) == 1
+
+
+def test_step_that_no_robot_makes_is_doubted():
+    drive = Drive()
+    drive.go()
+    found = drive.go(se2.exp(TWIST * 5 * DT), moved=STEP)
+    assert len(found) == 2
+    np.testing.assert_allclose(found[1], STEP, atol=1e-9)
+
+
+def test_pose_that_was_moved_is_not_compared_with_the_one_before():
+    drive = Drive()
+    drive.go()
+    drive.hypotheses.forget()
+    assert len(drive.go(np.zeros(3))) == 1
