@@ -38,7 +38,8 @@ UNREAD: dict[str, tuple[str, ...]] = {
     'reflector_detector.yaml': (
         'motion.scale_error_sigma', 'motion.scale_error_time',
         'map_frame', 'odom_frame', 'local_frame', 'use_scan', 'use_reflectors',
-        'reflector_poses_topic', 'mode', 'map_directory', 'map_file_name', 'map_start_pose',
+        'reflector_poses_topic', 'reflector_markers_topic', 'reflector_beams_topic',
+        'landmarks_topic', 'mode', 'map_directory', 'map_file_name', 'map_start_pose',
         'restore_pose', 'continue_map', 'transform_publish_period', 'map_update_interval',
     ),
 }  # fmt: skip

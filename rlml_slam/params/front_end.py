@@ -141,6 +141,14 @@ class Reflector(Group):
         0.0,
         0.1,
     )
+    muted_sectors: tuple[float, ...] = param(
+        (0.0, 0.0),
+        'bearings in which the detector is muted or sees the robot itself, pairs of begin and end '
+        'counter-clockwise, axes of base_frame: a reflector that is not seen there is not missing',
+        'rad',
+        -6.3,
+        6.3,
+    )
     robust_scale: float = param(
         3.0, 'Cauchy scale of the reflector residual, in sigmas', '', 0.5, 100.0
     )

@@ -30,6 +30,16 @@ class Node(Group, prefix=''):
     reflector_poses_topic: str = param(
         'reflector_poses', 'PoseArray topic of reflector detections'
     )
+    reflector_markers_topic: str = param(
+        'nav_reflectors', 'MarkerArray topic of reflector detections, of sick_scan_xd (NAV350)'
+    )
+    reflector_beams_topic: str = param(
+        'extended_laser_scan',
+        'ExtendedLaserScan topic of sick_safetyscanners2 (nanoScan3): its reflector bit',
+    )
+    landmarks_topic: str = param(
+        'landmark', 'LandmarkList topic, as Cartographer has it, where cartographer_ros_msgs is'
+    )
     max_beams: int = param(20_000, 'a scan with more beams is refused', '', 10, 1_000_000)
     max_reflectors: int = param(
         500,

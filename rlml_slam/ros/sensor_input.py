@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Generic, Protocol, TypeVar
 
 from rlml_slam.errors import InputError
-from rlml_slam.params import Node, Parameters, Reflector
+from rlml_slam.params import Node, Parameters
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.codecs.decode import frame
+from rlml_slam.ros.codecs.device_reflectors import as_poses, is_device
 from rlml_slam.ros.tf import Extrinsics
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.mirror import mirrored_detections, mirrored_scan
@@ -25,12 +26,14 @@ STREAMS: Mapping[str, tuple[str, str, bool]] = {
     'imu': ('imu_topic', 'sensor_msgs/msg/Imu', True),
     'reflectors': ('reflectors_topic', 'sensor_msgs/msg/PointCloud2', False),
     'reflector_poses': ('reflector_poses_topic', 'geometry_msgs/msg/PoseArray', False),
-}
-# streams of reflectors, and what reads their messages
-DETECTIONS: Mapping[str, Callable[[Any, Reflector], Detections]] = {
-    'reflectors': decode.detections,
-    'reflector_poses': decode.detections_of_poses,
-}
+    'reflector_markers': (
+        'reflector_markers_topic', 'visualization_msgs/msg/MarkerArray', False),
+    'reflector_beams': (
+        'reflector_beams_topic', 'sick_safetyscanners2_interfaces/msg/ExtendedLaserScan', False),
+    'landmarks': ('landmarks_topic', 'cartographer_ros_msgs/msg/LandmarkList', False),
+}  # fmt: skip
+# streams of reflectors
+DETECTIONS = ('reflectors', 'reflector_poses', 'reflector_markers', 'reflector_beams', 'landmarks')
 USED_BY = {
     'scan': 'use_scan', 'odom': 'use_odom', 'imu': 'use_imu',
     **dict.fromkeys(DETECTIONS, 'use_reflectors'),
@@ -86,6 +89,8 @@ class SensorInput(Generic[Out]):
     def add(self, stream: str, msg: Any) -> list[Out]:
         """One message of a stream; what became ready by it."""
         try:
+            if is_device(msg):
+                msg = as_poses(msg, self._p.node.max_beams)
             if stream in PLACED:
                 self.is_placed(msg)
             sample = self._converted(stream, msg)
@@ -132,5 +137,6 @@ class SensorInput(Generic[Out]):
         if stream == 'imu':
             up = self.extrinsics.up(self._p.node.base_frame, frame(msg.header.frame_id))
             return decode.imu(msg, up=up)
-        seen = DETECTIONS[stream](msg, self._p.reflector)
+        read = decode.detections_of_poses if hasattr(msg, 'poses') else decode.detections
+        seen = read(msg, self._p.reflector)
         return mirrored_detections(seen) if self.hangs(seen.frame_id) else seen

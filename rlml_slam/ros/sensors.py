@@ -17,6 +17,7 @@ from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, Reliabilit
 from rlml_slam.errors import InputError
 from rlml_slam.params import Parameters
 from rlml_slam.ros.codecs.decode import frame
+from rlml_slam.ros.codecs.device_reflectors import as_poses, is_device
 from rlml_slam.ros.codecs.message_types import rclpy_class
 from rlml_slam.ros.message_guard import guard_of
 from rlml_slam.ros.sensor_input import (
@@ -98,9 +99,11 @@ class Sensors:
 
     def _subscribe(self, node: Any, stream: str, topic: str) -> None:
         index = len(self._queues)
-        self._topics[stream] += 1
         qos = MOTION if stream in ('odom', 'imu') else SENSOR
         kind, callback = rclpy_class(STREAMS[stream][1]), lambda msg: self.receive(index, msg)
+        if kind is None:
+            return  # of a package that is not installed
+        self._topics[stream] += 1
         subscription = node.create_subscription(kind, topic, callback, qos)
         self._queues.append((stream, subscription))
 
@@ -124,7 +127,7 @@ class Sensors:
         The executor serves the queues in turn. After a pause, scans would overtake the odometry
         that is more frequent and lies in the queue beside theirs.
         """
-        self._take({index: [(self._queues[index][0], msg)]})
+        self._take({index: self._plain(self._queues[index][0], msg)})
 
     def _take(self, first: dict[int, list[tuple[str, Any]]]) -> int:
         """Use all that has arrived, ``first`` of each queue before the rest; how many.
@@ -186,8 +189,16 @@ class Sensors:
                 if taken is None:
                     break
                 if taken is not REFUSED:
-                    out.append((stream, taken[0]))
+                    out += self._plain(stream, taken[0])
         return out
+
+    def _plain(self, stream: str, msg: Any) -> list[tuple[str, Any]]:
+        """The message, of a device as a PoseArray; nothing where it cannot be used."""
+        if not is_device(msg):
+            return [(stream, msg)]
+        most = self._p.node.max_beams
+        plain = self._guard.pass_on(stream, lambda: as_poses(msg, most), REFUSED)
+        return [] if plain is REFUSED else [(stream, plain)]
 
     def add(self, stream: str, msg: Any) -> None:
         """One message of a stream."""

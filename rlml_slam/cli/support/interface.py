@@ -49,6 +49,8 @@ TOPICS = (
           'reflectors_topic'),
     Topic('front_end', IN, 'reflector_poses', 'geometry_msgs/PoseArray', SENSOR,
           'the same in its simplest form', 'reflector_poses_topic'),
+    Topic('front_end', IN, 'nav_reflectors', 'visualization_msgs/MarkerArray', SENSOR,
+          'the same as cylinders, of a NAV350 by sick_scan_xd', 'reflector_markers_topic'),
     Topic('front_end', IN, 'initialpose', POSE, RELIABLE, 'restart at this pose of the map'),
     Topic('front_end', IN, 'rlml/graph_correction', CLOUD, RELIABLE,
           'of the back end: the local frame in the map, and the newest pose and the reflectors '
@@ -141,6 +143,8 @@ TOPICS = (
           'reflectors_topic'),
     Topic('deformable_slam', IN, 'reflector_poses', 'geometry_msgs/PoseArray', SENSOR,
           'the same in its simplest form', 'reflector_poses_topic'),
+    Topic('deformable_slam', IN, 'nav_reflectors', 'visualization_msgs/MarkerArray', SENSOR,
+          'the same as cylinders, of a NAV350 by sick_scan_xd', 'reflector_markers_topic'),
     Topic('deformable_slam', IN, 'carrier_velocity', 'geometry_msgs/TwistStamped', SENSOR,
           "the carrier's nominal velocity from the stamp on, in the axes of the map (or no "
           'frame) or of the base'),

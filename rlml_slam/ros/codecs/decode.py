@@ -158,7 +158,7 @@ def detections(msg: Any, noise: Reflector, topic: str = 'reflectors') -> Detecti
 
 
 def detections_of_poses(msg: Any, noise: Reflector, topic: str = 'reflector_poses') -> Detections:
-    """PoseArray of anonymous reflectors; only the positions are read."""
+    """PoseArray of reflectors, anonymous but for ``ids``; only the positions are read."""
     points = np.array([[p.position.x, p.position.y] for p in msg.poses], dtype=np.float64)
     points = points.reshape(-1, 2)
     bounded(points, f'{topic}: a position', FARTHEST)
@@ -169,7 +169,7 @@ def detections_of_poses(msg: Any, noise: Reflector, topic: str = 'reflector_pose
         frame(msg.header.frame_id),
         points,
         polar_covariance(points, sigma_r, sigma_b, noise.sigma_fallback),
-        np.full(n, ANONYMOUS, dtype=np.int64),
+        getattr(msg, 'ids', np.full(n, ANONYMOUS, dtype=np.int64)),
         np.full(n, np.nan),
     )
 

@@ -19,7 +19,7 @@ from rlml_slam.slam.front_end.inactive_landmarks import InactiveLandmarks
 from rlml_slam.slam.front_end.joint_state import JointState
 from rlml_slam.slam.front_end.map_window import MapWindow
 from rlml_slam.slam.front_end.reflector_update import use_reflectors
-from rlml_slam.slam.landmarks.visibility import expected
+from rlml_slam.slam.landmarks.visibility import expected, sectors
 from rlml_slam.types import ANONYMOUS, Belief, Detections, Observation, Reflectors, Status
 
 NONE = np.zeros(0, dtype=np.int64)
@@ -84,6 +84,7 @@ class ReflectorTerm:
         r = params.reflector
         self._inactive = InactiveLandmarks(r.max_range, r.min_sightings)
         self._max_range_seen = 0.0
+        self._muted = sectors(self._p.reflector.muted_sectors)
 
     def use_map(self, reflectors: Reflectors) -> None:
         """Use the reflectors of a saved map (map frame), and no others."""
@@ -204,7 +205,7 @@ class ReflectorTerm:
         due: NDArray[np.bool_] = self.tracks.confirmed(self._p.reflector.min_sightings)
         due &= expected(
             self._state.pose, self._state.landmarks(), observation.points, observation.origin,
-            self._max_range_seen,
+            self._max_range_seen, self._muted,
         )  # fmt: skip
         seen = set(self.tracks.keys[due].tolist()).intersection(matches.keys[used].tolist())
         return int(due.sum()), len(seen)

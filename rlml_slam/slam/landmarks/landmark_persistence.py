@@ -31,7 +31,7 @@ from rlml_slam.se2 import Array
 from rlml_slam.slam.keyframes import Interval, Keyframe
 from rlml_slam.slam.landmarks.landmark import Cell, Landmark
 from rlml_slam.slam.landmarks.reflector_graph import ReflectorGraph
-from rlml_slam.slam.landmarks.visibility import expected
+from rlml_slam.slam.landmarks.visibility import expected, sectors
 
 CELL = 0.5  # [m] side of a cell, and travel between two misses that count as independent
 NEW_UNTIL = 30  # detections after which it is decided whether a reflector is new
@@ -55,6 +55,7 @@ class LandmarkPersistence:
     def __init__(self, params: Parameters, graph: Graph, reflectors: ReflectorGraph) -> None:
         p = params.reflector
         self._p = p
+        self._muted = sectors(p.muted_sectors)
         self._missing = params.relocalization.missed_share
         self._empty = min(p.unmapped_density * math.pi * p.min_separation**2, 0.5)
         self._graph = graph
@@ -79,7 +80,7 @@ class LandmarkPersistence:
         missed = known & ~seen & ~near
         if missed.any():
             scan = key.points.astype(np.float64)
-            missed &= expected(pose, places, scan, key.origin, math.inf)
+            missed &= expected(pose, places, scan, key.origin, math.inf, self._muted)
         # where most are missed, the pose or the detector is wrong
         if seen.sum() < max(1, missed.sum()):
             return ()
@@ -153,7 +154,8 @@ class LandmarkPersistence:
                 continue
             if k.points is not None and k.origin is not None:
                 scan = k.points.astype(np.float64)
-                num_missed += bool(expected(pose, place, scan, k.origin, math.inf)[0])
+                due = expected(pose, place, scan, k.origin, math.inf, self._muted)
+                num_missed += bool(due[0])
         return bool(self._missing**num_missed < self._p.persistence_threshold)
 
 

@@ -8,29 +8,47 @@ direction ended at it, or behind it. Without such a beam it is not expected.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
 from rlml_slam.compiled import kernel
+from rlml_slam.errors import ParameterError
 from rlml_slam.se2 import Array
 
 BEAM = 0.02  # [rad] between a beam and a reflector that it may hit: half a coarse scanner's step
 DEPTH = 0.3  # [m] a beam that ends this far before a reflector is blocked, with the pose's error
+NONE = np.zeros((0, 2))
 SHARE = 0.9  # of the largest range at which one was seen: beyond, it may be missed
 
 
+def sectors(bearings: Sequence[float]) -> Array:
+    """Pairs (k, 2) of begin and end of muted sectors [rad]. Raises ParameterError if odd."""
+    if len(bearings) % 2:
+        raise ParameterError(
+            f'reflector.muted_sectors has {len(bearings)} bearings: pairs of begin and end are '
+            'needed'
+        )
+    return np.array(bearings, dtype=np.float64).reshape(-1, 2)
+
+
 def expected(
-    pose: Array, reflectors: Array, points: Array, origin: Array, max_range: float
-) -> NDArray[np.bool_]:
+    pose: Array, reflectors: Array, points: Array, origin: Array, max_range: float,
+    muted: Array = NONE,
+) -> NDArray[np.bool_]:  # fmt: skip
     """Whether each of ``reflectors`` (m, 2) should be seen from ``pose`` (3,), as booleans (m,).
 
     ``points`` (n, 2) are the end points of a scan from ``origin`` (2,), both in the base frame;
-    ``max_range`` [m] is the largest range at which a reflector was seen so far.
+    ``max_range`` [m] is the largest range at which a reflector was seen so far; ``muted`` (k, 2)
+    are sectors of the detector that say nothing.
     """
     place = se2.transform(se2.inverse(pose), reflectors) - origin
     out: NDArray[np.bool_] = _is_visible(place, points, origin, SHARE * max_range)
+    bearing = np.arctan2(place[:, 1], place[:, 0])
+    for begin, end in muted:
+        out &= np.mod(bearing - begin, 2.0 * math.pi) > np.mod(end - begin, 2.0 * math.pi)
     return out
 
 

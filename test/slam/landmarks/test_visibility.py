@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reflectors that should be seen and are not: said where nothing hides them, and nowhere else."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from made_worlds import ROOM, drive, observations
 
+from rlml_slam.errors import ParameterError
 from rlml_slam.params import Parameters
 from rlml_slam.slam.front_end.front_end import FrontEnd
-from rlml_slam.slam.landmarks.visibility import expected
+from rlml_slam.slam.landmarks.visibility import expected, sectors
 from rlml_slam.types import Level
 
 ORIGIN = np.array([0.2, 0.0])
@@ -64,3 +67,23 @@ def test_reflectors_that_are_no_longer_detected_degrade_the_health():
 def test_nothing_is_said_where_all_is_seen_or_no_one_looks():
     for change in (lambda o: o, lambda o: replace(o, detections=None)):
         assert not any('expected' in r for h in healths(change) for r in h.reasons)
+
+
+@pytest.mark.parametrize(
+    ('muted', 'due'),
+    [((0.0, 0.0), [True, True]), ((-0.3, 0.3), [False, True]), ((0.3, -0.3), [True, False]),
+     ((2.8, -2.8), [True, False]), ((-4.0, 0.1, 3.0, 3.3), [False, False])],
+)  # fmt: skip
+def test_nothing_is_expected_in_a_muted_sector(muted, due):
+    a = np.linspace(-np.pi, np.pi, 720)
+    scan = 6.0 * np.stack([np.cos(a), np.sin(a)], -1)
+    ahead_and_behind = np.array([[4.0, 0.0], [-4.0, 0.0]])
+    out = expected(
+        np.zeros(3), ahead_and_behind, scan, np.zeros(2), math.inf, sectors(muted)
+    )  # fmt: skip
+    assert out.tolist() == due
+
+
+def test_sectors_are_pairs():
+    with pytest.raises(ParameterError, match='3 bearings: pairs of begin and end'):
+        sectors((0.0, 1.0, 2.0))
