@@ -2,6 +2,8 @@
 """Package description for colcon (ament_python) and pip alike."""
 
 from glob import glob
+from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
@@ -11,14 +13,19 @@ NODES = (
     'carrier_simulator', 'ekf_slam', 'reflector_detector',
 )  # fmt: skip
 
+ABOUT = ElementTree.parse(Path(__file__).with_name('package.xml')).getroot()
+PEOPLE = ABOUT.findall('maintainer')
+
 setup(
     name=NAME,
-    version='0.1.0',
-    description='2D localization and SLAM with retro-reflective markers and a 2D laser',
-    author='rlml_slam maintainers',
-    maintainer='rlml_slam maintainers',
-    maintainer_email='maintainers@rlml-slam.invalid',
-    license='Apache-2.0',
+    version=ABOUT.findtext('version'),
+    description=ABOUT.findtext('description'),
+    author=', '.join(p.text for p in PEOPLE),
+    maintainer=', '.join(p.text for p in PEOPLE),
+    maintainer_email=', '.join(p.get('email') for p in PEOPLE),
+    url=ABOUT.findtext("url[@type='website']"),
+    project_urls={u.get('type'): u.text for u in ABOUT.findall('url')},
+    license=ABOUT.findtext('license'),
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
     package_data={NAME: ['py.typed', 'simulation/worlds/*.yaml']},
@@ -26,6 +33,7 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
         (f'share/{NAME}/config', sorted(glob('config/*'))),
+        (f'share/{NAME}/launch', sorted(glob('launch/*.launch.py'))),
     ],
     install_requires=[
         'matplotlib',

@@ -141,8 +141,18 @@ def test_lists_are_checked_for_length_and_range(name, value, why):
 
 def test_versions_agree():
     described = ElementTree.parse(ROOT / 'package.xml').getroot().findtext('version')
-    (installed,) = re.findall(r"version='([^']+)'", (ROOT / 'setup.py').read_text())
-    assert described == installed == __version__
+    assert described == __version__
+    assert 'package.xml' in (ROOT / 'setup.py').read_text()  # where it reads what it installs
+
+
+def test_people_and_addresses_are_written_once():
+    about = ElementTree.parse(ROOT / 'package.xml').getroot()
+    people = [p.get('email') for p in about.findall('maintainer')]
+    assert people
+    assert {u.get('type') for u in about.findall('url')} == {'website', 'repository', 'bugtracker'}
+    for file in ('setup.py', 'README.md', 'QUALITY_DECLARATION.md', 'CONTRIBUTING.md'):
+        text = (ROOT / file).read_text(encoding='utf-8')
+        assert not [address for address in people if address in text], file
 
 
 def test_every_executable_exists_and_every_node_is_one():

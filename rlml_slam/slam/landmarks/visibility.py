@@ -48,7 +48,7 @@ def expected(
     out: NDArray[np.bool_] = _is_visible(place, points, origin, SHARE * max_range)
     bearing = np.arctan2(place[:, 1], place[:, 0])
     for begin, end in muted:
-        out &= np.mod(bearing - begin, 2.0 * math.pi) > np.mod(end - begin, 2.0 * math.pi)
+        out &= np.mod(bearing - begin, 2.0 * math.pi) >= np.mod(end - begin, 2.0 * math.pi)
     return out
 
 
