@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import PointCloud2
 
 from rlml_slam import warm_up
@@ -19,11 +21,11 @@ from rlml_slam.ros.back_end.map_services import MapServices
 from rlml_slam.ros.back_end.mapper import Mapper
 from rlml_slam.ros.back_end.user_requests import UserRequests
 from rlml_slam.ros.codecs import decode
-from rlml_slam.ros.codecs.frame_messages import FrameAssembler, read_points, read_record
-from rlml_slam.ros.codecs.reflector_clouds import read_associated
+from rlml_slam.ros.codecs.frame_messages import POINT, FrameAssembler, read_points, read_record
+from rlml_slam.ros.codecs.reflector_clouds import ASSOCIATED, read_associated
 from rlml_slam.ros.declare import declare
 from rlml_slam.ros.diagnostics import HealthPublisher
-from rlml_slam.ros.message_guard import checked
+from rlml_slam.ros.message_guard import SMALL, Listener
 from rlml_slam.ros.run import run
 from rlml_slam.slam.conversation import FrontEndCommand, SessionFrame
 
@@ -34,8 +36,7 @@ SETTLE_PERIOD = 0.1  # [s] between two looks whether the input has fallen silent
 class BackEndNode(Node):
     """Joins the front end's messages by stamp and gives the frames to the mapper.
 
-    With a front end in the same process, ``command`` takes the commands for it, and its frames
-    come by ``take``, as they are.
+    A front end in the same process gets its commands by ``command``, and gives frames to ``take``.
     """
 
     def __init__(
@@ -57,17 +58,20 @@ class BackEndNode(Node):
         self.create_timer(SETTLE_PERIOD, self.mapper.settle, clock=steady)
 
     def _subscribe(self) -> None:
-        join, stamp = self.join, decode.stamp
-        self._listen('rlml/frames', lambda m: join.add_record(read_record(m)))
-        self._listen('deskewed_points', lambda m: join.add_points(stamp(m, ''), read_points(m)))
-        self._listen('reflectors/associated', lambda m: join.add_associated(read_associated(m)))
+        join, n = self.join, self.params.node
+        for topic, largest, add in (
+            ('rlml/frames', 0, lambda m: join.add_record(read_record(m))),
+            ('deskewed_points', n.max_beams * POINT.itemsize,
+             lambda m: join.add_points(decode.stamp(m, 'deskewed_points'), read_points(m))),
+            ('reflectors/associated', n.max_reflectors * ASSOCIATED.itemsize,
+             lambda m: join.add_associated(read_associated(m))),
+        ):  # fmt: skip
+            use = partial(self._take_all, add)
+            Listener(self, PointCloud2, topic, use, QoSProfile(depth=DEPTH), SMALL + largest)
 
-    def _listen(self, topic: str, add: Callable[[Any], list[SessionFrame]]) -> None:
-        def callback(msg: Any) -> None:
-            for record in add(msg):
-                self.take(record)
-
-        self.create_subscription(PointCloud2, topic, checked(self, topic, callback), DEPTH)
+    def _take_all(self, add: Callable[[Any], list[SessionFrame]], msg: Any) -> None:
+        for record in add(msg):
+            self.take(record)
 
     def take(self, record: SessionFrame) -> None:
         """Give a whole frame to the mapper."""
@@ -76,12 +80,10 @@ class BackEndNode(Node):
 
     def figures(self) -> dict[str, object]:
         """Figures for /diagnostics."""
-        refused = self.map_services.refused
         return {
-            **figures(self.mapper),
+            **figures(self.mapper), **self.map_services.figures(),
             'frames without their points or detections': self.join.incomplete,
-            **({} if not refused else {'last refused request': refused}),
-        }
+        }  # fmt: skip
 
     def destroy_node(self) -> None:
         """Finish the running jobs first."""

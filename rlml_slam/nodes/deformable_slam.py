@@ -17,7 +17,7 @@ from rlml_slam.params import DeformableParameters, Parameters
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.declare import declare
 from rlml_slam.ros.diagnostics import HealthPublisher
-from rlml_slam.ros.message_guard import checked
+from rlml_slam.ros.message_guard import Listener
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensor_input import STREAMS
 from rlml_slam.ros.sensors import RELIABLE, Sensors
@@ -45,12 +45,7 @@ class DeformableSlamNode(Node):
         streams = [s for s in STREAMS if s != 'scan']
         self.sensors = Sensors(self, shared, streams, self.process, self.restart)
         self.health = HealthPublisher(self, self.sensors, self.figures)
-        self.create_subscription(
-            PoseWithCovarianceStamped,
-            'initialpose',
-            checked(self, 'initialpose', self.start_at),
-            RELIABLE,
-        )
+        Listener(self, PoseWithCovarianceStamped, 'initialpose', self.start_at, RELIABLE)
 
     def process(self, observation: Observation) -> None:
         """One observation: estimate and publish."""

@@ -19,7 +19,7 @@ from rlml_slam.ros.declare import declare
 from rlml_slam.ros.diagnostics import HealthPublisher
 from rlml_slam.ros.front_end.frame_publisher import FramePublisher
 from rlml_slam.ros.map_publisher import TOPICS, MapPublisher
-from rlml_slam.ros.message_guard import checked
+from rlml_slam.ros.message_guard import Listener
 from rlml_slam.ros.odom_frame import OdomFrame
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensor_input import STREAMS
@@ -47,8 +47,7 @@ class EkfSlamNode(Node):
         self.odom = OdomFrame()  # in the map, which is the filter's local frame
         self.sensors = Sensors(self, self.params, STREAMS, self.process, self.restart)
         self.health = HealthPublisher(self, self.sensors)
-        start = checked(self, 'initialpose', self.start_at)
-        self.create_subscription(PoseWithCovarianceStamped, 'initialpose', start, RELIABLE)
+        Listener(self, PoseWithCovarianceStamped, 'initialpose', self.start_at, RELIABLE)
         self.restart()
 
     def process(self, observation: Observation) -> None:

@@ -17,9 +17,10 @@ from rlml_slam import warm_up
 from rlml_slam.params import SimulatorParameters
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.declare import declare
-from rlml_slam.ros.message_guard import checked
+from rlml_slam.ros.message_guard import Listener
 from rlml_slam.ros.playback_clock import PlaybackClock
 from rlml_slam.ros.run import run
+from rlml_slam.ros.sensors import RELIABLE
 from rlml_slam.ros.systems.simulator_messages import SimulatedTopics
 from rlml_slam.simulation.robot import SECOND
 from rlml_slam.simulation.simulation import START, STEP, Simulation
@@ -42,9 +43,7 @@ class SimulatorNode(Node):
         self._pace: PlaybackClock | None = None
         self._finished: float | None = None
         if n.drive == 'cmd_vel':
-            self.create_subscription(
-                Twist, 'cmd_vel', checked(self, 'cmd_vel', self.on_cmd_vel), 10
-            )
+            Listener(self, Twist, 'cmd_vel', self.on_cmd_vel, RELIABLE)
         warm_up.compile_loaded()
         # steady timers: with use_sim_time, a ROS timer would wait for this node's own clock
         steady = Clock(clock_type=ClockType.STEADY_TIME)

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one place that every message of a node passes: one that cannot be used costs only itself."""
+"""The one place that every message of a node passes: one that cannot be used costs only itself.
+
+Subscriptions get bytes. Their number is compared with what the topic may have before a message is
+made of them: 100 000 poses are in memory in a millisecond, and take rclpy two seconds.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +11,17 @@ import re
 import traceback
 from collections import Counter
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 from rlml_slam.errors import InputError
 
+if TYPE_CHECKING:
+    from rclpy.qos import QoSProfile
+
 MAX_LOGGED = 100  # different reasons in the log; /diagnostics count all refusals
+SMALL = 65_536  # [bytes] of a message without lists: a pose, odometry, a command
+LARGE = 1 << 28  # [bytes] of a map and of what belongs to it
 NUMBERS = re.compile(r'[-+]?\d[\d.e+-]*|nan|inf')
 
 
@@ -22,6 +32,7 @@ class MessageGuard:
         self._logger = logger
         self._logged: set[tuple[str, str]] = set()
         self.refused: Counter[str] = Counter()  # by topic
+        self.unexpected: Counter[str] = Counter()  # of these, by error: each is a bug
         self.last = ''
 
     def pass_on(self, topic: str, use: Callable[[], Any], otherwise: Any = None) -> Any:
@@ -37,6 +48,8 @@ class MessageGuard:
     def report(self, topic: str, error: BaseException) -> None:
         """Count an error that nobody expected, with the message of a topic that it came from."""
         reason = f'{topic}: {type(error).__name__}: {error}'
+        if len(self.unexpected) < MAX_LOGGED:
+            self.unexpected[reason[:200]] += 1
         self.refuse(topic, reason, ''.join(traceback.format_exception(error)))
 
     def refuse(self, topic: str, reason: str, trace: str = '') -> None:
@@ -68,7 +81,57 @@ def guard_of(node: Any) -> MessageGuard:
     return found
 
 
-def checked(node: Any, topic: str, callback: Callable[[Any], None]) -> Callable[[Any], None]:
-    """The callback, which counts a message that cannot be used instead of raising."""
-    guard = guard_of(node)
-    return lambda msg: guard.pass_on(topic, lambda: callback(msg))
+class Listener:
+    """A subscription; ``use`` gets each message of at most ``largest`` bytes that can be read.
+
+    ``options`` are those of rclpy's create_subscription.
+    """
+
+    def __init__(
+        self, node: Any, kind: Any, topic: str, use: Callable[[Any], None], qos: QoSProfile,
+        largest: int = SMALL, **options: Any,
+    ) -> None:  # fmt: skip
+        self._guard = guard_of(node)
+        self._kind, self._topic, self._use, self._largest = kind, topic, use, largest
+        self._depth = qos.depth
+        self._subscription = node.create_subscription(
+            kind, topic, self.receive, qos, raw=True, **options
+        )
+
+    @property
+    def topic_name(self) -> str:
+        """The topic as it is after remapping."""
+        return str(self._subscription.topic_name)
+
+    def receive(self, data: bytes) -> None:
+        """Use one serialized message, or count it as refused."""
+        self._guard.pass_on(self._topic, lambda: self._use(self._decoded(data)))
+
+    def accept(self, msg: Any) -> None:
+        """The same for a message."""
+        self._guard.pass_on(self._topic, lambda: self._use(msg))
+
+    def drained(self) -> list[Any]:
+        """All messages that lie in the queue, in order of arrival."""
+        out: list[Any] = []
+        handle = self._subscription.handle
+        with handle:
+            for _ in range(self._depth):
+                taken = handle.take_message(self._kind, True)
+                if taken is None:
+                    break
+                msg = self._guard.pass_on(self._topic, partial(self._decoded, taken[0]))
+                if msg is not None:
+                    out.append(msg)
+        return out
+
+    def _decoded(self, data: bytes) -> Any:
+        from rclpy.serialization import deserialize_message
+
+        topic, kind = self._topic, self._kind.__name__
+        if len(data) > self._largest:
+            raise InputError(f'{topic}: {len(data)} bytes, more than {self._largest} of a {kind}')
+        try:
+            return deserialize_message(data, self._kind)
+        except Exception as e:
+            raise InputError(f'{topic}: {len(data)} bytes that are no {kind}') from e

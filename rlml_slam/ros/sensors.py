@@ -15,11 +15,11 @@ from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
 from rlml_slam.errors import InputError
-from rlml_slam.params import Parameters
+from rlml_slam.params import Node, Parameters
 from rlml_slam.ros.codecs.decode import frame
 from rlml_slam.ros.codecs.device_reflectors import as_poses, is_device
 from rlml_slam.ros.codecs.message_types import rclpy_class
-from rlml_slam.ros.message_guard import guard_of
+from rlml_slam.ros.message_guard import SMALL, Listener, guard_of
 from rlml_slam.ros.sensor_input import (
     PLACED,
     STREAMS,
@@ -40,10 +40,16 @@ DEPTH = 200
 MOTION_DEPTH = 2000
 SENSOR = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 MOTION = QoSProfile(depth=MOTION_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+LONG_AGO = -(1 << 62)  # [ns]: a transform that was waited for
 PATIENCE = 5.0  # [s] of the wall clock, after which missing inputs are named in the log
 SILENCE = 1.0  # [s] of the wall clock without any message, after which nothing more is waited for
 MAX_SENSORS = 100  # whose frames are remembered
-REFUSED = ('',)  # in the place of a message that cannot be taken
+REFUSED = ('',)  # in the place of what a message would have given
+# [bytes] of a beam or reflector in a message, with whatever else a driver says of it
+BYTES = {
+    'scan': 8, 'reflectors': 256, 'reflector_poses': 56, 'reflector_markers': 1024,
+    'reflector_beams': 16, 'landmarks': 256,
+}  # fmt: skip
 # the back end says with it that it runs, so that a front end notices where it does not
 LEASE = 1.0  # [s]
 ALIVE = QoSProfile(
@@ -85,7 +91,7 @@ class Sensors:
         self._held: list[tuple[str, Any]] = []
         self._frames: defaultdict[str, set[str]] = defaultdict(set)  # of sensors, by stream
         self._topics: Counter[str] = Counter()  # by stream
-        self._queues: list[tuple[str, Any]] = []
+        self._queues: list[tuple[str, Listener]] = []
         self._heard = self._began = time.monotonic()
         self._told: set[str] = set()
         for stream in streams:
@@ -100,12 +106,12 @@ class Sensors:
     def _subscribe(self, node: Any, stream: str, topic: str) -> None:
         index = len(self._queues)
         qos = MOTION if stream in ('odom', 'imu') else SENSOR
-        kind, callback = rclpy_class(STREAMS[stream][1]), lambda msg: self.receive(index, msg)
+        kind, use = rclpy_class(STREAMS[stream][1]), lambda msg: self.receive(index, msg)
         if kind is None:
             return  # of a package that is not installed
         self._topics[stream] += 1
-        subscription = node.create_subscription(kind, topic, callback, qos)
-        self._queues.append((stream, subscription))
+        listener = Listener(node, kind, topic, use, qos, largest(self._p.node, stream))
+        self._queues.append((stream, listener))
 
     def _begin(self, extrinsics: Extrinsics) -> None:
         self.synchronizer = Synchronizer(self._p)
@@ -155,8 +161,8 @@ class Sensors:
     def problems(self) -> tuple[str, ...]:
         """Sensors of which there is one, and that several nodes publish."""
         out = []
-        for stream, subscription in self._queues:
-            found = self._node.get_publishers_info_by_topic(subscription.topic_name)
+        for stream, listener in self._queues:
+            found = self._node.get_publishers_info_by_topic(listener.topic_name)
             if stream in ('odom', 'imu') and len(found) > 1:
                 names = sorted(f'{i.node_namespace.rstrip("/")}/{i.node_name}' for i in found)
                 out.append(f'{stream} has {len(found)} publishers: {", ".join(names)}')
@@ -180,17 +186,8 @@ class Sensors:
 
     def _taken(self, index: int) -> list[tuple[str, Any]]:
         """Everything in a queue, in order of arrival."""
-        stream, subscription = self._queues[index]
-        out: list[tuple[str, Any]] = []
-        handle, kind = subscription.handle, (subscription.msg_type, subscription.raw)
-        with handle:
-            for _ in range(MOTION_DEPTH):
-                taken = self._guard.pass_on(stream, lambda: handle.take_message(*kind), REFUSED)
-                if taken is None:
-                    break
-                if taken is not REFUSED:
-                    out += self._plain(stream, taken[0])
-        return out
+        stream, listener = self._queues[index]
+        return [item for msg in listener.drained() for item in self._plain(stream, msg)]
 
     def _plain(self, stream: str, msg: Any) -> list[tuple[str, Any]]:
         """The message, of a device as a PoseArray; nothing where it cannot be used."""
@@ -215,7 +212,7 @@ class Sensors:
         if unknown and not late and len(self._held) < DEPTH:
             return
         for sensor in unknown:
-            self._since.setdefault(sensor, 0)
+            self._since.setdefault(sensor, LONG_AGO)
         self._release()
 
     def stop_waiting(self) -> None:
@@ -281,6 +278,13 @@ class Sensors:
         self._tell_of_refused()
         for observation in observations:
             self._handle(observation)
+
+
+def largest(params: Node, stream: str) -> int:
+    """Bytes that a message of a stream may have."""
+    has_beams = stream in ('scan', 'reflector_beams')
+    most = params.max_beams if has_beams else params.max_reflectors
+    return SMALL + most * BYTES.get(stream, 0)
 
 
 def _stamp(msg: Any) -> int:

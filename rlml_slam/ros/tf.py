@@ -17,11 +17,12 @@ from rlml_slam.errors import InputError
 from rlml_slam.ros.codecs import decode, encode
 from rlml_slam.ros.codecs.decode import Transform
 from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
-from rlml_slam.ros.message_guard import guard_of
+from rlml_slam.ros.message_guard import Listener, guard_of
 from rlml_slam.se2 import Array
 
 TF_MESSAGE = 'tf2_msgs/msg/TFMessage'
 MAX_FRAMES = 10_000  # on /tf_static; robots have some hundred
+MAX_BYTES = 1 << 18  # of a message: some 2000 transforms
 HALF_TURN = np.diag([1.0, -1.0, -1.0])  # about the x axis
 
 
@@ -149,5 +150,5 @@ def subscribe_static(node: Any, extrinsics: Extrinsics) -> bool:
         for transform in msg.transforms:  # each by itself: a bad one costs none of the others
             guard.pass_on('/tf_static', partial(take_one, transform))
 
-    node.create_subscription(kind, '/tf_static', take, latched)
+    Listener(node, kind, '/tf_static', take, latched, MAX_BYTES)
     return True

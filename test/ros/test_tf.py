@@ -76,10 +76,12 @@ def test_later_transform_replaces_the_earlier():
 
 def test_bad_static_transform_costs_only_itself(monkeypatch):
     pytest.importorskip('rclpy')
-    monkeypatch.setattr(tf, 'rclpy_class', lambda name: object)
     hear, said = {}, []
+    monkeypatch.setattr(tf, 'rclpy_class', lambda name: object)
+    monkeypatch.setattr(
+        tf, 'Listener', lambda node, kind, topic, use, *_: hear.update({topic: use})
+    )
     node = SimpleNamespace(
-        create_subscription=lambda kind, topic, callback, qos: hear.update({topic: callback}),
         get_logger=lambda: SimpleNamespace(warning=said.append),
     )
     tree = Extrinsics()

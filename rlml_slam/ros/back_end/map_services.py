@@ -79,6 +79,10 @@ class MapServices:
 
         return call
 
+    def figures(self) -> dict[str, object]:
+        """Figures for /diagnostics."""
+        return {'last refused request': self.refused} if self.refused else {}
+
     def save_map(self, _request: Any, response: Any) -> None:
         """Write the map under map_file_name."""
         save = self._requests.save

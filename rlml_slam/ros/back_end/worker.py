@@ -39,7 +39,6 @@ class Worker:
 
     def submit(self, job: Callable[[], Any]) -> Future[Any]:
         """Run ``job`` after all that were given before."""
-        self.check()
         self._given += 1
         future = self._pool.submit(job)
         future.add_done_callback(self._finish)

@@ -29,8 +29,9 @@ MAX_VARIANCE = 1e6  # [m^2], [rad^2] of a start: from 1e9 or so, updates lose al
 _ROUNDING = 1e-9  # of the largest variance
 LARGEST_VARIANCE = 1e15  # [m^2], [rad^2] of what another node of this package sends
 LARGEST_SIGMA = 100.0  # [m], [rad] of a detection
-FASTEST_TURN = 1e3  # [rad/s]
+FASTEST = 1e3  # [m/s], [rad/s]
 FARTHEST = 1e4  # [m] beyond any laser
+LARGE = 50  # rows of a covariance whose eigenvalues are not computed
 _NEAR = 1e-3  # [m] nearer than this a bearing has no meaning
 
 
@@ -61,8 +62,14 @@ def covariances(cov: Array, where: str) -> None:
     symmetric = 0.5 * (cov + np.swapaxes(cov, -1, -2))
     if np.abs(cov - symmetric).max(initial=0.0) > 1e-4 * most:
         raise InputError(f'{where} is not symmetric')
-    if np.linalg.eigvalsh(symmetric).min(initial=0.0) < -1e-4 * most:
-        raise InputError(f'{where} has an eigenvalue below 0')
+    if cov.shape[-1] > LARGE:  # of a map: eigenvalues would take seconds, pairs take milliseconds
+        variances = np.diagonal(symmetric, axis1=-2, axis2=-1)
+        limit = variances[..., None] * variances[..., None, :] + (1e-4 * most) ** 2
+        wrong = (variances < -1e-4 * most).any() or (symmetric**2 > limit).any()
+    else:
+        wrong = np.linalg.eigvalsh(symmetric).min(initial=0.0) < -1e-4 * most
+    if wrong:
+        raise InputError(f'{where} is not positive semidefinite')
 
 
 def frame(frame_id: str) -> str:
@@ -121,7 +128,7 @@ def imu(msg: Any, topic: str = 'imu', up: Array | None = None) -> Imu:
         raise InputError(f'{topic}: angular_velocity is marked as not measured')
     w = np.array([msg.angular_velocity.x, msg.angular_velocity.y, msg.angular_velocity.z])
     used = w[2:] if up is None else w
-    bounded(used, f'{topic}: angular_velocity', FASTEST_TURN)
+    bounded(used, f'{topic}: angular_velocity', FASTEST)
     return Imu(stamp(msg, topic), float(w[2] if up is None else up @ w))
 
 
@@ -242,8 +249,7 @@ def twist(msg: Any, topic: str = 'cmd_vel') -> tuple[float, float]:
     """Speed [m/s] and turn rate [rad/s] of a Twist or TwistStamped."""
     t = getattr(msg, 'twist', msg)
     v, w = float(t.linear.x), float(t.angular.z)
-    if not np.isfinite([v, w]).all():
-        raise InputError(f'{topic}: twist is not finite')
+    bounded((v, w), f'{topic}: twist', FASTEST)
     return v, w
 
 

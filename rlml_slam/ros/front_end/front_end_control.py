@@ -20,7 +20,7 @@ from rlml_slam.ros.codecs.correction_message import read_correction
 from rlml_slam.ros.codecs.message_types import rclpy_class
 from rlml_slam.ros.codecs.reflector_clouds import read_reflector_map
 from rlml_slam.ros.codecs.request_message import read_request
-from rlml_slam.ros.message_guard import checked
+from rlml_slam.ros.message_guard import LARGE, SMALL, Listener
 from rlml_slam.ros.sensors import ALIVE, LATCHED, LEASE, RELIABLE
 from rlml_slam.slam.conversation import FrontEndCommand, LocalizeIn
 from rlml_slam.slam.front_end_session import FrontEndSession
@@ -50,22 +50,20 @@ class FrontEndControl:
         self._arrival = node.create_guard_condition(self.carry_out)
         self._grids: dict[int, OccupancyGrid | None] = {}
         self._reflectors: dict[int, Reflectors | None] = {}
-        topics: tuple[tuple[str, str, Callable[[Any], None], Any], ...] = (
-            (CLOUD, 'rlml/graph_correction', self.on_correction, ALIVE),
-            (CLOUD, 'rlml/session_start', self.on_request, RELIABLE),
-            (GRID, 'rlml/localization_grid', self.on_grid, LATCHED),
-            (CLOUD, 'rlml/localization_map', self.on_map, LATCHED),
+        topics: tuple[tuple[str, str, Callable[[Any], None], Any, int], ...] = (
+            (CLOUD, 'rlml/graph_correction', self.on_correction, ALIVE, LARGE),
+            (CLOUD, 'rlml/session_start', self.on_request, RELIABLE, SMALL),
+            (GRID, 'rlml/localization_grid', self.on_grid, LATCHED, LARGE),
+            (CLOUD, 'rlml/localization_map', self.on_map, LATCHED, LARGE),
         )
         self._absent: float | None = None if has_back_end else time.monotonic()
-        for kind, topic, callback, qos in (
-            (POSE, 'initialpose', self.start_at, RELIABLE),
+        for kind, topic, use, qos, largest in (
+            (POSE, 'initialpose', self.start_at, RELIABLE, SMALL),
             *(() if has_back_end else topics),
         ):
             events = SubscriptionEventCallbacks(liveliness=self._on_liveliness)
-            node.create_subscription(
-                rclpy_class(kind), topic, checked(node, topic, callback), qos,
-                event_callbacks=events if qos is ALIVE else None,
-            )  # fmt: skip
+            options = {'event_callbacks': events} if qos is ALIVE else {}
+            Listener(node, rclpy_class(kind), topic, use, qos, largest, **options)
 
     def _on_liveliness(self, event: Any) -> None:
         """A back end has come, or gives no sign any more."""

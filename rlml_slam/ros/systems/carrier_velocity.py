@@ -9,8 +9,8 @@ from typing import Any
 from rlml_slam.deformable.window import CarrierVelocity
 from rlml_slam.params import Node
 from rlml_slam.ros.codecs.message_types import rclpy_class
-from rlml_slam.ros.message_guard import checked, guard_of
-from rlml_slam.ros.sensors import DEPTH, REFUSED, SENSOR
+from rlml_slam.ros.message_guard import Listener
+from rlml_slam.ros.sensors import SENSOR
 from rlml_slam.ros.systems.deformable_messages import read_velocity
 
 
@@ -24,26 +24,13 @@ class VelocityInput:
     def __init__(
         self, node: Any, params: Node, announce: Callable[[int, CarrierVelocity, bool], None]
     ) -> None:
-        self._guard, topic = guard_of(node), 'carrier_velocity'
-        self.receive = checked(node, topic, lambda msg: announce(*read_velocity(msg, params)))
-        self._subscription = node.create_subscription(
-            rclpy_class('geometry_msgs/msg/TwistStamped'), topic, self.receive,
-            SENSOR,
-        )  # fmt: skip
+        kind, topic = rclpy_class('geometry_msgs/msg/TwistStamped'), 'carrier_velocity'
+        self._listener = Listener(
+            node, kind, topic, lambda msg: announce(*read_velocity(msg, params)), SENSOR
+        )
+        self.receive = self._listener.accept
 
     def drain(self) -> None:
         """Everything that has arrived."""
-        subscription = self._subscription
-        with subscription.handle:
-            for _ in range(DEPTH):
-                taken = self._guard.pass_on(
-                    'carrier_velocity',
-                    lambda: subscription.handle.take_message(
-                        subscription.msg_type, subscription.raw
-                    ),
-                    REFUSED,
-                )
-                if taken is None:
-                    return
-                if taken is not REFUSED:
-                    self.receive(taken[0])
+        for msg in self._listener.drained():
+            self.receive(msg)

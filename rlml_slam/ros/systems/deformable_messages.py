@@ -12,10 +12,10 @@ from rlml_slam.deformable.window import CarrierVelocity, Features, WindowEstimat
 from rlml_slam.errors import InputError
 from rlml_slam.params import DeformableParameters, Node
 from rlml_slam.ros.codecs import encode
-from rlml_slam.ros.codecs.decode import frame, stamp
+from rlml_slam.ros.codecs.decode import FASTEST, frame, stamp
 from rlml_slam.ros.codecs.markers import reflector_markers
 from rlml_slam.ros.codecs.message_types import Make, make_rclpy, rclpy_class
-from rlml_slam.ros.codecs.point_cloud import build_cloud, read_cloud
+from rlml_slam.ros.codecs.point_cloud import bounded, build_cloud, read_cloud
 from rlml_slam.se2 import Array
 from rlml_slam.types import Reflectors
 
@@ -49,8 +49,7 @@ def read_velocity(
         )
     linear = np.array([msg.twist.linear.x, msg.twist.linear.y], dtype=np.float64)
     angular = float(msg.twist.angular.z)
-    if not np.all(np.isfinite([*linear, angular])):
-        raise InputError(f'{topic}: twist is not finite')
+    bounded([*linear, angular], f'{topic}: twist', FASTEST)
     return stamp(msg, topic), CarrierVelocity(linear, angular), axes == params.base_frame
 
 

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A message that cannot be used costs itself, is counted, and is in the log once."""
+
+from __future__ import annotations
+
+import time
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip('rclpy')
+
+from geometry_msgs.msg import Pose, PoseArray
+from rclpy.qos import QoSProfile
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import LaserScan
+
+from rlml_slam.errors import InputError
+from rlml_slam.ros.message_guard import MAX_LOGGED, SMALL, Listener, MessageGuard, guard_of
+
+
+class Said:
+    """Stands in for a logger."""
+
+    def __init__(self):
+        self.warnings, self.errors = [], []
+        self.warning, self.error = self.warnings.append, self.errors.append
+
+
+@pytest.fixture
+def node():
+    said = Said()
+    subscription = SimpleNamespace(topic_name='/scan')
+    return SimpleNamespace(
+        get_logger=lambda: said, create_subscription=lambda *_, **__: subscription
+    )
+
+
+def listener(node, use, kind=LaserScan, largest=SMALL):
+    return Listener(node, kind, 'scan', use, QoSProfile(depth=5), largest)
+
+
+def refuse(_):
+    raise InputError('scan: it is empty')
+
+
+def test_message_is_given_to_its_use(node):
+    used = []
+    listener(node, used.append).receive(serialize_message(LaserScan(angle_min=0.5)))
+    assert used[0].angle_min == 0.5
+    assert guard_of(node).figures() == {}
+
+
+def test_large_message_is_refused_before_anything_is_made_of_it(node):
+    used = []
+    data = serialize_message(PoseArray(poses=[Pose()] * 20_000))
+    heard = listener(node, used.append, PoseArray)
+    began = time.perf_counter()
+    for _ in range(100):
+        heard.receive(data)
+    # to read one takes 0.4 s
+    assert time.perf_counter() - began < 0.4
+    assert used == []
+    assert guard_of(node).refused == {'scan': 100}
+    assert 'more than 65536 of a PoseArray' in guard_of(node).last
+
+
+@pytest.mark.parametrize('data', [b'', b'\0', b'\0\1\0\0' + b'\xff' * 50, b'\0\1\0\0'])
+def test_bytes_that_are_no_message_are_counted(node, data):
+    used = []
+    listener(node, used.append).receive(data)
+    assert used == []
+    assert 'that are no LaserScan' in guard_of(node).figures()['last refused message']
+
+
+def test_reason_is_in_the_log_once_whatever_numbers_it_has(node):
+    guard = guard_of(node)
+    for k in range(10):
+        guard.refuse('scan', f'scan: {k} beams')
+    guard.refuse('odom', 'odom: 3 beams')
+    assert node.get_logger().warnings == ['not used: scan: 0 beams', 'not used: odom: 3 beams']
+    assert guard.figures()['refused on scan'] == 10
+
+
+def test_log_has_an_end(node):
+    guard = guard_of(node)
+    for k in range(1000):
+        guard.refuse('scan', 'x' * k)
+    assert len(node.get_logger().warnings) == MAX_LOGGED
+    assert guard.refused['scan'] == 1000
+
+
+def test_bug_costs_the_message_that_it_came_from_and_is_reported(node):
+    def use(_):
+        raise IndexError('out of range')
+
+    heard = listener(node, use)
+    for _ in range(3):
+        heard.accept(LaserScan())
+    (text,) = node.get_logger().errors
+    assert 'IndexError: out of range; please report this:\nTraceback' in text
+    assert guard_of(node).refused['scan'] == 3
+
+
+def test_signal_passes_the_guard():
+    guard = MessageGuard(Said())
+
+    def interrupted():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        guard.pass_on('scan', interrupted)
+
+
+def test_refused_message_is_counted(node):
+    listener(node, refuse).accept(LaserScan())
+    assert guard_of(node).refused == {'scan': 1}
+    assert node.get_logger().errors == []
