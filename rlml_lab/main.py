@@ -75,6 +75,12 @@ COMMANDS: Table = {
                 'rlml_lab.contact.study_contact',
                 'messages that nobody should send: nodes go on, poses too',
             ),
+            'fuzz-files': Command(
+                'rlml_lab.contact.study_fuzz_files', 'mutated files of every format that is read'
+            ),
+            'kills': Command(
+                'rlml_lab.contact.study_kills', 'processes that are killed while they map, live'
+            ),
             'victoria-park': Command(
                 'rlml_lab.studies.study_victoria_park',
                 'dead reckoning, EKF and RLML among trees, against GPS',

@@ -6,6 +6,7 @@ from __future__ import annotations
 import gzip
 import lzma
 import math
+import zlib
 from collections.abc import Iterator, Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -17,6 +18,8 @@ from rlml_slam.errors import FileFormatError
 from rlml_slam.se2 import Array
 
 SECOND = 1_000_000_000
+LATEST = 9_000_000_000  # [s] that 64 bits of nanoseconds hold
+MAX_LINE, MAX_SIZE = 1 << 24, 1 << 33  # bytes, unpacked
 _GZIP, _XZ = b'\x1f\x8b', b'\xfd7zXZ'
 
 
@@ -28,11 +31,15 @@ def read_lines(path: str | Path) -> Iterator[tuple[int, str]]:
     """
     try:
         with _open(Path(path)) as f:
-            for number, raw in enumerate(f, start=1):
+            size = 0
+            for number, raw in enumerate(iter(lambda: f.readline(MAX_LINE), b''), start=1):
+                size += len(raw)
+                if len(raw) == MAX_LINE or size > MAX_SIZE:
+                    raise FileFormatError(f'{path}:{number}: a line or the file is too long')
                 line = raw.decode('utf-8', errors='replace').strip()
                 if line and not line.startswith('#'):
                     yield number, line
-    except (EOFError, lzma.LZMAError, gzip.BadGzipFile) as e:
+    except (EOFError, lzma.LZMAError, gzip.BadGzipFile, zlib.error) as e:
         raise FileFormatError(f'{path}: the compressed file is damaged: {e}') from e
     except OSError as e:
         raise FileFormatError(f'{path}: cannot be read: {e.strerror or e}') from e
@@ -54,12 +61,16 @@ def parse_stamp(word: str) -> int:
     Raises ValueError.
     """
     whole, _, fraction = word.partition('.')
-    if whole.isdecimal() and len(fraction) <= 9 and (fraction.isdecimal() or not fraction):
+    is_plain = whole.isdecimal() and (fraction.isdecimal() or not fraction)
+    if is_plain and len(whole) <= 10 and len(fraction) <= 9 and int(whole) < LATEST:
         return int(whole) * SECOND + int(fraction.ljust(9, '0'))
     try:
-        return int((Decimal(word) * SECOND).to_integral_value())
+        seconds = Decimal(word)
+        if abs(seconds) < LATEST:
+            return int((seconds * SECOND).to_integral_value())
     except (InvalidOperation, ValueError, OverflowError) as e:
-        raise ValueError(f'{word!r} is not a time in seconds') from e
+        raise ValueError(f'{word[:40]!r} is not a time in seconds') from e
+    raise ValueError(f'{word[:40]!r} is not a time in seconds')
 
 
 def format_stamp(stamp: int) -> str:

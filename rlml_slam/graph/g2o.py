@@ -14,6 +14,7 @@ fixed, as g2o does.
 from __future__ import annotations
 
 import gzip
+import io
 import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -32,6 +33,8 @@ from rlml_slam.se2 import Array, rotation
 from rlml_slam.types import EdgeKind
 
 # upper triangle of the information matrix by rows, and in TORO's order
+MAX_SIZE = 1 << 31  # bytes, unpacked
+LARGEST = 1e150  # its square is finite
 UPPER_3 = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 TORO_3 = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
 UPPER_2 = ((0, 0), (0, 1), (1, 1))
@@ -98,8 +101,13 @@ def read_graph(path: Path | str, losses: Losses | None = None) -> GraphFile:
 def _parse(path: Path) -> tuple[dict[str, _Lines], list[tuple[int, int]], Counter[str]]:
     try:
         raw = path.read_bytes()
-        text = (gzip.decompress(raw) if raw[:2] == b'\x1f\x8b' else raw).decode('ascii')
-    except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
+        if raw[:2] == b'\x1f\x8b':
+            with gzip.open(io.BytesIO(raw)) as f:
+                raw = f.read(MAX_SIZE + 1)
+        if len(raw) > MAX_SIZE:
+            raise ValueError(f'more than {MAX_SIZE} bytes')
+        text = raw.decode('ascii')
+    except (ValueError, OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
         raise FileFormatError(f'{path}: cannot be read: {error}') from None
     lines = {tag: _Lines() for tag in TAGS}
     fixed: list[tuple[int, int]] = []
@@ -134,9 +142,12 @@ def _parse(path: Path) -> tuple[dict[str, _Lines], list[tuple[int, int]], Counte
 
 def _ids(path: Path, number: int, words: Sequence[str]) -> list[int]:
     try:
-        return [int(word) for word in words]
+        ids = [int(word) for word in words]
     except ValueError as error:
         raise FileFormatError(f'{path}:{number}: bad vertex id: {error}') from None
+    if not all(abs(value) < 1 << 62 for value in ids):
+        raise FileFormatError(f'{path}:{number}: bad vertex id: too large')
+    return ids
 
 
 def _values(path: Path, number: int, words: Sequence[str]) -> list[float]:
@@ -144,8 +155,8 @@ def _values(path: Path, number: int, words: Sequence[str]) -> list[float]:
         values = [float(word) for word in words]
     except ValueError as error:
         raise FileFormatError(f'{path}:{number}: {error}') from None
-    if not np.isfinite(values).all():
-        raise FileFormatError(f'{path}:{number}: a value is not finite')
+    if not (np.abs(values) < LARGEST).all():
+        raise FileFormatError(f'{path}:{number}: a value is not finite, or beyond {LARGEST:g}')
     return values
 
 

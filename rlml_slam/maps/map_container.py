@@ -17,8 +17,10 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import os
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -38,6 +40,13 @@ SIZE = HEAD.size + 16
 DESCRIPTION = 'description.json'
 PREVIOUS = '.previous'
 PACKED = 1 << 16  # bytes; smaller arrays are not worth a compressor's start
+UNPACKED = 1 << 28  # bytes that any file may unpack to,
+RATIO = 20  # and how many times its own size a larger one
+# what the readers of zip, JSON and arrays raise for files that are none of ours
+FOREIGN = (
+    zipfile.BadZipFile, zlib.error, LookupError, ValueError, TypeError, EOFError, OSError,
+    MemoryError, RuntimeError, SyntaxError, struct.error, tokenize.TokenError,
+)  # fmt: skip
 PLAIN = frozenset('f')  # kinds of numbers that hardly get smaller: measurements
 
 
@@ -183,12 +192,28 @@ def _unpacked(path: Path, body: memoryview) -> Content:
     arrays: dict[str, NDArray[Any]] = {}
     try:
         with zipfile.ZipFile(io.BytesIO(body)) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+            if size > max(UNPACKED, RATIO * len(body)):
+                raise ValueError(f'{len(body)} bytes would become {size}')
             description = json.loads(archive.read(DESCRIPTION))
             for name in archive.namelist():
                 if name.endswith('.npy'):
-                    with archive.open(name) as f:
-                        arrays[name.removesuffix('.npy')] = npy.read_array(f, allow_pickle=False)
+                    arrays[name.removesuffix('.npy')] = _array(archive.read(name))
     # a checksum that fits says that the file is as it was written, not that we wrote it
-    except (zipfile.BadZipFile, zlib.error, KeyError, ValueError, EOFError, OSError) as e:
+    except FOREIGN as e:
         raise FileFormatError(f'{path}: not a map of this program: {e}') from e
+    if not isinstance(description, dict):
+        raise FileFormatError(f'{path}: not a map of this program: it has no description')
     return Content(arrays, description)
+
+
+def _array(data: bytes) -> NDArray[Any]:
+    """The array of a file in numpy's format; ValueError where it declares another size."""
+    f = io.BytesIO(data)
+    version = npy.read_magic(f)
+    read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+    shape, _, dtype = read(f)
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(data) - f.tell():
+        raise ValueError(f'an array of {shape} {dtype} in {len(data)} bytes')
+    f.seek(0)
+    return npy.read_array(f, allow_pickle=False)

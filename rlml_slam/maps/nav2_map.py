@@ -19,13 +19,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from rlml_slam.errors import FileFormatError, MapError
 from rlml_slam.maps.atomic_file import write_atomically
 from rlml_slam.maps.occupancy import UNKNOWN, OccupancyGrid
+from rlml_slam.plain_yaml import parse_yaml
 
 OCCUPIED_THRESH = 0.65
 FREE_THRESH = 0.196  # below the 50/255 of an unknown pixel, which 0.25 would read as free
@@ -101,10 +101,10 @@ def describe(path: str | Path) -> Description:
     try:
         if path.stat().st_size > MAX_DESCRIPTION:
             raise FileFormatError(f'{path}: too large to be the description of a map')
-        meta = yaml.safe_load(path.read_text(encoding='utf-8'))
+        meta = parse_yaml(path.read_text(encoding='utf-8'), f'{path}: not a map description')
     except OSError as e:
         raise MapError(f'{path}: cannot be read: {e.strerror}') from e
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as e:
+    except UnicodeDecodeError as e:
         raise FileFormatError(f'{path}: not a map description: {e}') from e
     if not isinstance(meta, dict):
         raise FileFormatError(f'{path}: not a map description: no "name: value" lines')

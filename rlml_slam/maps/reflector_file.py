@@ -17,6 +17,9 @@ COLUMNS = (
 )  # fmt: skip
 
 
+LARGEST = 2.0**53  # of a key, an id, a count; no place is that far away
+
+
 def reflector_table(r: Reflectors) -> str:
     """One row per reflector; an unknown diameter is left empty."""
     rows = [','.join(COLUMNS)]
@@ -46,9 +49,11 @@ def load(path: str | Path) -> Reflectors:
     lines = text.splitlines()
     if not lines or tuple(lines[0].split(',')) != COLUMNS:
         raise FileFormatError(f'{path}: line 1: not the columns of a reflector map')
-    values = np.array(
-        [_row(f'{path}: line {k}', row) for k, row in enumerate(csv.reader(lines[1:]), 2)]
-    ).reshape(-1, len(COLUMNS))
+    try:
+        rows = [_row(f'{path}: line {k}', row) for k, row in enumerate(csv.reader(lines[1:]), 2)]
+    except csv.Error as e:
+        raise FileFormatError(f'{path}: {e}') from e
+    values = np.array(rows).reshape(-1, len(COLUMNS))
     cov = values[:, [4, 5, 5, 6]].reshape(-1, 2, 2)
     if len(cov) and (np.linalg.eigvalsh(cov) < -1e-9).any():
         bad = int(np.argmax(np.linalg.eigvalsh(cov).min(-1) < -1e-9))
@@ -71,6 +76,6 @@ def _row(where: str, row: list[str]) -> list[float]:
         diameter = float(row[-1]) if row[-1] else float('nan')
     except ValueError as e:
         raise FileFormatError(f'{where}: {e}') from e
-    if not np.isfinite(numbers).all():
-        raise FileFormatError(f'{where}: a value is not finite')
+    if not (np.abs(numbers) < LARGEST).all():
+        raise FileFormatError(f'{where}: a value is not finite, or beyond {LARGEST:g}')
     return [*numbers, diameter]

@@ -26,6 +26,7 @@ from rlml_slam.se2 import Array
 from rlml_slam.types import ANONYMOUS
 
 MM = 1e-3
+FARTHEST = 1e7  # [m]
 IMK_FIELDS = 6  # before the layers
 
 
@@ -59,7 +60,7 @@ def load(path: str | Path) -> Survey:
     try:
         for where, row in reader(text):
             rows.append(_checked(where, row))
-    except (ValueError, TypeError, KeyError) as e:
+    except (ValueError, TypeError, KeyError, RecursionError, csv.Error) as e:
         raise FileFormatError(f'{path}: {e}') from e
     if not rows:
         raise FileFormatError(f'{path}: no reflector in it')
@@ -79,10 +80,12 @@ def _checked(where: str, row: Mapping[str, Any]) -> tuple[float, float, float, f
         diameter = float(row['diameter']) if row.get('diameter') not in (None, '') else math.nan
     except KeyError as e:
         raise ValueError(f'{where}: {e.args[0]} is missing') from e
-    except (ValueError, TypeError) as e:
+    except (ValueError, TypeError, OverflowError) as e:
         raise ValueError(f'{where}: {e}') from e
-    if not (math.isfinite(x) and math.isfinite(y)):
-        raise ValueError(f'{where}: the place is not finite')
+    if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST):
+        raise ValueError(f'{where}: the place is not finite, or beyond {FARTHEST:g} m')
+    if abs(id_) >= 1 << 53:
+        raise ValueError(f'{where}: {id_} is no id')
     return float(id_), x, y, diameter
 
 

@@ -48,7 +48,7 @@ class BackEndNode(Node):
         self.requests = UserRequests(self.mapper, self.params, self.get_logger())
         warm_up.compile_loaded()
         self.join = FrameAssembler()
-        self.health = HealthPublisher(self, figures=self.figures)
+        self.health = HealthPublisher(self, None, self.figures, self.mapper.problems)
         self.map_services = MapServices(self, self.params, self.mapper, self.requests)
         if command is None:
             self._subscribe()

@@ -9,11 +9,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from rlml_slam.errors import FileFormatError, ParameterError
 from rlml_slam.params.declaration import declarations
 from rlml_slam.params.systems import NODES, ROS_OWN, Parameters
+from rlml_slam.plain_yaml import parse_yaml
 
 
 def from_mapping(values: Mapping[str, Any], of: type[Any] = Parameters) -> Any:
@@ -59,11 +58,11 @@ def read_yaml(path: str | Path, of: type[Any] = Parameters) -> dict[str, Any]:
     has no such section.
     """
     try:
-        tree = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+        tree = parse_yaml(Path(path).read_text(encoding='utf-8'), str(path))
     except OSError as e:
         raise FileFormatError(f'{path}: cannot be read: {e.strerror}') from e
-    except (yaml.YAMLError, UnicodeDecodeError) as e:
-        raise FileFormatError(f'{path}: not YAML: {str(e).splitlines()[0]}') from e
+    except UnicodeDecodeError as e:
+        raise FileFormatError(f'{path}: not YAML: {e}') from e
     if not isinstance(tree, Mapping):
         raise FileFormatError(f'{path}: no parameters in this file')
     ours = ('**', '*', *NODES[of])

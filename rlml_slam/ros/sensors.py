@@ -65,10 +65,10 @@ class Sensors:
 
     Where the clock jumps back by more than the buffer holds, ``restart`` is called and a new
     sequencer begins. At the start, scans and detections wait, in order, until /tf_static has where
-    their sensor is, but no longer than TF_PATIENCE: then a sensor without a transform is taken to
-    sit at ``laser_pose``, one for each topic. Later, a message in another frame without transform
-    is refused, and holds up nothing. Where all inputs fall silent, what still waits for odometry
-    is used as it is.
+    one of their sensors is, but no longer than TF_PATIENCE: then a sensor without a transform is
+    taken to sit at ``laser_pose``, one for each topic. Later, a message in another frame without
+    transform is refused, and holds up nothing. Where all inputs fall silent, what still waits for
+    odometry is used as it is.
     """
 
     def __init__(
@@ -209,9 +209,13 @@ class Sensors:
         self._held.append((stream, msg))
         unknown = {frame(m.header.frame_id) for _, m in self._held if not self._is_placed(m)}
         late = not 0 <= _stamp(msg) - _stamp(self._held[0][1]) <= TF_PATIENCE
-        if unknown and not late and len(self._held) < DEPTH:
+        late = late or len(self._held) >= DEPTH
+        for stream, held in self._held:
+            if self._is_placed(held):  # takes precedence over a frame that came before it
+                self._frames[stream].add(frame(held.header.frame_id))
+        if not late and not self._frames:
             return
-        for sensor in unknown:
+        for sensor in unknown if late else ():
             self._since.setdefault(sensor, LONG_AGO)
         self._release()
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from rlml_slam.errors import FileFormatError
+from rlml_slam.plain_yaml import parse_yaml
 from rlml_slam.se2 import Array
 from rlml_slam.simulation.world import (
     NO_REFLECTOR,
@@ -57,11 +57,7 @@ def load_world(name_or_path: str | Path) -> World:
 def parse_world(text: str, name: str, source: str = '') -> World:
     """A world from the text of its file; ``source`` is what errors call the file."""
     source = source or f'world {name!r}'
-    try:
-        tree = yaml.safe_load(text)
-    except yaml.YAMLError as e:
-        raise FileFormatError(f'{source}: not YAML: {str(e).splitlines()[0]}') from e
-    root = _Place(tree, source)
+    root = _Place(parse_yaml(text, source), source)
     root.allow(*WORLD_KEYS)
     static = _static(root)
     return World(

@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
+import hashlib
+import io
 import os
+import resource
 import signal
+import struct
 import subprocess
 import sys
 import textwrap
@@ -161,3 +165,49 @@ def test_object_is_never_unpickled(tmp_path):
     with pytest.raises(ValueError, match=r'[Oo]bject'):
         map_container.write(tmp_path / 'a.rlml', objects)
     assert list(tmp_path.iterdir()) == []
+
+
+def packed(members):
+    """A container of which the checksums are right, whatever is in it."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, 'w', zipfile.ZIP_DEFLATED) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    body = out.getvalue()
+    head = map_container.HEAD.pack(
+        map_container.MAGIC, map_container.VERSION, len(body), hashlib.sha256(body).digest()
+    )
+    return head + hashlib.sha256(head).digest()[:16] + body
+
+
+def npy(shape, data=b''):
+    text = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + '\n'
+    return b'\x93NUMPY\1\0' + struct.pack('<H', len(text)) + text.encode() + data
+
+
+@pytest.mark.parametrize(
+    'members',
+    [
+        {'description.json': b'{}', 'a.npy': bytes(300_000_000)},
+        {'description.json': b'[' * 100_000},
+        {'description.json': b'3'},
+        {'description.json': b'{}', 'a.npy': npy((10**12,))},
+        {'description.json': b'{}', 'a.npy': npy((10, 10), bytes(8))},
+        {'description.json': b'{}', 'a.npy': npy('(' * 500)},
+        {'a.npy': npy((1,), bytes(8))},
+    ],
+    ids=['bomb', 'depth', 'number', 'declared', 'short', 'header', 'no description'],
+)
+def test_foreign_content_with_a_right_checksum_is_refused(members, tmp_path):
+    path = tmp_path / 'a.rlml'
+    path.write_bytes(packed(members))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(FileFormatError, match='not a map of this program'):
+        map_container.read(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # [KB]
+
+
+def test_array_with_its_own_size_is_read(tmp_path):
+    path = tmp_path / 'a.rlml'
+    path.write_bytes(packed({'description.json': b'{}', 'a.npy': npy((1,), bytes(8))}))
+    np.testing.assert_array_equal(map_container.read(path).arrays['a'], [0.0])

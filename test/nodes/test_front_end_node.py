@@ -400,6 +400,28 @@ def test_tf_static_tells_the_place_of_the_laser(live):
     np.testing.assert_allclose(node.sensors.extrinsics.pose('base_link', 'laser'), [0.3, 0.1, 0.0])
 
 
+def test_scan_in_an_unknown_frame_holds_up_nothing_and_never_gets_laser_pose(live):
+    """Neither as the first message of all, nor later."""
+    node = live.start(FrontEndNode, laser_pose=[5.0, 5.0, 0.0])
+    node.sensors._has_tf = node.sensors._waits = True
+    place = encode.transform(make, SECOND, ('base_link', 'laser'), np.array([0.3, 0.1, 0.0]))
+    node.sensors.extrinsics.add(decode.transforms(place))
+    waiting, scans = [], 0
+    for stream, msg in room(['/scan', '/odom'], seconds=4.0):
+        if stream == 'scan':
+            other = copy.deepcopy(msg)
+            other.header.frame_id = 'camera'
+            node.sensors.add(stream, other)
+            scans += 1
+            waiting.append(scans - used(node, 'scan'))
+        node.sensors.add(stream, msg)
+    # a scan waits for the odometry behind it
+    assert max(waiting) <= 3
+    assert used(node, 'scan') >= scans - 1
+    assert node.sensors.synchronizer.inputs.totals()['scan']['invalid'] == scans
+    np.testing.assert_allclose(node.last.observation.origin, [0.3, 0.1], atol=1e-6)
+
+
 def test_parameter_serves_where_nobody_tells_the_place_of_the_laser(live):
     node = live.start(FrontEndNode, laser_pose=[0.3, 0.1, 0.0])
     sent = feed(node, 4.0)

@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 import dataclasses
+import resource
+import threading
+import time
 from collections import defaultdict
 from threading import Event
 from types import SimpleNamespace
@@ -18,9 +21,8 @@ from rlml_slam.errors import MapError
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Parameters
-from rlml_slam.ros.back_end.back_end_figures import figures
 from rlml_slam.ros.back_end.last_pose import LastPose
-from rlml_slam.ros.back_end.map_folder import MapFolder
+from rlml_slam.ros.back_end.map_folder import LOST_BYTES, MapFolder
 from rlml_slam.ros.back_end.mapper import Mapper
 from rlml_slam.ros.back_end.user_requests import UserRequests
 from rlml_slam.ros.codecs.reflector_clouds import read_reflector_map
@@ -516,7 +518,7 @@ def test_journal_that_cannot_be_written_is_reported_once(make, ear, tmp_path):
         f'{tmp_path}/file/map.journal-… cannot be written: File exists; '
         'if the process is killed now, this map is lost'
     ]
-    assert 'File exists' in figures(mapper)['journal']
+    assert 'File exists' in mapper.problems()[0]
 
 
 def test_journal_begins_again_with_another_map(make, tmp_path):
@@ -528,6 +530,75 @@ def test_journal_begins_again_with_another_map(make, tmp_path):
     searched(make(map_directory=str(tmp_path)))
     (saved,) = tmp_path.glob('map.autosave-*.rlml')
     assert len(map_file.load(saved).arrays['pose']) == keys
+
+
+def test_slow_robot_loses_no_more_than_a_fast_one(make, ear, tmp_path):
+    mapper = make(map_directory=str(tmp_path), journal_period=1e-3)
+    drives(mapper, range(8))
+    keys = len(mapper.back_end.keyframes)
+    assert keys < 5
+    killed(mapper)
+    searched(make(map_directory=str(tmp_path)))
+    (saved,) = tmp_path.glob('map.autosave-*.rlml')
+    assert len(map_file.load(saved).arrays['pose']) == keys
+
+
+def test_full_disk_is_reported_and_what_was_written_is_recovered(make, ear, tmp_path):
+    mapper = make(map_directory=str(tmp_path), journal_period=1e-3)
+    drives(mapper, range(60))
+    (left,) = journals(tmp_path)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (left.stat().st_size + 100, before[1]))
+    try:
+        drives(mapper, range(60, 120))
+        assert 'File too large' in mapper.problems()[0]
+        keys = len(mapper.back_end.keyframes)
+        killed(mapper)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    again = make(map_directory=str(tmp_path))
+    searched(again)
+    assert again.problems() == ()
+    (saved,) = tmp_path.glob('map.autosave-*.rlml')
+    assert 10 < len(map_file.load(saved).arrays['pose']) < keys
+
+
+def test_journals_count_as_automatic_files(make, ear, tmp_path):
+    with (tmp_path / 'map.journal-1.damaged').open('wb') as file:
+        file.truncate(LOST_BYTES + 1)  # sparse
+    mapper = make(map_directory=str(tmp_path), journal_period=1e-3)
+    drives(mapper, range(60))
+    assert 'remove those that are not needed' in mapper.problems()[0]
+
+
+def test_recovery_that_is_interrupted_is_left_to_the_next_start(make, ear, tmp_path):
+    mapper = make(map_directory=str(tmp_path), journal_period=1e-3)
+    drives(mapper, range(60))
+    killed(mapper)
+    other = make(map_directory=str(tmp_path / 'other'))
+    other.journal._folder = mapper.archive.folder
+    other.journal.ends = True
+    other.journal.recover()
+    assert any('left for the next start' in w for w in ear.warnings)
+    assert len(journals(tmp_path)) == 1
+    searched(make(map_directory=str(tmp_path)))
+    assert len([*tmp_path.glob('map.autosave-*.rlml')]) == 1
+
+
+def test_map_is_saved_before_a_search_has_ended(make, tmp_path):
+    mapper = make(map_directory=str(tmp_path))
+    drives(mapper, range(60))
+    goes_on = threading.Event()
+    mapper.searcher.worker.submit(goes_on.wait)
+    end = threading.Thread(target=mapper.close)
+    end.start()
+    deadline = time.monotonic() + 20.0
+    while not [*tmp_path.glob('map.autosave-*.rlml')] and time.monotonic() < deadline:
+        time.sleep(0.01)
+    saved = [*tmp_path.glob('map.autosave-*.rlml')]
+    goes_on.set()
+    end.join()
+    assert len(saved) == 1
 
 
 def test_damaged_journal_is_kept_under_another_name(make, ear, tmp_path):

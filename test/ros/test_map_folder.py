@@ -89,9 +89,36 @@ def test_automatic_maps_displace_none_where_they_fill_their_share(tmp_path, monk
     path = folder.free('hall', LOST, 1)
     with path.open('wb') as file:
         file.truncate(LOST_BYTES + 1)  # sparse
-    with pytest.raises(MapError, match=r'hall\.lost-… and \.autosave-… have 1000 MB; remove'):
+    with pytest.raises(MapError, match=r'hall: \.lost-, .*… have 1000 MB; remove'):
         folder.make_room('hall', path.stat().st_mtime)
     assert path.exists()
+
+
+@pytest.mark.parametrize('name', ['a\0b', 'x' * 5000, 'ü' * 150])
+def test_names_that_no_file_can_have_are_refused(name, tmp_path):
+    with pytest.raises(MapError, match='is no name of a file'):
+        MapFolder(str(tmp_path)).load(name)
+
+
+@pytest.mark.parametrize('suffix', ['.rlml', '.csv'])
+def test_link_out_of_the_folder_is_not_followed(suffix, tmp_path):
+    outside, maps = tmp_path / f'secret{suffix}', tmp_path / 'maps'
+    outside.write_text('secret')
+    maps.mkdir()
+    (maps / f'hall{suffix}').symlink_to(outside)
+    with pytest.raises(MapError, match='is no file inside of map_directory'):
+        MapFolder(str(maps)).load('hall')
+    (maps / 'halls').symlink_to(tmp_path)
+    with pytest.raises(MapError, match='is not inside of map_directory'):
+        MapFolder(str(maps)).load('halls/secret')
+    with pytest.raises(MapError, match='inside of map_directory'):
+        MapFolder(str(maps)).survey(f'hall{suffix}')
+
+
+def test_pipe_in_the_place_of_a_map_does_not_block(tmp_path):
+    os.mkfifo(tmp_path / 'hall.csv')
+    with pytest.raises(MapError, match='is no file inside of map_directory'):
+        MapFolder(str(tmp_path)).load('hall')
 
 
 def test_no_automatic_map_is_written_over_another(tmp_path):

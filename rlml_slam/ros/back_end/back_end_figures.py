@@ -20,6 +20,5 @@ def figures(mapper: Mapper) -> dict[str, object]:
         **({} if entry is None else {'saved map not entered': entry.why}),
         **({} if survey_frame is None else {'survey': survey_frame.why}),
         'constellations not searched': back_end.constellation_search.not_searched,
-        **({'journal': mapper.journal.problem} if mapper.journal.problem else {}),
         'frames waiting for the worker': mapper.worker.backlog,
     }

@@ -32,7 +32,7 @@ class MapArchive:
 
     def load(self, name: str) -> Content:
         """A whole map of the folder. Raises MapError or FileFormatError."""
-        whole = self.folder.whole(name)
+        whole = self.folder.readable(self.folder.whole(name))
         if name.endswith(SUFFIXES) and not name.endswith(whole.suffix):
             raise MapError(f'{name} can be localized in; only a .rlml file can be continued')
         content = map_file.load(whole)

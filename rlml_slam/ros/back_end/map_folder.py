@@ -13,7 +13,10 @@ from rlml_slam.slam.store import map_file
 
 # in the names of maps that were written without a user's request: one that another took the place
 # of, and one that was in the making when its process ended
-LOST, AUTOSAVE = '.lost-', '.autosave-'
+# and the journal of one
+LOST, AUTOSAVE, JOURNAL = AUTOMATIC = ('.lost-', '.autosave-', '.journal-')
+ENDS = ('.rlml', f'.rlml{map_container.PREVIOUS}')
+MAX_NAME = 200  # bytes
 LOST_AGE = 30 * 86400.0  # [s] after which such a file is removed
 LOST_BYTES = 1_000_000_000  # of such files: where there are more, no other one is written
 IMAGES = ('.pgm', '.png', '.bmp')
@@ -31,19 +34,32 @@ class MapFolder:
         name = name.removeprefix('file://')
         for suffix in SUFFIXES:
             name = name.removesuffix(suffix)
-        path = (self.root / name).resolve()
-        if not name or path == self.root or not path.is_relative_to(self.root):
+        path = self._inside(name, 'map')
+        if not name or path == self.root:
             raise MapError(f'map {name!r} is not inside of map_directory, {self.root}')
+        return path
+
+    def _inside(self, name: str, what: str) -> Path:
+        """A path of the folder, links followed; MapError where it leads out, or is none."""
+        if '\0' in name or len(name.encode(errors='replace')) > MAX_NAME:
+            raise MapError(f'{what} {name[:MAX_NAME]!r} is no name of a file')
+        path = (self.root / name).resolve()
+        if not path.is_relative_to(self.root):
+            raise MapError(f'{what} {name!r} is not inside of map_directory, {self.root}')
+        return path
+
+    def readable(self, path: Path) -> Path:
+        """The path of a file; MapError where it is a link out of the folder, or no plain file."""
+        inside = path.resolve().is_relative_to(self.root)
+        if path.exists() and not (path.is_file() and inside):
+            raise MapError(f'{path} is no file inside of map_directory, {self.root}')
         return path
 
     def survey(self, name: str) -> Survey | None:
         """Surveyed reflectors; None without a name. MapError or FileFormatError if unusable."""
         if not name:
             return None
-        path = (self.root / name).resolve()
-        if not path.is_relative_to(self.root):
-            raise MapError(f'survey {name!r} is not inside of map_directory, {self.root}')
-        return survey.load(path)
+        return survey.load(self.readable(self._inside(name, 'survey')))
 
     def save(self, name: str, saved: SavedMap) -> Path:
         """Write name.csv, and name.pgm with name.yaml where there is a grid.
@@ -83,8 +99,7 @@ class MapFolder:
     def newest(self, name: str) -> Path:
         """The path of a whole map, or of a younger one of it that was saved automatically."""
         whole = self.whole(name)
-        begin = self.path(name).name + AUTOSAVE
-        saved = [file for file in whole.parent.glob('*.rlml') if file.name.startswith(begin)]
+        saved = [f for f in self.automatic(name, (AUTOSAVE,)) if f.name.endswith('.rlml')]
         files = [*saved, *([whole] if whole.exists() else [])]
         return max(files, key=lambda file: file.stat().st_mtime_ns, default=whole)
 
@@ -94,22 +109,34 @@ class MapFolder:
         No other file is ever removed. Raises MapError where the younger ones fill LOST_BYTES.
         """
         path = self.path(name)
-        begin = (path.name + LOST, path.name + AUTOSAVE)
         try:
-            files = [file for file in path.parent.glob('*.rlml') if file.name.startswith(begin)]
+            files = self.automatic(name)
             old = [file for file in files if now - file.stat().st_mtime > LOST_AGE]
             for file in old:
-                file.unlink()
+                file.unlink(missing_ok=True)
                 file.with_name(file.name + map_container.PREVIOUS).unlink(missing_ok=True)
             size = sum(file.stat().st_size for file in files if file not in old)
         except OSError as e:
             raise MapError(f'{path}: {e.filename}: {e.strerror}') from e
         if size > LOST_BYTES:
             raise MapError(
-                f'{path}{LOST}… and {AUTOSAVE}… have {size / 1e6:.0f} MB; remove those that are '
+                f'{path}: {", ".join(AUTOMATIC)}… have {size / 1e6:.0f} MB; remove those that are '
                 f'not needed, so that others can be kept'
             )
-        return sorted(old)
+        return [file for file in old if file.suffix == '.rlml']
+
+    def automatic(self, name: str, kinds: tuple[str, ...] = AUTOMATIC) -> list[Path]:
+        """Files of a map that were written without a user's request, by name."""
+        path = self.path(name)
+        begin = tuple(path.name + kind for kind in kinds)
+        if not path.parent.is_dir():
+            return []
+        journal = path.name + JOURNAL
+        return sorted(
+            file for file in path.parent.iterdir()
+            if file.name.startswith(begin)
+            and (file.name.endswith(ENDS) or file.name.startswith(journal))
+        )  # fmt: skip
 
     def load(self, name: str) -> SavedMap:
         """Read name.rlml where it is there, else name.csv and name.yaml; a suffix says which.
@@ -123,10 +150,14 @@ class MapFolder:
             files = files[2:]
         elif name.endswith(SUFFIXES):
             files = [file for file in files if name.endswith(file.suffix)]
-        found = next((file for file in files if file.exists()), None)
+        found = next((file for file in files if self.readable(file).exists()), None)
         if found is None:
             names = ' and no '.join(f.name for f in files)
             raise NoMapError(f'{path.parent}: there is no {names}')
         if found.suffix == '.rlml':
             return map_file.saved_map(map_file.load(found))
+        self.readable(found.with_suffix('.csv'))
+        meta = self.readable(found.with_suffix('.yaml'))
+        if meta.exists():
+            self.readable(nav2_map.describe(meta).image)
         return saved_map.load(found)

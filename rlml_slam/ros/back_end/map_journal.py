@@ -17,12 +17,10 @@ from rlml_slam.errors import MapError, RlmlError
 from rlml_slam.maps import map_container
 from rlml_slam.maps.map_container import Content
 from rlml_slam.params import Parameters
-from rlml_slam.ros.back_end.map_archive import WORTH_KEEPING
-from rlml_slam.ros.back_end.map_folder import AUTOSAVE, MapFolder
+from rlml_slam.ros.back_end.map_folder import AUTOSAVE, JOURNAL, MapFolder
 from rlml_slam.slam.store import journal, map_file
 from rlml_slam.slam.store.journal import Journal
 
-JOURNAL = '.journal-'  # in the names of the files
 MAX_BYTES = 2_000_000_000  # of one journal
 
 
@@ -37,13 +35,14 @@ class MapJournal:
         self._p = params
         self._logger = logger
         self._file: IO[bytes] | None = None
-        self.problem = ''
+        self.ends = False  # whether a recovery is to stop, and be left to the next start
         self._start(None)
 
     def _start(self, base: Content | None) -> None:
         self._journal = Journal(self._p, base)
-        self._keyframes = 0 if base is None else WORTH_KEEPING
+        self._has_keyframes = base is not None
         self._due = time.monotonic()
+        self.problem = ''
 
     def restart(self, base: Content | None = None, keep: bool = False) -> None:
         """Another map begins, or ``base`` is continued. ``keep`` the file of the map until now."""
@@ -54,7 +53,7 @@ class MapJournal:
         """A frame that the graph was given."""
         if self._p.node.journal_period == 0.0 or self.problem:
             return
-        self._keyframes += is_keyframe
+        self._has_keyframes |= is_keyframe
         self._journal.add(frame, is_keyframe)
         self.write()
 
@@ -62,7 +61,7 @@ class MapJournal:
     def is_due(self) -> bool:
         """Whether there is something to be written by now."""
         late = time.monotonic() - self._due >= self._p.node.journal_period
-        return late and self._keyframes >= WORTH_KEEPING and not self.problem
+        return late and self._has_keyframes and not self.problem
 
     def write(self) -> None:
         """Write what has come, if it is due."""
@@ -76,12 +75,15 @@ class MapJournal:
                 self._stop(f'has {MAX_BYTES / 1e9:.0f} GB: save the map and start again')
         except OSError as e:
             self._stop(f'cannot be written: {e.strerror or e}')
+        except MapError as e:
+            self._stop(f'cannot be written: {e}')
         self._due = time.monotonic()
 
     def _open(self) -> IO[bytes]:
         """A new file, locked for as long as this process lives."""
         path = self._folder.path(self._p.node.map_file_name)
         path.parent.mkdir(parents=True, exist_ok=True)
+        self._folder.make_room(self._p.node.map_file_name, time.time())
         name, k = f'{path.name}{JOURNAL}{int(time.time())}', 1
         while path.with_name(f'{name}-{k}').exists():
             k += 1
@@ -115,9 +117,13 @@ class MapJournal:
                     continue  # another process is writing it
                 self._recover(path)
 
+    def _check(self) -> None:
+        if self.ends:
+            raise InterruptedError
+
     def _left(self) -> list[Path]:
-        path = self._folder.path(self._p.node.map_file_name)
-        return sorted(path.parent.glob(f'{path.name}{JOURNAL}*[0-9]'))
+        files = self._folder.automatic(self._p.node.map_file_name, (JOURNAL,))
+        return [path for path in files if path.name[-1].isdecimal() and path.is_file()]
 
     def _recover(self, path: Path) -> None:
         name = self._p.node.map_file_name
@@ -126,16 +132,22 @@ class MapJournal:
             f'({path.stat().st_size / 1e6:.1f} MB)'
         )
         try:
-            back_end, params = journal.recover(path, self._folder.survey(self._p.back_end.survey))
-            if not back_end.keyframes:
-                raise MapError('it has no frames')
+            survey = self._folder.survey(self._p.back_end.survey)
+            back_end, params = journal.recover(path, survey, self._check)
             content = map_file.content_of(back_end, params, back_end.occupancy_grid())
-            to = self._folder.free(name, AUTOSAVE, int(time.time()))
-            map_container.write(to, content)
-        except (RlmlError, OSError, KeyError, ValueError) as e:
+        except InterruptedError:
+            self._logger.warning(f'{path}: left for the next start')
+            return
+        except (RlmlError, OSError) as e:
             bad = path.with_name(path.name + '.damaged')
             path.rename(bad)
             self._logger.error(f'{bad}: no map can be made of it: {e}')
             return
-        path.unlink()
+        to = self._folder.free(name, AUTOSAVE, int(time.time()))
+        try:
+            map_container.write(to, content)
+            path.unlink()
+        except (MapError, OSError) as e:
+            self._logger.error(f'{path}: left for the next start: {e}')
+            return
         self._logger.warning(f'recovered: {len(back_end.keyframes)} keyframes in {to}')

@@ -243,11 +243,15 @@ class Mapper:
         self._tf.publish(self._sent, (n.map_frame, n.odom_frame), T)
 
     def close(self) -> None:
-        """Finish the running jobs, forget the others, and save what was mapped."""
-        self.searcher.close()
+        """Save what was mapped, behind the running job; then the running search may end."""
+        self.journal.ends = True
         self.worker.close()
-        if self._ended:
-            return
-        self._ended = True
-        saved = self.archive.autosave(self.back_end, self.products.grid(self.back_end))
-        self.journal.close(keep=not saved)
+        if not self._ended:
+            self._ended = True
+            saved = self.archive.autosave(self.back_end, self.products.grid(self.back_end))
+            self.journal.close(keep=not saved)
+        self.searcher.close()
+
+    def problems(self) -> tuple[str, ...]:
+        """What /diagnostics have to say of the files."""
+        return (self.journal.problem,) if self.journal.problem else ()

@@ -8,6 +8,7 @@ the file. The one use is ``BagRecovery(path)`` in bag.py, in place of the librar
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import struct
 from collections import Counter
@@ -26,7 +27,7 @@ from rosbags.interfaces import (
     MessageDefinitionFormat,
     TopicInfo,
 )
-from rosbags.rosbag1.reader import Header, decompressors, normalize
+from rosbags.rosbag1.reader import Header, ReaderError, decompressors, normalize
 from rosbags.rosbag2.storage_mcap import decompress
 from rosbags.typesys.msg import normalize_msgtype
 
@@ -124,13 +125,22 @@ def _from_file(
             yield from scan(source)
         except Truncated:
             yield f'{file.name} is cut off'
+        except (ValueError, LookupError, TypeError, struct.error, ReaderError) as e:
+            yield f'{file.name} is damaged: {type(e).__name__}: {e}'
 
 
 def _exactly(source: BinaryIO, size: int) -> bytes:
-    data = source.read(size)
-    if len(data) != size:
+    if size > _rest(source):  # before as much memory is asked for
         raise Truncated
-    return data
+    return source.read(size)
+
+
+def _rest(source: BinaryIO) -> int:
+    """Bytes that are left."""
+    here = source.tell()
+    size = source.seek(0, os.SEEK_END) - here
+    source.seek(here)
+    return size
 
 
 # --- MCAP ----------------------------------------------------------------------------------
@@ -157,7 +167,7 @@ def _mcap_chunk(
     (name_size,) = struct.unpack('<I', _exactly(source, 4))
     compression = _exactly(source, name_size).decode()
     (packed_size,) = struct.unpack('<Q', _exactly(source, 8))
-    packed = source.read(packed_size)
+    packed = source.read(min(packed_size, _rest(source)))
     cut = len(packed) != packed_size
     if cut and compression:
         raise Truncated

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO
 
@@ -123,10 +123,13 @@ def frames_of(piece: Content) -> Iterator[Frame]:
         )  # fmt: skip
 
 
-def recover(path: Path, survey: Survey | None = None) -> tuple[BackEnd, Parameters]:
+def recover(
+    path: Path, survey: Survey | None = None, check: Callable[[], None] = lambda: None
+) -> tuple[BackEnd, Parameters]:
     """The graph that a journal was written for, and the parameters that it was made with.
 
-    Raises MapError if the file cannot be read, FileFormatError if its first part is damaged.
+    ``check`` is called before each frame, and may raise to end it. Raises MapError if the file
+    cannot be read, FileFormatError if its first part is damaged.
     """
     pieces = read_pieces(path)
     head = next(pieces, None)
@@ -140,6 +143,8 @@ def recover(path: Path, survey: Survey | None = None) -> tuple[BackEnd, Paramete
     if base is not None:
         map_file.restore(Content(head.arrays, base), back_end)
     for piece in pieces:
-        for frame in frames_of(piece):
-            back_end.add(frame)
+        with map_file.consistent():
+            for frame in frames_of(piece):
+                check()
+                back_end.add(frame)
     return back_end, params

@@ -23,7 +23,8 @@ The description has the parameters that the map was made with, and the grid's or
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -53,16 +54,29 @@ MADE = ('keys', 'ids', 'sightings', 'diameters')
 Arrays = Mapping[str, NDArray[Any]]
 
 
+@contextmanager
+def consistent() -> Iterator[None]:
+    """FileFormatError in the place of what arrays that contradict each other raise."""
+    try:
+        yield
+    except (
+        LookupError, ValueError, TypeError, AttributeError, ArithmeticError, MemoryError,
+        SolverError,
+    ) as e:  # fmt: skip
+        raise FileFormatError(f'the parts of the map are inconsistent: {e}') from e
+
+
 def parameters_of(content: Content) -> Parameters:
     """Parameters that a map was made with; unknown ones are left out."""
-    saved = content.description['parameters']
     groups: dict[str, Any] = {}
-    for group in dataclasses.fields(Parameters):
-        kind: Any = type(group.default)
-        known = {f.name for f in dataclasses.fields(kind)}
-        values = saved.get(group.name, {})
-        groups[group.name] = kind(**{k: v for k, v in values.items() if k in known})
-    return Parameters(**groups)
+    with consistent():
+        saved = content.description['parameters']
+        for group in dataclasses.fields(Parameters):
+            kind: Any = type(group.default)
+            known = {f.name for f in dataclasses.fields(kind)}
+            values = saved.get(group.name, {})
+            groups[group.name] = kind(**{k: v for k, v in values.items() if k in known})
+        return Parameters(**groups)
 
 
 def tables(graph: Graph) -> dict[str, FactorTable]:
@@ -142,15 +156,16 @@ def load(path: str | Path) -> Content:
 def saved_map(content: Content) -> SavedMap:
     """Reflectors and grid for localization."""
     a, d = content.arrays, content.description
-    reflectors = Reflectors(
-        a['reflector_map_keys'], a['reflector_map'], a['reflector_cov'], a['reflector_map_ids'],
-        a['reflector_map_sightings'], a['reflector_map_diameters'],
-    )  # fmt: skip
-    if 'grid' not in a:
-        return SavedMap(reflectors)
-    (x, y), yaw = d['grid']['origin'], float(d['grid'].get('yaw', 0.0))
-    grid = OccupancyGrid(float(d['grid']['resolution']), (x, y), a['grid'], yaw)
-    return SavedMap(reflectors, grid)
+    with consistent():
+        reflectors = Reflectors(
+            a['reflector_map_keys'], a['reflector_map'], a['reflector_cov'],
+            a['reflector_map_ids'], a['reflector_map_sightings'], a['reflector_map_diameters'],
+        )  # fmt: skip
+        if 'grid' not in a:
+            return SavedMap(reflectors)
+        (x, y), yaw = d['grid']['origin'], float(d['grid'].get('yaw', 0.0))
+        grid = OccupancyGrid(float(d['grid']['resolution']), (x, y), a['grid'], yaw)
+        return SavedMap(reflectors, grid)
 
 
 def survey_of(content: Content) -> Survey | None:
@@ -168,11 +183,9 @@ def restore(content: Content, back_end: BackEnd) -> None:
     survey.
     """
     a = content.arrays
-    try:
+    with consistent():
         fill(back_end.graph, a)
         saved_state.restore(back_end, _keyframes(a), a, survey_of(content))
-    except (KeyError, IndexError, ValueError, SolverError) as e:
-        raise FileFormatError(f'the parts of the map are inconsistent: {e}') from e
 
 
 def revoked(content: Content, number: int) -> tuple[Content, Closure]:

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""YAML whose cost is bounded by the size of its text."""
+
+import time
+
+import pytest
+
+from rlml_slam.errors import FileFormatError
+from rlml_slam.plain_yaml import MAX_CHARACTERS, parse_yaml
+
+BOMB = 'a0: &a0 [x]\n' + ''.join(
+    f'a{k}: &a{k} [{", ".join([f"*a{k - 1}"] * 9)}]\n' for k in range(1, 12)
+)
+
+
+def test_plain_values_are_read():
+    assert parse_yaml('a: [1, 2.5, x]\nb: {c: true}', 'f') == {
+        'a': [1, 2.5, 'x'],
+        'b': {'c': True},
+    }
+
+
+@pytest.mark.parametrize(
+    ('text', 'why'),
+    [
+        (BOMB, 'an alias is not allowed here'),
+        ('a: &a\n  b: *a', 'an alias is not allowed here'),
+        ('a: 2001-99-99', 'not YAML'),
+        ('[' * 2000, 'not YAML'),
+        ('a: ' + '9' * 5000, 'not YAML'),
+        ('a: [', 'not YAML'),
+        ('!!python/object:os.system x', 'not YAML'),
+        ('x' * (MAX_CHARACTERS + 1), 'more than'),
+    ],
+)
+def test_others_are_refused_at_once(text, why):
+    began = time.monotonic()
+    with pytest.raises(FileFormatError, match=f'^file.yaml: .*{why}'):
+        parse_yaml(text, 'file.yaml')
+    assert time.monotonic() - began < 20.0
