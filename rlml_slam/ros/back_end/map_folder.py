@@ -110,12 +110,11 @@ class MapFolder:
         """
         path = self.path(name)
         try:
-            files = self.automatic(name)
-            old = [file for file in files if now - file.stat().st_mtime > LOST_AGE]
+            old = [f for f in self.automatic(name) if now - f.stat().st_mtime > LOST_AGE]
             for file in old:
                 file.unlink(missing_ok=True)
                 file.with_name(file.name + map_container.PREVIOUS).unlink(missing_ok=True)
-            size = sum(file.stat().st_size for file in files if file not in old)
+            size = sum(file.stat().st_size for file in self.automatic(name))
         except OSError as e:
             raise MapError(f'{path}: {e.filename}: {e.strerror}') from e
         if size > LOST_BYTES:
