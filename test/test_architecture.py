@@ -134,7 +134,7 @@ def test_folder_has_at_most_15_files(folder):
 MAX_CLASS = 250  # lines
 # of the installed package; the goal is 40 000. Raised for journal, guard, nav2, devices, motion
 # hypotheses
-MAX_LINES = 45_300
+MAX_LINES = 45_500
 MAX_LONG_LISTS = 25  # functions of more than 8 arguments
 MAX_WORDS = 60  # in code and docs, the changelog aside
 # the present sizes of the classes that are larger
