@@ -87,6 +87,7 @@ COMMANDS: Table = {
             ),
         },
     ),
+    'convert': Command('rlml_lab.datasets.convert', 'public data sets become bags'),
     'results': Command('rlml_lab.results', 'the page of benchmarks, from docs/benchmarks.json'),
     'bench': Group(
         'measured speed and quality against other libraries',

@@ -36,6 +36,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 PACKAGE = 'rlml_slam'
+LAB = 'rlml_lab'
 BYTES = ('trajectory.tum', 'front_end.tum', 'map.pgm', 'map.yaml', 'reflectors.csv')
 NUMBERS = ('closures.csv', 'reflector_states.csv')
 MAP, METRICS = 'map.rlml', 'metrics.json'
@@ -97,7 +98,7 @@ def cases() -> dict[str, Case]:
 
 
 def conversions(data: Path) -> dict[str, tuple[str | Path, ...]]:
-    """What ``rlml convert`` is given for each bag, without the bag's own name."""
+    """What ``convert`` of rlml or rlml-lab is given for each bag, without the bag's own name."""
     out: dict[str, tuple[str | Path, ...]] = {
         name: ('carmen', _benchmark(data, name, 'rebuilt.log.xz')) for name in SETS
     }
@@ -145,7 +146,8 @@ def bag_of(places: Places, name: str) -> Path:
         unfinished = places.bags / f'.unfinished-{os.getpid()}'
         unfinished.mkdir(parents=True, exist_ok=True)
         try:
-            done = rlml(places, 'convert', *command, unfinished / name)
+            module = PACKAGE if command[0] == 'carmen' else LAB
+            done = _python(places, '-m', module, 'convert', *command, unfinished / name)
             if done.returncode:
                 raise PinError(f'{name} is not converted: {done.stderr.strip()}')
             os.rename(unfinished / name, bag)

@@ -132,16 +132,14 @@ def test_folder_has_at_most_15_files(folder):
 # --- a ratchet: lower these limits as the code gets better, never raise them ----------------
 
 MAX_CLASS = 250  # lines
-# of the installed package; the goal is 40 000. Raised for journal, guard, nav2, devices, motion
-# hypotheses
-MAX_LINES = 45_500
+MAX_LINES = 43_990  # of the installed package; the goal is 40 000
 MAX_LONG_LISTS = 25  # functions of more than 8 arguments
 MAX_WORDS = 60  # in code and docs, the changelog aside
 # the present sizes of the classes that are larger
 LARGER = {'Recorder': 268}
 # tests that need a study's scenes, drives or graphs; a new one belongs into test/lab
 TESTS_WITH_A_STUDY = {
-    'cli/test_doctor.py', 'cli/test_main.py', 'datasets/test_victoria_park.py',
+    'cli/test_doctor.py', 'cli/test_main.py',
     'deformable/test_deformable_slam.py', 'deformable/test_deformable_window.py',
     'graph/test_incremental_solver.py', 'graph/test_initialization.py', 'graph/test_solver.py',
     'nodes/test_deformable_node.py', 'sensing/test_reflector_detector.py',

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from rlml_lab.datasets.lego import BEAM_TIME, T_BASE_LASER, Lego
 from rlml_slam import se2
-from rlml_slam.datasets.lego import BEAM_TIME, T_BASE_LASER, Lego
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.params import Spikes
 from rlml_slam.se2 import Array

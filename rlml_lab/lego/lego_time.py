@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
+from rlml_lab.datasets.lego import T_BASE_LASER, Lego
 from rlml_lab.lego.lego_scale import Ranges
 from rlml_slam import se2
-from rlml_slam.datasets.lego import T_BASE_LASER, Lego
 from rlml_slam.se2 import Array
 
 STARTS = np.arange(-1.0, 1.01, 0.1)  # [s] a lag beyond is not looked for

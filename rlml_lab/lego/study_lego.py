@@ -11,10 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rlml_lab.lego.lego_scale import Ranges, at, fit_scale, ranges_of
-from rlml_lab.lego.lego_time import camera_lag, scan_lag
-from rlml_slam import se2
-from rlml_slam.datasets.lego import (
+from rlml_lab.datasets.lego import (
     CAMERA_LAG,
     LASER_FRAME,
     SCAN_LAG,
@@ -22,6 +19,9 @@ from rlml_slam.datasets.lego import (
     Lego,
     read_lego,
 )
+from rlml_lab.lego.lego_scale import Ranges, at, fit_scale, ranges_of
+from rlml_lab.lego.lego_time import camera_lag, scan_lag
+from rlml_slam import se2
 from rlml_slam.ekf.slam import EkfSlam
 from rlml_slam.maps.atomic_file import write_atomically
 from rlml_slam.params import EkfParameters, from_mapping, read_yaml

@@ -16,15 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from rlml_slam import se2, warm_up
-from rlml_slam.cli.support.progress import Progress
-from rlml_slam.datasets.tum import Trajectory
-from rlml_slam.datasets.victoria_park import (
+from rlml_lab.datasets.victoria_park import (
     LASER_FRAME,
     T_BASE_LASER,
     VictoriaPark,
     read_victoria_park,
 )
+from rlml_slam import se2, warm_up
+from rlml_slam.cli.support.progress import Progress
+from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.ekf.slam import EkfSlam
 from rlml_slam.evaluation.ate import trajectory_errors
 from rlml_slam.evaluation.run_record import FrameLog

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``rlml convert``: recorded data sets become bags, which everything else reads."""
+"""``rlml convert``: a recorded log becomes a bag, which everything else reads."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rlml_slam.datasets import carmen, lego, mrclam, victoria_park
+from rlml_slam.datasets import carmen
 from rlml_slam.datasets.text_file import SECOND
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.ros.bags.bag import BagWriter
@@ -45,8 +45,11 @@ class Recording:
 
 
 def add_parser(subparsers: Any) -> None:
-    """Declare ``rlml convert carmen``, ``mrclam``, ``victoria-park`` and ``lego``."""
-    parser = subparsers.add_parser('convert', help='recorded data sets become bags')
+    """Declare ``rlml convert carmen``."""
+    parser = subparsers.add_parser(
+        'convert', help='a recorded log becomes a bag',
+        epilog='In a checkout, rlml-lab convert reads MR.CLAM, Victoria Park and LEGO data sets.',
+    )  # fmt: skip
     kinds = parser.add_subparsers(dest='kind', metavar='FORMAT', required=True)
 
     log = kinds.add_parser('carmen', help='CARMEN log: FLASER, ROBOTLASER1, RAWLASER + ODOM')
@@ -58,36 +61,26 @@ def add_parser(subparsers: Any) -> None:
         '--field-of-view', type=float, metavar='DEG', help='span of the beams of FLASER lines'
     )
     log.add_argument('--strict', action='store_true', help='fail at the first broken line')
+    add_output_arguments(log)
 
-    clam = kinds.add_parser('mrclam', help='UTIAS MR.CLAM: landmarks become reflectors')
-    clam.add_argument(
-        'folder', metavar='DIR', type=Path, help='one data set, e.g. MRCLAM_Dataset6'
-    )
-    clam.add_argument('--robot', type=int, required=True, choices=range(1, 6), metavar='N')
-    clam.add_argument('--no-ids', action='store_true', help='the detections are anonymous')
-    clam.add_argument(
-        '--depths', action='store_true',
-        help="make ranges of what is logged as such: the camera's depths",
+
+def add_output_arguments(parser: argparse.ArgumentParser) -> None:
+    """The bag that is written, and how."""
+    parser.add_argument('bag', metavar='BAG', type=Path, help='folder to be written')
+    parser.add_argument(
+        '--format', choices=('mcap', 'sqlite3'),
+        help='storage of the bag (default: mcap, or sqlite3 if BAG ends with .db3)',
     )  # fmt: skip
-
-    park = kinds.add_parser('victoria-park', help='Victoria Park: tree trunks become reflectors')
-    park.add_argument('folder', metavar='DIR', type=Path, help='folder of the .mat files')
-
-    lego = kinds.add_parser('lego', help='LEGO robot among cylinders: scans, ticks, camera track')
-    lego.add_argument('folder', metavar='DIR', type=Path, help='folder of the robot4_*.txt files')
-
-    for p in (log, clam, park, lego):
-        p.add_argument('bag', metavar='BAG', type=Path, help='folder to be written')
-        p.add_argument(
-            '--format', choices=('mcap', 'sqlite3'),
-            help='storage of the bag (default: mcap, or sqlite3 if BAG ends with .db3)',
-        )  # fmt: skip
-        p.add_argument('--json', action='store_true', help='print one JSON object and no more')
+    parser.add_argument('--json', action='store_true', help='print one JSON object and no more')
 
 
 def run(args: argparse.Namespace) -> int:
     """Convert, and say what was written and what was left out."""
-    recording, counts = _READERS[args.kind](args)
+    return write(args, *_read_carmen(args))
+
+
+def write(args: argparse.Namespace, recording: Recording, counts: Mapping[str, int]) -> int:
+    """Write the bag that the arguments name, and say what is in it; the exit code."""
     written = write_recording(args.bag, recording, storage_of(args.bag, args.format))
     summary = {'bag': str(args.bag), 'messages': written, 'source': counts}
     if args.json:
@@ -121,50 +114,6 @@ def _read_carmen(args: argparse.Namespace) -> tuple[Recording, dict[str, int]]:
         )
     sensors = {carmen.LASER_FRAME: log.T_base_laser}
     return Recording(log.odometry, log.scans, sensors=sensors), dict(log.counts)
-
-
-def _read_mrclam(args: argparse.Namespace) -> tuple[Recording, dict[str, int]]:
-    data = mrclam.read_mrclam(args.folder, args.robot, not args.no_ids, args.depths)
-    n = len(data.landmark_ids)
-    known = Detections(
-        data.odometry[0].stamp, WORLD, data.landmark_points, np.zeros((n, 2, 2)),
-        data.landmark_ids, np.full(n, np.nan),
-    )  # fmt: skip
-    recording = Recording(
-        data.odometry, detections=data.detections, truth=data.truth, true_reflectors=known
-    )
-    return recording, dict(data.counts)
-
-
-def _read_victoria_park(args: argparse.Namespace) -> tuple[Recording, dict[str, int]]:
-    data = victoria_park.read_victoria_park(args.folder)
-    sensors = {victoria_park.LASER_FRAME: victoria_park.T_BASE_LASER}
-    recording = Recording(
-        data.odometry, detections=data.detections, sensors=sensors, truth=data.gps
-    )
-    return recording, dict(data.counts)
-
-
-def _read_lego(args: argparse.Namespace) -> tuple[Recording, dict[str, int]]:
-    data = lego.read_lego(args.folder)
-    n = len(data.landmarks)
-    known = Detections(
-        data.odometry[0].stamp, WORLD, data.landmarks, np.zeros((n, 2, 2)),
-        np.arange(n, dtype=np.int64), np.full(n, np.nan),
-    )  # fmt: skip
-    sensors = {lego.LASER_FRAME: lego.T_BASE_LASER}
-    recording = Recording(
-        data.odometry, data.scans, sensors=sensors, truth=data.track, true_reflectors=known
-    )
-    return recording, dict(data.counts)
-
-
-_READERS = {
-    'carmen': _read_carmen,
-    'mrclam': _read_mrclam,
-    'victoria-park': _read_victoria_park,
-    'lego': _read_lego,
-}
 
 
 def write_recording(

@@ -49,7 +49,7 @@ COMMANDS: Table = {
         'rlml_slam.cli.replay', 'run the system over a bag: no topics, deterministic'
     ),
     'live': Command('rlml_slam.cli.live', 'play a bag to the live nodes, then a report'),
-    'convert': Command('rlml_slam.cli.convert', 'recorded data sets become bags'),
+    'convert': Command('rlml_slam.cli.convert', 'a recorded log becomes a bag'),
     'evaluate': Command(
         'rlml_slam.cli.evaluate', 'errors of a trajectory against relations or ground truth'
     ),

@@ -11,12 +11,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from rlml_lab.lego.lego_scale import Ranges, fit_scale
-from rlml_lab.lego.lego_time import camera_lag, scan_lag
-from rlml_lab.lego.study_lego import camera_view
-from rlml_lab.main import main
-from rlml_slam import se2
-from rlml_slam.datasets.lego import (
+from rlml_lab.datasets.lego import (
     BEAM,
     BEAM_TIME,
     CAMERA_LAG,
@@ -29,6 +24,11 @@ from rlml_slam.datasets.lego import (
     Lego,
     read_lego,
 )
+from rlml_lab.lego.lego_scale import Ranges, fit_scale
+from rlml_lab.lego.lego_time import camera_lag, scan_lag
+from rlml_lab.lego.study_lego import camera_view
+from rlml_lab.main import main
+from rlml_slam import se2
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.errors import FileFormatError
 from rlml_slam.types import Odometry

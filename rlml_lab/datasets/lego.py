@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.datasets.mrclam import chain
+from rlml_lab.datasets.mrclam import chain
 from rlml_slam.datasets.text_file import parse_numbers, read_lines
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.errors import FileFormatError

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from rlml_lab.datasets.mrclam import HALF_VIEW, chain, read_mrclam
 from rlml_slam import se2
-from rlml_slam.datasets.mrclam import HALF_VIEW, chain, read_mrclam
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.errors import FileFormatError
 from rlml_slam.evaluation.ate import interpolate, trajectory_errors

@@ -11,8 +11,8 @@ import pytest
 import scipy.io
 from numpy.testing import assert_allclose, assert_array_equal
 
+from rlml_lab.datasets.victoria_park import HALF_TRACK, WHEEL_BASE, read_victoria_park
 from rlml_lab.main import main
-from rlml_slam.datasets.victoria_park import HALF_TRACK, WHEEL_BASE, read_victoria_park
 from rlml_slam.errors import FileFormatError
 
 SHARED = Path(__file__).resolve().parents[3] / 'shared' / 'data' / 'victoria-park'

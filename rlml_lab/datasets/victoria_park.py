@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import scipy.io
 
+from rlml_lab.datasets.mrclam import chain, from_polar
 from rlml_slam import se2
-from rlml_slam.datasets.mrclam import chain, from_polar
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.errors import FileFormatError
 from rlml_slam.se2 import Array
