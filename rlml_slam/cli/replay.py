@@ -38,7 +38,7 @@ from rlml_slam.slam.store import map_file
 
 # name -> the type of its parameters and its constructor
 SYSTEMS: Mapping[str, tuple[type[Any], Callable[[Any], Slam | EkfSlam]]] = {
-    'rlml': (Parameters, lambda params: Slam(params, parallel=True)),
+    'rlml': (Parameters, Slam),
     'ekf': (EkfParameters, EkfSlam),
 }
 
@@ -139,7 +139,7 @@ def replay(
         if surveyed is not None:
             if not isinstance(slam, Slam):
                 raise ParameterError('replay: --survey is for --system rlml')
-            slam = Slam(params, parallel=True, survey=surveyed)
+            slam = Slam(params, survey=surveyed)
         if begun is not None:
             if not isinstance(slam, Slam):
                 raise ParameterError('replay: --continue is for --system rlml')

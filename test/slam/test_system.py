@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -18,9 +17,7 @@ from made_worlds import (
 )
 
 from rlml_slam import se2
-from rlml_slam.errors import SolverError
-from rlml_slam.params import BackEnd, LoopClosure, Node, Parameters
-from rlml_slam.slam.offline import slam as slam_module
+from rlml_slam.params import Node, Parameters
 from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.types import Detections, Imu, Level, Odometry, Scan
 
@@ -216,74 +213,12 @@ def test_front_end_goes_on_from_the_newest_correction():
     assert checked > 3
 
 
-@pytest.mark.parametrize(('scan', 'reflectors'), [(True, False), (True, True), (False, True)])
-def test_back_end_in_a_process_changes_no_bit(scan, reflectors):
-    """Nor does it where the run is looked back on."""
-    sent = messages(ROOM, CURVE, scan=scan, reflectors=reflectors, rng=np.random.default_rng(5))
-    # small submaps, so that loops are closed on a short way
-    params = Parameters(
-        back_end=BackEnd(submap_size=4), loop_closure=LoopClosure(keyframe_interval=1)
-    )
-    slams = [Slam(params, parallel) for parallel in (False, True)]
-    one, other = ([f for m in sent for f in add(slam, m)] + slam.finish() for slam in slams)
-    assert [f.stamp for f in one] == [f.stamp for f in other]
-    assert sum(u.optimized for u in slams[0].updates) > 1
-    for a, b in zip(one, other, strict=True):
-        assert a.T_map_base.tobytes() == b.T_map_base.tobytes()
-        assert a.cov_map.tobytes() == b.cov_map.tobytes()
-        assert a.T_local_base.tobytes() == b.T_local_base.tobytes()
-    assert slams[0].trajectory()[1].tobytes() == slams[1].trajectory()[1].tobytes()
-
-
-def test_frames_wait_for_the_back_end_by_a_fixed_number(monkeypatch):
-    monkeypatch.setattr(slam_module, 'AHEAD', 7)
-    sent = messages(ROOM, CURVE, reflectors=False)
-    slam = Slam(Parameters(), parallel=True)
-    frames, processed = 0, 0
-    for m in sent:
-        frames += len(add(slam, m))
-        processed = slam.counts.get('scan', {}).get('used', 0)
-        assert frames == max(processed - 7, 0)
-    assert frames > 0
-    assert frames + len(slam.finish()) == len(CURVE)
-
-
-def failing(monkeypatch, how):
-    """A parallel system whose back end fails at the third frame."""
-
-    def add_(self, frame):
-        return how() if frame.stamp >= FIRST + 2 * STEP else None
-
-    monkeypatch.setattr(slam_module.BackEnd, 'add', add_)
-    return Slam(Parameters(), parallel=True)
-
-
-def to_the_end(slam):
-    for m in messages(ROOM, CURVE[:10], reflectors=False):
-        add(slam, m)
-    slam.finish()
-
-
-def test_error_in_the_back_ends_process_is_raised_here(monkeypatch):
-    def fail():
-        raise SolverError('no solution')
-
-    slam = failing(monkeypatch, fail)
-    with pytest.raises(SolverError, match='no solution'):
-        to_the_end(slam)
-
-
-def test_end_of_the_back_ends_process_is_told(monkeypatch):
-    slam = failing(monkeypatch, lambda: os._exit(3))
-    with pytest.raises(RuntimeError, match='exit code 3'):
-        to_the_end(slam)
-
-
-def test_map_can_be_asked_for_while_frames_wait():
-    slam = Slam(Parameters(), parallel=True)
+def test_map_can_be_asked_for_on_the_way():
+    slam = Slam(Parameters())
     for m in messages(ROOM, CURVE[:30], reflectors=False):
         add(slam, m)
     grid = slam.map().grid
     assert grid is not None
     assert (grid.cells == 100).sum() > 50
-    assert len(slam.finish()) == len(slam.trajectory()[0]) == 30
+    assert len(slam.finish()) == 0
+    assert len(slam.trajectory()[0]) == 30

@@ -23,8 +23,7 @@ from rlml_slam.sensing.synchronization.synchronized_system import SynchronizedSy
 from rlml_slam.slam import conversation as say
 from rlml_slam.slam.back_end.back_end import BackEnd, Update
 from rlml_slam.slam.front_end.front_end import FrontEnd
-from rlml_slam.slam.front_end_session import FrontEndSession, is_lost
-from rlml_slam.slam.offline.back_end_process import BackEndProcess
+from rlml_slam.slam.front_end_session import FrontEndSession
 from rlml_slam.slam.offline.batch_reassociation import BatchReassociation
 from rlml_slam.slam.relocalization.pose_test import locate
 from rlml_slam.slam.relocalization.scan_relocalization import Relocation
@@ -32,28 +31,15 @@ from rlml_slam.slam.store import map_file
 from rlml_slam.slam.system import System
 from rlml_slam.types import Frame, Observation, Reflectors
 
-AHEAD = 1000  # frames that the front end may be ahead of the back end
-
 
 class Slam(SynchronizedSystem):
     """Synchronizer, front end and back end, with the conductor's commands executed at once.
-
-    With ``parallel`` the back end works in a process of its own, up to AHEAD frames behind, and
-    frames come later by as many; they are the same to the last bit. The front end's local frame
-    does not depend on the back end, as long as there are no reflectors and the robot is not lost:
-    with the first reflector both take turns for good, and at a lost frame once. The front end's
-    times in milliseconds are then those of the processor, without the waits for one another, as
-    the back end's are in any case.
 
     Answers of searches come ``search_delay`` [s] of stamps late, as they do on a robot.
     """
 
     def __init__(
-        self,
-        params: Parameters,
-        parallel: bool = False,
-        survey: Survey | None = None,
-        search_delay: float = 0.0,
+        self, params: Parameters, survey: Survey | None = None, search_delay: float = 0.0
     ) -> None:
         super().__init__(params)
         self.session = FrontEndSession(params)
@@ -66,16 +52,11 @@ class Slam(SynchronizedSystem):
         self.answers: dict[int, say.Answer] = {}
         self._params, self._survey = params, survey
         self._path: list[tuple[int, Array]] = []
-        self._parallel = parallel
-        self._apart: BackEndProcess | None = None
-        self._pending: deque[tuple[say.MapFrame, float, Array]] = deque()
         self._loaded: BackEnd | None = None
         self._delay = int(search_delay * 1e9)
         self._late: deque[tuple[int, int, Relocation]] = deque()
-        self._out: list[Frame] = []
         self._observation: Observation | None = None
-        self._newest: Frame | None = None  # None once it waits for the back end
-        self._spent = 0.0
+        self._newest: Frame | None = None  # what the observation came to in the end
         front_end = self.session.execute
         self._executes: Mapping[type, Callable[[Any], None]] = {
             say.StartSession: self._start_session,
@@ -107,7 +88,6 @@ class Slam(SynchronizedSystem):
 
         Raises FileFormatError if the parts of the map do not fit together; then all is as it was.
         """
-        self._take_turns()
         loaded = BackEnd(self._params, self._survey)
         map_file.restore(content, loaded)
         self._loaded = loaded
@@ -118,8 +98,6 @@ class Slam(SynchronizedSystem):
     def finish(self) -> list[Frame]:
         """Everything that still waits; then the last optimisation."""
         frames = self.process(self.synchronizer.flush())
-        self._take_turns()
-        frames += self._taken()
         if self.system.map is None and self.system.entry is None:
             self.back_end.finish()
             self._look_back()
@@ -142,25 +120,18 @@ class Slam(SynchronizedSystem):
 
     def process(self, observations: Iterable[Observation]) -> list[Frame]:
         """What the synchronizer made of the inputs."""
+        frames: list[Frame] = []
         for observation in observations:
-            if self.system.map is not None or observation.detections:
-                self._take_turns()
             self._deliver_late(observation.stamp)
-            began = time.thread_time()
             self._observation = observation
             record = self.session.process(observation)
-            self._spent = 1e3 * (time.thread_time() - began)
             self.batch_reassociation.add(observation, record.frame)
             self._give(record)
-            if self._newest is not None:
-                if self.system.map is not None:
-                    self._path.append((self._newest.stamp, self._newest.T_map_base))
-                self._out.append(self._newest)
-        return self._taken()
-
-    def _taken(self) -> list[Frame]:
-        out, self._out = self._out, []
-        return out
+            assert self._newest is not None
+            if self.system.map is not None:
+                self._path.append((self._newest.stamp, self._newest.T_map_base))
+            frames.append(self._newest)
+        return frames
 
     def _give(self, record: say.SessionFrame) -> None:
         self._newest = record.frame
@@ -182,41 +153,21 @@ class Slam(SynchronizedSystem):
             self._give(self.session.process(replace(observation, motion=STILL)))
 
     def _map_frame(self, command: say.MapFrame) -> None:
-        frame = command.frame
-        if self._parallel:
-            self._apart = self._apart or BackEndProcess(self.back_end, _add)
-            self._apart.add(frame)
-            late = self.front_end.late(frame.observation.stamp_sigma)
-            self._pending.append((command, self._spent, frame.cov_local + late))
-            self._newest = None
-            self._settle(0 if is_lost(frame) else AHEAD)
-            return
-        update = _add(self.back_end, frame)
+        update = self._timed_add(command.frame)
         if update is not None:
             belief = self.back_end.belief() if update.optimized else None
             self.updates.append(update)
-            self.execute(self.system.on_update(command.session, frame.stamp, update, belief))
+            self.execute(
+                self.system.on_update(command.session, command.frame.stamp, update, belief)
+            )
 
-    def _take_turns(self) -> None:
-        """End the back end's process, if there is one, after the frames that waited for it."""
-        self._settle(0)
-        if self._apart is not None:
-            self.back_end = self._apart.bring_home()
-            self._apart = None
-        self._parallel = False
-
-    def _settle(self, most: int) -> None:
-        """Put out the oldest of the frames that wait, so that ``most`` are left."""
-        while len(self._pending) > most:
-            assert self._apart is not None
-            command, spent, cov = self._pending.popleft()
-            frame = command.frame
-            T_map_base, cov_map = self.front_end.in_map(frame.T_local_base, cov)
-            self._out.append(replace(frame, T_map_base=T_map_base, cov_map=cov_map, wall_ms=spent))
-            update = self._apart.update()
-            if update is not None:
-                self.updates.append(update)
-                self.execute(self.system.on_update(command.session, frame.stamp, update, None))
+    def _timed_add(self, frame: Frame) -> Update | None:
+        """One frame to the back end; with the time of the processor."""
+        began = time.thread_time()
+        update = self.back_end.add(frame)
+        if update is None:
+            return None
+        return replace(update, wall_ms=1e3 * (time.thread_time() - began))
 
     # --- searches and maps as commands -----------------------------------------------------------
 
@@ -239,7 +190,6 @@ class Slam(SynchronizedSystem):
         self.back_end, self._loaded = self._loaded, None
 
     def _forget_map(self, _: say.ForgetMap) -> None:
-        self._take_turns()
         self.back_end.reset()
 
     # --- the user's requests ---------------------------------------------------------------------
@@ -263,8 +213,6 @@ class Slam(SynchronizedSystem):
         """The map as it is now, or the one that never changes."""
         if self.system.map is not None:
             return self.system.map
-        if self._apart is not None:
-            return self._apart.map()
         return SavedMap(self.back_end.reflectors(), self.back_end.occupancy_grid())
 
     def trajectory(self) -> tuple[NDArray[np.int64], Array]:
@@ -283,12 +231,3 @@ class Slam(SynchronizedSystem):
         """The map of the scans, None without any."""
         saved = self.system.map
         return self.back_end.occupancy_grid() if saved is None else saved.grid
-
-
-def _add(back_end: BackEnd, frame: Frame) -> Update | None:
-    """One frame to the back end, in whatever process; with the time of the processor."""
-    began = time.thread_time()
-    update = back_end.add(frame)
-    if update is None:
-        return None
-    return replace(update, wall_ms=1e3 * (time.thread_time() - began))
