@@ -16,9 +16,6 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.cli.replay import collect
-from rlml_slam.cli.replay import replay as run_replay
-from rlml_slam.cli.support.bag_inputs import BagInputs
 from rlml_slam.datasets.tum import Trajectory, read_tum
 from rlml_slam.errors import InputError, MapError
 from rlml_slam.evaluation.ate import trajectory_errors
@@ -30,6 +27,9 @@ from rlml_slam.maps.map_container import Content
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Parameters, from_mapping, read_yaml
+from rlml_slam.replay.bag_inputs import BagInputs
+from rlml_slam.replay.bag_replay import replay as run_replay
+from rlml_slam.replay.products import collect
 from rlml_slam.report.outputs import write_outputs
 from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.sensor_input import SensorInput

@@ -12,7 +12,6 @@ import numpy as np
 from rlml_lab.ekf.association_truth import AssociationLog, association_figures
 from rlml_lab.support.drives import observe, process, simulate
 from rlml_slam import se2
-from rlml_slam.cli.replay import collect
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.ekf.slam import EkfSlam
 from rlml_slam.estimation.landmark_models import POINT
@@ -20,6 +19,7 @@ from rlml_slam.evaluation.ate import trajectory_errors
 from rlml_slam.evaluation.metrics import metrics
 from rlml_slam.evaluation.run_record import FrameLog
 from rlml_slam.params import EkfParameters, SimulatorParameters, from_mapping
+from rlml_slam.replay.products import collect
 from rlml_slam.simulation.simulation import Message
 from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.types import Odometry

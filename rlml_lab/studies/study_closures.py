@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from rlml_slam import params, se2, warm_up
-from rlml_slam.cli.support.bag_inputs import BagInputs
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.evaluation.relations import Relations, nearest, read_relations, relation_errors
 from rlml_slam.graph.batch.initialization import initialize
 from rlml_slam.graph.batch.solver import optimize
 from rlml_slam.graph.model.graph import Graph
+from rlml_slam.replay.bag_inputs import BagInputs
 from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.se2 import Array

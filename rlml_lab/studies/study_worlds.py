@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 
 from rlml_slam import warm_up
-from rlml_slam.cli.replay import collect
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.errors import ParameterError
 from rlml_slam.evaluation.metrics import metrics
 from rlml_slam.evaluation.run_record import FrameLog, Run, Truth
 from rlml_slam.params import Parameters, SimulatorParameters, from_mapping, read_yaml
+from rlml_slam.replay.products import collect
 from rlml_slam.report.outputs import write_outputs
 from rlml_slam.simulation.simulation import GroundTruth, Simulation
 from rlml_slam.simulation.world_file import load_world

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rlml_slam.datasets.tum import Trajectory, write_tum
-from rlml_slam.graph.g2o import write_graph
-from rlml_slam.graph.model.graph import Graph
+from rlml_slam.graph import Graph, write_graph
 from rlml_slam.maps import nav2_map, reflector_file
 from rlml_slam.maps.map_container import Content
 from rlml_slam.report.outputs import make_folder

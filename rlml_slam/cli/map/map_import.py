@@ -18,8 +18,7 @@ from rlml_slam import warm_up
 from rlml_slam.cli.map.map_info import contents
 from rlml_slam.datasets.tum import read_tum
 from rlml_slam.errors import FileFormatError, MapError
-from rlml_slam.graph.g2o import read_graph
-from rlml_slam.graph.model.graph import Graph
+from rlml_slam.graph import Graph, read_graph
 from rlml_slam.maps import map_container, nav2_map, reflector_file
 from rlml_slam.maps.map_container import Content
 from rlml_slam.params import Parameters

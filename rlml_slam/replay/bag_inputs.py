@@ -26,7 +26,7 @@ _TF_SAMPLE = 500  # messages of /tf that are searched for a sensor that /tf_stat
 
 
 class BagInputs:
-    """Iterate for (log time [ns], stream of ros/feed.py, message) in log order.
+    """Iterate for (log time [ns], stream of ros/sensor_input.py, message) in log order.
 
     ``topics`` by stream, as ``params`` ask for them, and ``more_scans`` those of further lidars;
     ``extrinsics`` knows the static transforms of the whole bag.

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rlml_slam.cli.support.bag_inputs import BagInputs
 from rlml_slam.params import Parameters
+from rlml_slam.replay.bag_inputs import BagInputs
 from rlml_slam.ros.bags.bag import BagReader, BagWriter
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_bag

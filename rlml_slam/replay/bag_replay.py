@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Replay of a bag: the system driven by its messages, in the order of the log."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rlml_slam import warm_up
+from rlml_slam.ekf.slam import EkfSlam
+from rlml_slam.errors import BagError, InputError, ParameterError
+from rlml_slam.evaluation.run_record import FrameLog, Run, Truth
+from rlml_slam.maps.map_container import Content
+from rlml_slam.maps.saved_map import SavedMap
+from rlml_slam.maps.survey import Survey
+from rlml_slam.params import EkfParameters, Parameters
+from rlml_slam.replay.bag_inputs import BagInputs
+from rlml_slam.replay.products import collect, fates, sources, survey_figures
+from rlml_slam.ros.bags.bag import BagReader
+from rlml_slam.ros.sensor_input import SensorInput
+from rlml_slam.slam.offline.slam import Slam
+from rlml_slam.slam.store import map_file
+
+# name -> the type of its parameters and its constructor
+SYSTEMS: Mapping[str, tuple[type[Any], Callable[[Any], Slam | EkfSlam]]] = {
+    'rlml': (Parameters, Slam),
+    'ekf': (EkfParameters, EkfSlam),
+}
+
+
+def replay(
+    path: str | Path,
+    params: Parameters,
+    truth: Truth | None = None,
+    system: str = 'rlml',
+    known: SavedMap | None = None,
+    begun: Content | None = None,
+    surveyed: Survey | None = None,
+    progress: Callable[[float, str], None] = lambda share, note: None,
+) -> Run:
+    """Drive the system with a bag's messages in the order of the log.
+
+    ``truth`` replaces that of the bag; ``known`` is a map to localize in, from the pose
+    ``map_start_pose`` or from where the robot finds itself, ``begun`` one to go on with;
+    ``surveyed`` reflectors define the frame of the map. ``progress`` is called with the share that
+    is done and a note. A damaged bag, or one whose clock jumps
+    back, gives what came before, and ``Run.problem`` says so. Raises BagError if there is nothing
+    to use at all.
+    """
+    warm_up.compile_loaded()
+    with BagReader(path) as bag:
+        params = _patient(params)
+        inputs = BagInputs(bag, params)
+        slam = SYSTEMS[system][1](params)
+        if known is not None:
+            if not isinstance(slam, Slam):
+                raise ParameterError('replay: --map is for --system rlml')
+            slam = Slam(replace(params, node=replace(params.node, mode='localization')))
+            slam.use_map(known)
+        if surveyed is not None:
+            if not isinstance(slam, Slam):
+                raise ParameterError('replay: --survey is for --system rlml')
+            slam = Slam(params, survey=surveyed)
+        if begun is not None:
+            if not isinstance(slam, Slam):
+                raise ParameterError('replay: --continue is for --system rlml')
+            slam.continue_map(begun)
+        log, problem = FrameLog(), ''
+        began = time.perf_counter()
+        try:
+            _drive(slam, params, inputs, log, (bag.start, bag.end), progress)
+        except BagError as e:
+            problem = str(e)
+        except InputError as e:
+            problem = f'{path}: {e}'
+        log.add(slam.finish())
+        wall = time.perf_counter() - began
+        problem = problem or bag.damage
+        if not log.stamps:
+            why = problem or slam.synchronizer.inputs.last_error or 'no scan and no reflectors'
+            raise BagError(f'{path}: nothing in it could be used: {why}')
+        truth = truth or inputs.truth()
+        if truth is not None and surveyed is not None:
+            truth = replace(truth, is_map=False)  # the bag knows nothing of the survey
+        result = collect(slam, log, Path(path).resolve().name, truth)
+        if isinstance(slam, Slam) and known is None:
+            result.stored = map_file.content_of(slam.back_end, params, result.grid)
+            result.extra = survey_figures(slam.back_end)
+        result.inputs = fates(slam.counts, bag.skipped, inputs.topics)
+        result.topics = sources(inputs.topics, inputs.more_scans)
+    result.wall_s = wall
+    ended = f'{problem}; the results hold what came before' if problem else ''
+    result.problem = '; '.join(filter(None, (ended, result.problem)))
+    return result
+
+
+def _patient(params: Parameters) -> Parameters:
+    """Nobody waits for the pose: a pause of the odometry that can be bridged is waited for."""
+    n = params.node
+    longest = max(n.transform_timeout, params.motion.max_gap)
+    return replace(params, node=replace(n, transform_timeout=longest))
+
+
+def _drive(
+    slam: Slam | EkfSlam,
+    params: Parameters,
+    inputs: BagInputs,
+    log: FrameLog,
+    span: tuple[int, int],
+    progress: Callable[[float, str], None],
+) -> None:
+    """Feed all inputs, the same way as the live nodes do."""
+    feed = SensorInput(params, slam, slam.synchronizer.inputs)
+    feed.extrinsics = inputs.extrinsics
+    began, (start, end) = time.perf_counter(), span
+    for k, (log_time, stream, message) in enumerate(inputs):
+        log.add(feed.add(stream, message))
+        if k % 200 == 0:
+            done = log_time - start
+            factor = done * 1e-9 / max(time.perf_counter() - began, 1e-3)
+            progress(done / max(end - start, 1), f'{factor:.0f} x real time')
