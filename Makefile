@@ -56,8 +56,7 @@ $(DOCS)/.made: $(wildcard requirements/docs-*.txt)
 	@touch $@
 
 config: env  ## write config/*.yaml from the declared parameters
-	@for name in default simulator deformable_slam carrier_simulator ekf_slam \
-	  reflector_detector; do \
+	@for name in default simulator deformable_slam ekf_slam reflector_detector; do \
 	  $(BIN)/python -m rlml_lab.support.config_file $$name.yaml >config/.new && \
 	  mv config/.new config/$$name.yaml; done
 

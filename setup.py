@@ -10,7 +10,7 @@ from setuptools import find_packages, setup
 NAME = 'rlml_slam'
 NODES = (
     'front_end', 'back_end', 'slam', 'simulator', 'bag_player', 'deformable_slam',
-    'carrier_simulator', 'ekf_slam', 'reflector_detector',
+    'ekf_slam', 'reflector_detector',
 )  # fmt: skip
 
 ABOUT = ElementTree.parse(Path(__file__).with_name('package.xml')).getroot()

@@ -140,7 +140,7 @@ def test_folder_has_at_most_15_files(folder):
 # --- a ratchet: lower these limits as the code gets better, never raise them ----------------
 
 MAX_CLASS = 250  # lines
-MAX_LINES = 43_700  # of the installed package; the goal is 40 000
+MAX_LINES = 43_171  # of the installed package; the goal is 40 000
 MAX_LONG_LISTS = 25  # functions of more than 8 arguments
 MAX_WORDS = 60  # in code and docs, the changelog aside
 # the present sizes of the classes that are larger
@@ -221,7 +221,7 @@ sys.exit(main(['replay', '--help']))
 def test_nodes_need_no_rosbags():
     """A stock ROS 2 has no rosbags; only bags need it."""
     for name in (
-        'front_end', 'back_end', 'slam', 'simulator', 'deformable_slam', 'carrier_simulator',
+        'front_end', 'back_end', 'slam', 'simulator', 'deformable_slam',
     ):  # fmt: skip
         seen, todo = set(), [f'rlml_slam.nodes.{name}']
         while todo:

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from rlml_lab import results
+from rlml_lab.carrier.carrier_parameters import CarrierParameters
 from rlml_lab.main import COMMANDS as LAB
 from rlml_slam.cli.main import COMMANDS, Group, build_parser
 from rlml_slam.params import (
-    CarrierParameters,
     DeformableParameters,
     DetectorParameters,
     EkfParameters,

@@ -18,6 +18,7 @@ from typing import Any
 
 from rlml_lab.bench.bench_back_end import read_graphs
 from rlml_lab.bench.generated_graphs import city
+from rlml_lab.bench.graduated_non_convexity import graduate
 from rlml_lab.bench.rivals import single_thread, timed
 from rlml_lab.bench.robust_cases import (
     EXACT,
@@ -36,7 +37,6 @@ from rlml_slam.graph.model.factors import FactorKind, Losses
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.graph.model.robust_loss import Loss, LossKind
 from rlml_slam.graph.robust.closure_selection import select_closures
-from rlml_slam.graph.robust.graduated_non_convexity import graduate
 
 COUNTS = ('0', '10', '50', '100', '500', '1000', '20%')
 KERNEL = 1.0  # sigmas, of Cauchy and DCS

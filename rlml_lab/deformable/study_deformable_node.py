@@ -23,13 +23,14 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 
+from rlml_lab.carrier.carrier_parameters import Carrier
 from rlml_lab.deformable.scoring import chi2_bounds
 from rlml_lab.deformable.study_deformable_window import KINDS
 from rlml_slam.cli.support.live_session import held_interrupts, node, own_domain
 from rlml_slam.cli.support.processes import Processes, free_domain
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.errors import RlmlError
-from rlml_slam.params import Carrier, MotionNoise, Reflector
+from rlml_slam.params import MotionNoise, Reflector
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.codecs.message_types import rclpy_class
 from rlml_slam.ros.sensors import SENSOR
@@ -145,7 +146,10 @@ def run_node(
         try:
             processes.start('deformable_slam', node('deformable_slam', noise_parameters()))
             listen_until(lambda: ear.count_publishers('features') > 0, START_TIMEOUT)
-            processes.start('carrier_simulator', node('carrier_simulator', simulated))
+            processes.start(
+                'carrier_simulator',
+                ['rlml_lab.carrier.carrier_simulator', *node('carrier_simulator', simulated)[1:]],
+            )
             listen_until(lambda: ear.time() > 0.0, START_TIMEOUT)
             patience = START_TIMEOUT + 10.0 * duration / rate
             listen_until(lambda: ear.time() >= min(SETTLED, 0.5 * duration), patience)

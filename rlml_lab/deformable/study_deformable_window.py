@@ -19,13 +19,14 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
 
+from rlml_lab.carrier.carrier import CarrierStep, simulate_carrier, true_features
+from rlml_lab.carrier.carrier_parameters import Carrier
 from rlml_lab.deformable.scoring import chi2_bounds
 from rlml_lab.support.parallel_jobs import each
 from rlml_slam.deformable.slam import DeformableSlam
 from rlml_slam.deformable.window import CarrierVelocity, WindowEstimate
-from rlml_slam.params import Carrier, DeformableParameters
+from rlml_slam.params import DeformableParameters
 from rlml_slam.se2 import Array, wrap
-from rlml_slam.simulation.carrier import CarrierStep, simulate_carrier, true_features
 from rlml_slam.types import Observation
 
 KINDS = ('train', 'conveyor')

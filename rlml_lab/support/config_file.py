@@ -8,7 +8,6 @@ import sys
 from typing import Any
 
 from rlml_slam.params import (
-    CarrierParameters,
     Declaration,
     DeformableParameters,
     DetectorParameters,
@@ -24,7 +23,6 @@ FILES: dict[str, tuple[type[Any], str]] = {
     'deformable_slam.yaml': (DeformableParameters, 'Every parameter of deformable_slam'),
     'ekf_slam.yaml': (EkfParameters, 'Every parameter of ekf_slam and `rlml replay --system ekf`'),
     'reflector_detector.yaml': (DetectorParameters, 'Every parameter of reflector_detector'),
-    'carrier_simulator.yaml': (CarrierParameters, 'Every parameter of carrier_simulator'),
 }
 
 

@@ -14,7 +14,6 @@ from rlml_slam.cli.support.interface import SERVICES, TOPICS
 from rlml_slam.errors import FileFormatError
 from rlml_slam.maps.atomic_file import write_atomically
 from rlml_slam.params import (
-    CarrierParameters,
     Declaration,
     DeformableParameters,
     DetectorParameters,
@@ -133,6 +132,5 @@ TABLES: Mapping[str, Callable[[], str]] = {
     'simulator parameters': lambda: parameter_table(SimulatorParameters),
     'deformable parameters': lambda: parameter_table(DeformableParameters, 'deformable.'),
     'detector parameters': lambda: parameter_table(DetectorParameters, 'detector.'),
-    'carrier parameters': lambda: parameter_table(CarrierParameters),
     'player parameters': lambda: parameter_table(PlayerParameters),
 }

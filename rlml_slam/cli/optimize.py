@@ -17,7 +17,6 @@ from rlml_slam.graph.model.factors import Losses
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.graph.model.robust_loss import Loss, LossKind
 from rlml_slam.graph.robust.closure_selection import select_closures
-from rlml_slam.graph.robust.graduated_non_convexity import graduate
 
 INIT = ('auto', 'none', 'odometry', 'spanning_tree', 'chordal')
 METHODS = ('auto', 'gauss_newton', 'levenberg_marquardt', 'dog_leg')
@@ -36,9 +35,9 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--method', choices=METHODS, default='auto', help='how steps are chosen')
     parser.add_argument(
         '--robust',
-        choices=[*(kind.name.lower() for kind in LossKind), 'gnc', 'select'],
+        choices=[*(kind.name.lower() for kind in LossKind), 'select'],
         default='none',
-        help='loss of closures and sightings; gnc: truncated, by graduated non-convexity; '
+        help='loss of closures and sightings; '
         'select: closures that agree with odometry and each other, the surest first',
     )
     parser.add_argument('--scale', type=float, default=2.0, help='scale of the loss, in sigmas')
@@ -86,15 +85,11 @@ def run(args: argparse.Namespace) -> int:
 
 def _solve(graph: Graph, robust: str, parameters: params.Solver) -> tuple[Solution, list[int]]:
     """The solution, and the edges that were disabled on the way (indices in the file)."""
-    if robust not in ('select', 'gnc'):
+    if robust != 'select':
         return optimize(graph, parameters), []
     before, began = graph.chi2(), time.perf_counter()
-    if robust == 'select':
-        chosen = select_closures(graph, parameters)
-        refused = chosen.edges[~chosen.accepted].tolist()
-    else:
-        graduated = graduate(graph, parameters)
-        refused = graduated.edges[graduated.weights < 0.5].tolist()
+    chosen = select_closures(graph, parameters)
+    refused = chosen.edges[~chosen.accepted].tolist()
     solution = optimize(graph, parameters)
     wall_ms = (time.perf_counter() - began) * 1e3
     # without losses the cost is chi2

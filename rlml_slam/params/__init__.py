@@ -8,7 +8,6 @@ tested against them.
 """
 
 from rlml_slam.params.back_end import BackEnd, LoopClosure, Relocalization, Solver
-from rlml_slam.params.carrier import Carrier, CarrierParameters, CarrierRun
 from rlml_slam.params.declaration import Declaration, Group, declarations, param
 from rlml_slam.params.deformable import Deformable
 from rlml_slam.params.detector import Detector
@@ -38,9 +37,6 @@ __all__ = [
     'NODES',
     'ROS_OWN',
     'BackEnd',
-    'Carrier',
-    'CarrierParameters',
-    'CarrierRun',
     'Declaration',
     'Deformable',
     'DeformableParameters',

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rlml_slam.params.back_end import BackEnd, LoopClosure, Relocalization, Solver
-from rlml_slam.params.carrier import CarrierParameters
 from rlml_slam.params.deformable import Deformable
 from rlml_slam.params.detector import Detector
 from rlml_slam.params.ekf import Ekf, Ransac, Spikes
@@ -68,7 +67,6 @@ NODES: Mapping[type[Any], tuple[str, ...]] = {
     DeformableParameters: ('deformable_slam',),
     DetectorParameters: ('reflector_detector',),
     SimulatorParameters: ('simulator',),
-    CarrierParameters: ('carrier_simulator',),
     PlayerParameters: ('bag_player',),
 }
 # parameters that ROS gives to every node

@@ -12,10 +12,10 @@ from rlml_slam.cli.docs import TABLES, filled, parameter_table
 from rlml_slam.cli.main import main
 from rlml_slam.cli.support.interface import SERVICES, TOPICS
 from rlml_slam.errors import FileFormatError
-from rlml_slam.params import CarrierParameters, Parameters, SimulatorParameters, declarations
+from rlml_slam.params import Parameters, SimulatorParameters, declarations
 
 NODES = (
-    'front_end', 'back_end', 'simulator', 'deformable_slam', 'carrier_simulator',
+    'front_end', 'back_end', 'simulator', 'deformable_slam',
     'reflector_detector',
 )  # fmt: skip
 ROOT = Path(__file__).resolve().parents[2]
@@ -32,7 +32,7 @@ def test_docs_are_up_to_date():
     assert wanted.removeprefix('run: ') in contributing
 
 
-@pytest.mark.parametrize('of', [Parameters, SimulatorParameters, CarrierParameters])
+@pytest.mark.parametrize('of', [Parameters, SimulatorParameters])
 def test_every_parameter_has_its_row(of):
     rows = parameter_table(of).splitlines()[2:]
     assert [row.split('`')[1] for row in rows] == [d.name for d in declarations(of)]
@@ -73,7 +73,6 @@ def nodes():
     from rclpy.parameter import Parameter
 
     from rlml_slam.nodes.back_end import BackEndNode
-    from rlml_slam.nodes.carrier_simulator import CarrierSimulatorNode
     from rlml_slam.nodes.deformable_slam import DeformableSlamNode
     from rlml_slam.nodes.front_end import FrontEndNode
     from rlml_slam.nodes.reflector_detector import ReflectorDetectorNode
@@ -90,7 +89,6 @@ def nodes():
         BackEndNode(context=context),
         SimulatorNode(context=context, parameter_overrides=drive),
         DeformableSlamNode(context=context, parameter_overrides=suggest),
-        CarrierSimulatorNode(context=context),
         ReflectorDetectorNode(context=context),
     ]
     yield {node.get_name(): node for node in made}

@@ -5,6 +5,8 @@ from itertools import islice, pairwise
 import numpy as np
 import pytest
 
+from rlml_lab.carrier.carrier import simulate_carrier
+from rlml_lab.carrier.carrier_parameters import Carrier
 from rlml_lab.deformable.scoring import chi2_bounds
 from rlml_slam.deformable.active import offsets
 from rlml_slam.deformable.bridge import bridge
@@ -15,7 +17,6 @@ from rlml_slam.deformable.velocity import MAX_KEPT, VelocityHistory
 from rlml_slam.deformable.window import CarrierVelocity, DeformableWindow
 from rlml_slam.errors import SolverError
 from rlml_slam.params import (
-    Carrier,
     Deformable,
     DeformableParameters,
     MotionNoise,
@@ -25,7 +26,6 @@ from rlml_slam.params import (
 )
 from rlml_slam.se2 import compose, exp, wrap
 from rlml_slam.sensing.synchronization.synchronizer import Synchronizer
-from rlml_slam.simulation.carrier import simulate_carrier
 from rlml_slam.types import Level, Motion, Observation, Odometry
 
 SECOND = 1_000_000_000

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from differences import central_differences
 
+from rlml_lab.carrier.carrier import simulate_carrier, true_features
+from rlml_lab.carrier.carrier_parameters import Carrier
 from rlml_lab.deformable.scoring import chi2_bounds
 from rlml_slam.deformable.window import CarrierVelocity, DeformableWindow
 from rlml_slam.deformable.window_equations import carry, motion_covariance, motion_information
 from rlml_slam.errors import InputError
-from rlml_slam.params import Carrier, Deformable, Reflector
+from rlml_slam.params import Deformable, Reflector
 from rlml_slam.se2 import wrap
-from rlml_slam.simulation.carrier import simulate_carrier, true_features
 from rlml_slam.types import Motion, Status
 
 EXACT = {

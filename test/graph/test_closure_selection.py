@@ -5,55 +5,24 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from made_graphs import loop_graph
+from made_graphs import SIGMA, WRONG, laps, loop_graph, spoil
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
 from rlml_slam import params, se2
-from rlml_slam.graph.batch.gauss_newton import gauss_newton
 from rlml_slam.graph.batch.marginals import Marginals
 from rlml_slam.graph.batch.solver import optimize
 from rlml_slam.graph.model import factors
 from rlml_slam.graph.model.factors import FactorKind, Losses
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.graph.model.robust_loss import Loss, LossKind
-from rlml_slam.graph.robust import graduated_non_convexity
 from rlml_slam.graph.robust.closure_selection import ROUNDS, _Selector, select_closures
-from rlml_slam.graph.robust.graduated_non_convexity import graduate, truncated_weights
 from rlml_slam.graph.robust.inlier_evidence import NU, evidence, fit_scale, uniform
 from rlml_slam.graph.robust.pairwise_consistency import group
 from rlml_slam.graph.robust.spanning_forest import SpanningForest
 from rlml_slam.types import EdgeKind
 
-SIGMA = np.array([0.03, 0.03, 0.01])
 EXACT = params.Solver(max_iterations=100, relative_tolerance=1e-12)
-
-
-def laps(seed=0, laps=3, per_lap=60, turned=0.0, losses=None):
-    """A robot on laps of a circle, with closures to every third pose of the lap before."""
-    rng = np.random.default_rng(seed)
-    phi = 2.0 * np.pi * np.arange(laps * per_lap) / per_lap
-    truth = np.stack([10 * np.cos(phi), 10 * np.sin(phi), se2.wrap(phi + np.pi / 2)], -1)
-    truth = se2.compose([5.0 * turned, -turned, turned], truth)
-    graph = Graph(losses)
-    graph.add_poses(truth)
-    graph.fixed_poses[0] = True
-    n = len(truth)
-    pairs = [(i, i + 1) for i in range(n - 1)] + [
-        (i, i + per_lap) for i in range(0, n - per_lap, 3)
-    ]
-    for i, j in pairs:
-        kind = EdgeKind.ODOMETRY if j == i + 1 else EdgeKind.CLOSURE
-        delta = se2.compose(se2.between(truth[i], truth[j]), SIGMA * rng.standard_normal(3))
-        graph.add_edge(kind, i, j, delta, np.diag(SIGMA**-2))
-    return graph
-
-
-def spoil(graph, pairs):
-    """Closures that say that two far poses are one."""
-    return [
-        graph.add_edge(EdgeKind.CLOSURE, i, j, np.zeros(3), np.diag(SIGMA**-2)) for i, j in pairs
-    ]
 
 
 def restated(source, factors):
@@ -64,9 +33,6 @@ def restated(source, factors):
     kinds = [EdgeKind.CLOSURE if k == FactorKind.CLOSURE else EdgeKind.ODOMETRY for k in e.kinds]
     graph.add_edges(kinds, e.nodes, e.measured, e.information * np.outer(factors, factors))
     return graph
-
-
-WRONG = [(3, 33), (10, 95), (44, 140), (70, 100), (20, 170), (21, 52), (90, 175), (5, 130)]
 
 
 def optimum(graph):
@@ -240,44 +206,6 @@ def test_a_graph_without_closures_is_only_optimised():
     chosen = select_closures(graph)
     assert len(chosen.edges) == 0
     assert graph.chi2() == pytest.approx(0.0, abs=1e-12)
-
-
-def test_weights_of_graduated_non_convexity_are_those_of_the_paper():
-    s = np.array([0.0, 1.0, 3.9, 4.1, 100.0])
-    assert_array_equal(truncated_weights(s, 2.0, 1e6) > 0.5, s < 4.0)
-    mu = 0.7  # in between: the formula of the paper, continuous at both ends
-    low, high = mu / (mu + 1.0) * 4.0, (mu + 1.0) / mu * 4.0
-    assert_allclose(truncated_weights(np.array([0.0, low, high]), 2.0, mu), [1, 1, 0], atol=1e-12)
-    middle = truncated_weights(np.array([4.0]), 2.0, mu)
-    assert_allclose(middle, np.sqrt(mu * (mu + 1.0)) - mu)
-
-
-def test_graduated_non_convexity_disables_a_few_wrong_closures():
-    graph = laps()
-    wrong = spoil(graph, WRONG[:3])
-    graduated = graduate(graph, EXACT)
-    refused = graduated.edges[graduated.weights < 0.5]
-    assert set(wrong) <= set(refused)
-    # the truncation at 99 % costs some of the right ones as well
-    assert len(refused) - len(wrong) <= 2
-    assert_array_equal(np.flatnonzero(~graph.edges.enabled), refused)
-
-
-def test_every_round_of_graduated_non_convexity_starts_where_the_first_did(monkeypatch):
-    starts = []
-
-    def spy(system, poses, *rest):
-        starts.append(poses.copy())
-        return gauss_newton(system, poses, *rest)
-
-    monkeypatch.setattr(graduated_non_convexity, 'gauss_newton', spy)
-    graph = laps()
-    spoil(graph, WRONG)
-    graph.poses[1:, 0] += 0.1
-    before = graph.poses.copy()
-    assert graduate(graph, EXACT).rounds == len(starts) > 1
-    for start in starts:
-        assert_array_equal(start, before)
 
 
 def test_closures_that_take_turns_are_judged_a_bounded_number_of_times(monkeypatch):

@@ -107,7 +107,7 @@ class Process:
         env |= {'ROS_DOMAIN_ID': str(DOMAIN), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
         env['PYTHONPATH'] = os.pathsep.join([str(ROOT), env.get('PYTHONPATH', '')])
         self._process = subprocess.Popen(
-            [sys.executable, '-m', f'rlml_slam.nodes.{name}', *args],
+            [sys.executable, '-m', name if '.' in name else f'rlml_slam.nodes.{name}', *args],
             env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         )  # fmt: skip
 

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 from rclpy.qos import QoSProfile
 
+from rlml_lab.carrier.carrier import simulate_carrier
+from rlml_lab.carrier.carrier_messages import CarrierMessages
+from rlml_lab.carrier.carrier_parameters import Carrier, CarrierParameters
 from rlml_lab.deformable import study_deformable_node as study
 from rlml_lab.deformable.scoring import chi2_bounds
 from rlml_slam.deformable.window import CarrierVelocity
 from rlml_slam.errors import InputError
 from rlml_slam.nodes.deformable_slam import DeformableSlamNode
-from rlml_slam.params import Carrier, CarrierParameters
 from rlml_slam.ros.codecs import decode, encode
 from rlml_slam.ros.codecs.message_types import make_rclpy as make
-from rlml_slam.ros.systems.carrier_messages import CarrierMessages
 from rlml_slam.ros.systems.deformable_messages import build_velocity, read_features
-from rlml_slam.simulation.carrier import simulate_carrier
 
 SECOND = 1_000_000_000
 SECONDS = 12
@@ -64,7 +64,10 @@ def test_processes_follow_a_carrier_within_their_covariances(kind, ids):
 
 @pytest.mark.parametrize(
     ('node', 'name', 'value'),
-    [('deformable_slam', 'deformable.suggest', 'loudly'), ('carrier_simulator', 'rate', -1.0)],
+    [
+        ('deformable_slam', 'deformable.suggest', 'loudly'),
+        ('rlml_lab.carrier.carrier_simulator', 'rate', -1.0),
+    ],
 )
 def test_wrong_parameter_is_one_line_and_exit_code_1(start, node, name, value):
     code, out = start(node, *arguments(**{name: value})).finish()

@@ -90,3 +90,35 @@ def range_graph(
             r = np.hypot(*(points[k] - truth[i, :2])) + noise * sigma_range * rng.standard_normal()
             graph.add_range(i, k, max(r, 0.0), sigma_range**-2.0)
     return graph, truth, points
+
+
+# sigmas [m, rad] of the edges of laps, and wrong closures for spoil
+SIGMA = np.array([0.03, 0.03, 0.01])
+WRONG = [(3, 33), (10, 95), (44, 140), (70, 100), (20, 170), (21, 52), (90, 175), (5, 130)]
+
+
+def laps(seed=0, laps=3, per_lap=60, turned=0.0, losses=None):
+    """A robot on laps of a circle, with closures to every third pose of the lap before."""
+    rng = np.random.default_rng(seed)
+    phi = 2.0 * np.pi * np.arange(laps * per_lap) / per_lap
+    truth = np.stack([10 * np.cos(phi), 10 * np.sin(phi), se2.wrap(phi + np.pi / 2)], -1)
+    truth = se2.compose([5.0 * turned, -turned, turned], truth)
+    graph = Graph(losses)
+    graph.add_poses(truth)
+    graph.fixed_poses[0] = True
+    n = len(truth)
+    pairs = [(i, i + 1) for i in range(n - 1)] + [
+        (i, i + per_lap) for i in range(0, n - per_lap, 3)
+    ]
+    for i, j in pairs:
+        kind = EdgeKind.ODOMETRY if j == i + 1 else EdgeKind.CLOSURE
+        delta = se2.compose(se2.between(truth[i], truth[j]), SIGMA * rng.standard_normal(3))
+        graph.add_edge(kind, i, j, delta, np.diag(SIGMA**-2))
+    return graph
+
+
+def spoil(graph, pairs):
+    """Closures that say that two far poses are one."""
+    return [
+        graph.add_edge(EdgeKind.CLOSURE, i, j, np.zeros(3), np.diag(SIGMA**-2)) for i, j in pairs
+    ]

@@ -160,16 +160,6 @@ TOPICS = (
           'how to see the features best; only with `deformable.suggest`'),
     Topic('deformable_slam', OUT, '/diagnostics', 'diagnostic_msgs/DiagnosticArray', RELIABLE,
           '1 Hz: health with reasons, inputs, p99 of the time per update'),
-    Topic('carrier_simulator', OUT, 'carrier_velocity', 'geometry_msgs/TwistStamped', RELIABLE,
-          'nominal velocity from the stamp on'),
-    Topic('carrier_simulator', OUT, 'odom', 'nav_msgs/Odometry', SENSOR, 'wheel odometry'),
-    Topic('carrier_simulator', OUT, 'reflectors', CLOUD, SENSOR,
-          'detections, anonymous with `carrier.ids:=false`'),
-    Topic('carrier_simulator', OUT, 'ground_truth', 'nav_msgs/Odometry', RELIABLE,
-          'true pose in the map'),
-    Topic('carrier_simulator', OUT, 'ground_truth_features', CLOUD, RELIABLE,
-          'true places of the features'),
-    Topic('carrier_simulator', OUT, '/clock', 'rosgraph_msgs/Clock', RELIABLE, 'simulated time'),
 )  # fmt: skip
 
 SERVICES = (

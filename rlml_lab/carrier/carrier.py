@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.params import Carrier
+from rlml_lab.carrier.carrier_parameters import Carrier
 from rlml_slam.se2 import Array, between, compose, exp, rotation
 from rlml_slam.types import ANONYMOUS, Detections, Motion
 

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from rlml_lab.carrier.carrier import CarrierStep
+from rlml_lab.carrier.carrier_parameters import CarrierParameters
 from rlml_slam.deformable.window import CarrierVelocity
-from rlml_slam.params import CarrierParameters
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import Make, make_rclpy, rclpy_class
 from rlml_slam.ros.systems.deformable_messages import build_velocity
 from rlml_slam.se2 import compose
-from rlml_slam.simulation.carrier import CarrierStep
 from rlml_slam.simulation.simulation import START
 from rlml_slam.types import Detections
 

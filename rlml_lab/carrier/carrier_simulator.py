@@ -12,12 +12,12 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
-from rlml_slam.params import CarrierParameters
+from rlml_lab.carrier.carrier import simulate_carrier
+from rlml_lab.carrier.carrier_messages import CarrierTopics
+from rlml_lab.carrier.carrier_parameters import CarrierParameters
 from rlml_slam.ros.declare import declare
 from rlml_slam.ros.playback_clock import PlaybackClock
 from rlml_slam.ros.run import run
-from rlml_slam.ros.systems.carrier_messages import CarrierTopics
-from rlml_slam.simulation.carrier import simulate_carrier
 from rlml_slam.simulation.robot import SECOND
 
 LINGER = 0.5  # [s] between the last message and the end of the process

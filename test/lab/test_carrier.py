@@ -4,9 +4,9 @@ from itertools import islice, pairwise
 import numpy as np
 import pytest
 
-from rlml_slam.params import Carrier
+from rlml_lab.carrier.carrier import simulate_carrier, true_features
+from rlml_lab.carrier.carrier_parameters import Carrier
 from rlml_slam.se2 import between, transform
-from rlml_slam.simulation.carrier import simulate_carrier, true_features
 
 
 def steps(count, seed=0, **settings):
