@@ -27,9 +27,9 @@ from rlml_slam.maps.map_container import Content
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Parameters, from_mapping, read_yaml
-from rlml_slam.replay.bag_inputs import BagInputs
-from rlml_slam.replay.bag_replay import replay as run_replay
-from rlml_slam.replay.products import collect
+from rlml_slam.recordings.bag_inputs import BagInputs
+from rlml_slam.recordings.bag_replay import replay as run_replay
+from rlml_slam.recordings.products import collect
 from rlml_slam.report.outputs import write_outputs
 from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.sensor_input import SensorInput

@@ -26,7 +26,7 @@ from rlml_slam import se2, warm_up
 from rlml_slam.errors import RlmlError
 from rlml_slam.evaluation.metrics import distribution
 from rlml_slam.params import Parameters, SimulatorParameters, from_mapping
-from rlml_slam.replay.bag_inputs import BagInputs
+from rlml_slam.recordings.bag_inputs import BagInputs
 from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.se2 import Array

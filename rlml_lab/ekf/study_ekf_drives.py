@@ -19,7 +19,7 @@ from rlml_slam.evaluation.ate import trajectory_errors
 from rlml_slam.evaluation.metrics import metrics
 from rlml_slam.evaluation.run_record import FrameLog
 from rlml_slam.params import EkfParameters, SimulatorParameters, from_mapping
-from rlml_slam.replay.products import collect
+from rlml_slam.recordings.products import collect
 from rlml_slam.simulation.simulation import Message
 from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.types import Odometry

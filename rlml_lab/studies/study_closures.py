@@ -25,7 +25,7 @@ from rlml_slam.evaluation.relations import Relations, nearest, read_relations, r
 from rlml_slam.graph.batch.initialization import initialize
 from rlml_slam.graph.batch.solver import optimize
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.replay.bag_inputs import BagInputs
+from rlml_slam.recordings.bag_inputs import BagInputs
 from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.se2 import Array

@@ -22,7 +22,7 @@ from rlml_slam.errors import ParameterError
 from rlml_slam.evaluation.metrics import metrics
 from rlml_slam.evaluation.run_record import FrameLog, Run, Truth
 from rlml_slam.params import Parameters, SimulatorParameters, from_mapping, read_yaml
-from rlml_slam.replay.products import collect
+from rlml_slam.recordings.products import collect
 from rlml_slam.report.outputs import write_outputs
 from rlml_slam.simulation.simulation import GroundTruth, Simulation
 from rlml_slam.simulation.world_file import load_world

@@ -10,7 +10,7 @@ from typing import Any
 from rlml_slam.cli.support.live_session import LISTENERS, Source, drive
 from rlml_slam.cli.support.recorder import Recorder
 from rlml_slam.params import Parameters, Player, from_mapping, read_yaml
-from rlml_slam.replay.bag_inputs import BagInputs
+from rlml_slam.recordings.bag_inputs import BagInputs
 from rlml_slam.report.outputs import make_folder, write_outputs
 from rlml_slam.report.summary import print_summary
 from rlml_slam.ros.bags.bag import BagReader

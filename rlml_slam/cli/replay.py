@@ -16,7 +16,7 @@ from rlml_slam.evaluation.run_record import Truth
 from rlml_slam.maps import saved_map, survey
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import from_mapping, read_yaml
-from rlml_slam.replay.bag_replay import SYSTEMS, replay
+from rlml_slam.recordings.bag_replay import SYSTEMS, replay
 from rlml_slam.report.outputs import make_folder, write_outputs
 from rlml_slam.report.summary import print_summary
 from rlml_slam.slam.store import map_file

@@ -16,8 +16,8 @@ from rlml_slam.cli.main import main
 from rlml_slam.datasets.tum import Trajectory, read_tum, write_tum
 from rlml_slam.maps import occupancy
 from rlml_slam.params import Parameters
-from rlml_slam.replay.bag_replay import replay
-from rlml_slam.replay.products import fates, sources
+from rlml_slam.recordings.bag_replay import replay
+from rlml_slam.recordings.products import fates, sources
 from rlml_slam.ros.bags.bag import BagWriter
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_bag

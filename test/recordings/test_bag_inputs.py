@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from rlml_slam.params import Parameters
-from rlml_slam.replay.bag_inputs import BagInputs
+from rlml_slam.recordings.bag_inputs import BagInputs
 from rlml_slam.ros.bags.bag import BagReader, BagWriter
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_bag

@@ -17,8 +17,8 @@ from rlml_slam.maps.map_container import Content
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.maps.survey import Survey
 from rlml_slam.params import EkfParameters, Parameters
-from rlml_slam.replay.bag_inputs import BagInputs
-from rlml_slam.replay.products import collect, fates, sources, survey_figures
+from rlml_slam.recordings.bag_inputs import BagInputs
+from rlml_slam.recordings.products import collect, fates, sources, survey_figures
 from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.slam.offline.slam import Slam
