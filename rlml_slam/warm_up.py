@@ -13,7 +13,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 OTHER_SYSTEMS = ('deformable', 'ekf')  # compiled when they are first used
-OUTER = ('ros', 'nodes', 'cli', 'datasets', 'evaluation', 'report')  # tiers without kernels
+# tiers without kernels
+OUTER = ('ros', 'nodes', 'cli', 'datasets', 'evaluation', 'recordings', 'report')
 
 
 def core_modules() -> Iterator[str]:

@@ -53,6 +53,8 @@ def imports(path: Path) -> set[str]:
             assert node.level == 0, f'{path}: relative import'
             assert node.module is not None
             found.add(node.module)
+            if '.' in node.module:  # a package's own file
+                found.add(f'{node.module}.__init__')
             # `from rlml_slam.ros import convert` imports a module as well
             if (ROOT / node.module.replace('.', '/')).is_dir():
                 found |= {f'{node.module}.{alias.name}' for alias in node.names}
@@ -128,6 +130,14 @@ def test_folders_import_one_way_at_every_level():
             tuple(TopologicalSorter(graph).static_order())
         except CycleError as e:
             pytest.fail(f'{level or "top"}: {" imports ".join(e.args[1])}')
+
+
+@pytest.mark.parametrize(
+    'path', [p for p in MODULES if PACKAGE / 'graph' not in p.parents], ids=name_of
+)
+def test_graph_is_used_through_its_facade(path):
+    inside = {name_of(p) for p in MODULES if PACKAGE / 'graph' in p.parents}
+    assert imports(path) & inside <= {'rlml_slam.graph.__init__'}
 
 
 @pytest.mark.parametrize(

@@ -11,12 +11,17 @@ from typing import Any
 
 from rlml_slam import params
 from rlml_slam.errors import FileFormatError
-from rlml_slam.graph.batch.solver import Solution, optimize
-from rlml_slam.graph.g2o import read_graph, write_graph
-from rlml_slam.graph.model.factors import Losses
-from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.model.robust_loss import Loss, LossKind
-from rlml_slam.graph.robust.closure_selection import select_closures
+from rlml_slam.graph import (
+    Graph,
+    Loss,
+    Losses,
+    LossKind,
+    Solution,
+    optimize,
+    read_graph,
+    select_closures,
+    write_graph,
+)
 
 INIT = ('auto', 'none', 'odometry', 'spanning_tree', 'chordal')
 METHODS = ('auto', 'gauss_newton', 'levenberg_marquardt', 'dog_leg')

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.graph.model.factors import FactorKind
-from rlml_slam.graph.model.graph import Graph
+from rlml_slam.graph import FactorKind, Graph
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import Make
 from rlml_slam.se2 import Array

@@ -12,10 +12,7 @@ from numpy.typing import NDArray
 from rlml_slam import se2
 from rlml_slam.errors import MapError
 from rlml_slam.estimation.correction import ReferencePose
-from rlml_slam.graph.incremental.online_solver import OnlineSolver
-from rlml_slam.graph.model.factors import Losses, relative_information
-from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.model.robust_loss import Loss, LossKind
+from rlml_slam.graph import Graph, Loss, Losses, LossKind, OnlineSolver, relative_information
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.survey import Survey, same
 from rlml_slam.params import Parameters

@@ -29,9 +29,7 @@ from rlml_slam.estimation.correction import (
     either,
     positive,
 )
-from rlml_slam.graph.incremental.online_solver import OnlineSolver
-from rlml_slam.graph.model.factor_table import FactorTable
-from rlml_slam.graph.model.graph import Graph
+from rlml_slam.graph import FactorTable, Graph, OnlineSolver
 from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.closure_records import ClosureRecords
 from rlml_slam.slam.keyframes import Keyframe

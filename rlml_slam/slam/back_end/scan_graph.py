@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.graph.model.graph import Graph
+from rlml_slam.graph import Graph
 from rlml_slam.matching.scans import scan_information, voxel_filter
 from rlml_slam.matching.scans.scan_match import match
 from rlml_slam.matching.scans.submap import Submap

@@ -16,11 +16,14 @@ from scipy.spatial import cKDTree
 
 from rlml_slam import se2
 from rlml_slam.errors import SolverError
-from rlml_slam.graph.incremental.online_solver import OnlineSolver
-from rlml_slam.graph.model.factors import FactorKind
-from rlml_slam.graph.model.graph import Renumbering
-from rlml_slam.graph.reduction.edge_pruning import prune_edges
-from rlml_slam.graph.reduction.marginalization import RelativePoses, marginalize_pose
+from rlml_slam.graph import (
+    FactorKind,
+    OnlineSolver,
+    RelativePoses,
+    Renumbering,
+    marginalize_pose,
+    prune_edges,
+)
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.back_end.scan_graph import ScanGraph

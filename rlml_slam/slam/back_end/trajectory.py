@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.graph.model.factor_table import Column
+from rlml_slam.graph import Column
 from rlml_slam.se2 import Array
 
 Arrays = Mapping[str, NDArray[Any]]

@@ -16,8 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rlml_slam import se2
-from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.robust.path_bound import path_bound
+from rlml_slam.graph import Graph, path_bound
 from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.closure_matching import AMBIGUOUS, Match, SearchResult
 from rlml_slam.slam.closures.loop_closure import Closure

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rlml_slam import se2
-from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.robust.path_bound import path_bound
+from rlml_slam.graph import Graph, path_bound
 from rlml_slam.params import LoopClosure
 from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap

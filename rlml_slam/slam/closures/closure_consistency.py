@@ -17,10 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.graph.incremental.online_solver import OnlineSolver
-from rlml_slam.graph.model import factors
-from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.robust.inlier_evidence import evidence
+from rlml_slam.graph import Graph, OnlineSolver, evidence, relative_pose
 from rlml_slam.se2 import Array
 
 Ints = NDArray[np.int64]
@@ -50,7 +47,7 @@ def is_consistent(
     graph, between = solver.graph, _RelativeCovariance(solver, np.unique(nodes))
     wrong = np.broadcast_to(wrong, len(nodes))
     i, j = nodes.T
-    e = factors.relative_pose(graph.poses[i], graph.poses[j], deltas)[0]
+    e = relative_pose(graph.poses[i], graph.poses[j], deltas)[0]
     alone = evidence(e, between.covs(i, j) + covs, 1.0, wrong)
     agree = _agreement(graph, between, nodes, deltas, covs, wrong)
     ranges, positions = np.broadcast_to(view_range, len(nodes)), graph.poses[:, :2]
@@ -70,7 +67,7 @@ class _RelativeCovariance:
     def covs(self, i: Ints, j: Ints) -> Array:
         """Covariances (k, 3, 3) of the poses j (k,) relative to i (k,), in the axes of j."""
         X_i, X_j = self._poses[i], self._poses[j]
-        _, A, B = factors.relative_pose(X_i, X_j, se2.between(X_i, X_j))
+        _, A, B = relative_pose(X_i, X_j, se2.between(X_i, X_j))
         a, b = np.searchsorted(self._indices, i), np.searchsorted(self._indices, j)
         mixed = A @ self._joint[a, b] @ np.swapaxes(B, 1, 2)
         out: Array = mixed + np.swapaxes(mixed, 1, 2)

@@ -14,11 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.errors import SolverError
-from rlml_slam.graph.model import factors
-from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.model.robust_loss import weights
-from rlml_slam.graph.robust.closure_selection import select_closures
-from rlml_slam.graph.robust.inlier_evidence import evidence, uniform
+from rlml_slam.graph import (
+    Graph,
+    chi2,
+    evidence,
+    loss_weights,
+    relative_pose,
+    select_closures,
+    uniform,
+)
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.closure_records import ClosureRecords
@@ -104,11 +108,11 @@ class ClosureMonitor:
         """Record residuals and weights; whether any enabled one is more likely wrong."""
         graph = self._graph
         i, j = graph.edges.nodes[edges].T
-        e = factors.relative_pose(graph.poses[i], graph.poses[j], graph.edges.measured[edges])[0]
+        e = relative_pose(graph.poses[i], graph.poses[j], graph.edges.measured[edges])[0]
         information = graph.edges.information[edges]
-        s, on = factors.chi2(e, information), graph.edges.enabled[edges]
+        s, on = chi2(e, information), graph.edges.enabled[edges]
         loss = graph.losses.closure
-        w = np.where(on, weights(int(loss.kind), loss.scale, s), 0.0)
+        w = np.where(on, loss_weights(int(loss.kind), loss.scale, s), 0.0)
         last = np.array([status.weight for status in statuses])
         changed = np.isnan(last) | ((w == 0.0) != (last == 0.0)) | (np.abs(w - last) > WEIGHT_STEP)
         for k in np.flatnonzero(changed).tolist():

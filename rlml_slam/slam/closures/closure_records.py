@@ -14,8 +14,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.graph.model.factor_table import Column
-from rlml_slam.graph.model.graph import Renumbering
+from rlml_slam.graph import Column, Renumbering
 from rlml_slam.slam.closures.loop_closure import Closure, ClosureStatus, State
 
 RECORDS = 2000  # kept at most; beyond, the oldest rejected closures are removed

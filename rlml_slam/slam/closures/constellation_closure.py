@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rlml_slam import se2
-from rlml_slam.graph.model.graph import Graph
+from rlml_slam.graph import Graph
 from rlml_slam.matching.reflectors.constellation import Candidate, locate
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from rlml_slam import se2
-from rlml_slam.graph.model.factors import relative_information
+from rlml_slam.graph import relative_information
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.se2 import Array
 from rlml_slam.slam.front_end.submaps import GRID_TURN

@@ -23,9 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.graph.incremental.online_solver import OnlineSolver
-from rlml_slam.graph.model.graph import Renumbering
-from rlml_slam.graph.robust.inlier_evidence import uniform
+from rlml_slam.graph import OnlineSolver, Renumbering, uniform
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array

@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from rlml_slam.graph.model.factor_table import Column
+from rlml_slam.graph import Column
 from rlml_slam.types import ANONYMOUS
 
 # Seen from keyframe ``pose`` at ``z`` (2,) in its frame; ``factor`` of the graph, -1 without one.

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.graph.model.graph import Graph
+from rlml_slam.graph import Graph
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.keyframes import Interval, Keyframe

@@ -10,10 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.estimation.landmark_merging import MergeTest
-from rlml_slam.graph.batch.marginals import Marginals
-from rlml_slam.graph.incremental.online_solver import OnlineSolver
-from rlml_slam.graph.model.graph import Renumbering
-from rlml_slam.graph.reduction.marginalization import RelativePoses
+from rlml_slam.graph import Marginals, OnlineSolver, RelativePoses, Renumbering
 from rlml_slam.matching.reflectors.association import gate
 from rlml_slam.params import Reflector
 from rlml_slam.se2 import Array, transform

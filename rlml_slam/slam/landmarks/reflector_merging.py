@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rlml_slam.estimation.landmark_merging import MERGE_DISTANCE, MergeTest
-from rlml_slam.graph.incremental.online_solver import OnlineSolver
+from rlml_slam.graph import OnlineSolver
 from rlml_slam.se2 import Array
 from rlml_slam.slam.landmarks.landmark import Landmark
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.graph.model.factor_table import Column
+from rlml_slam.graph import Column
 from rlml_slam.se2 import Array
 from rlml_slam.slam.landmarks.landmark import Landmark
 

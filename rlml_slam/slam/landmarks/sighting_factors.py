@@ -8,10 +8,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.graph.incremental.online_solver import OnlineSolver
-from rlml_slam.graph.model.graph import Renumbering
-from rlml_slam.graph.reduction.edge_pruning import prune_sightings
-from rlml_slam.graph.reduction.marginalization import RelativePoses
+from rlml_slam.graph import OnlineSolver, RelativePoses, Renumbering, prune_sightings
 from rlml_slam.slam.landmarks.landmark import Landmark
 from rlml_slam.slam.landmarks.sighting_reduction import Records, fused, moved
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.graph.reduction.marginalization import RelativePoses, floored_covariance
+from rlml_slam.graph import RelativePoses, floored_covariance
 from rlml_slam.se2 import Array, rotation, transform
 from rlml_slam.slam.keyframes import SIGHTING_GATE
 

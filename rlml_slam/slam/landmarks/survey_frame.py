@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rlml_slam.graph.incremental.online_solver import OnlineSolver
+from rlml_slam.graph import OnlineSolver
 from rlml_slam.maps.survey import Survey
 from rlml_slam.matching.reflectors.association import gate
 from rlml_slam.matching.reflectors.pair_votes import MIN_MATCHES

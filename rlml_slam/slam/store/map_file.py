@@ -32,9 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.errors import FileFormatError, MapError, SolverError
-from rlml_slam.graph.model.factor_table import FactorTable
-from rlml_slam.graph.model.factors import FactorKind
-from rlml_slam.graph.model.graph import Graph
+from rlml_slam.graph import FactorKind, FactorTable, Graph
 from rlml_slam.maps import map_container
 from rlml_slam.maps.map_container import Content
 from rlml_slam.maps.occupancy import OccupancyGrid

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rlml_slam import se2
 from rlml_slam.errors import MapError
-from rlml_slam.graph.model.factors import relative_information
+from rlml_slam.graph import relative_information
 from rlml_slam.maps.map_container import Content
 from rlml_slam.maps.survey import same
 from rlml_slam.matching.reflectors.constellation import locate
