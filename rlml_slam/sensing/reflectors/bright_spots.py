@@ -11,11 +11,12 @@ import math
 from enum import IntEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlml_slam.compiled import kernel, part
 from rlml_slam.se2 import Array
-from rlml_slam.sensing.reflectors.spot_edges import GAP, angle_of, beside, edges_of
-from rlml_slam.sensing.reflectors.spot_settings import Settings
+from rlml_slam.sensing.reflectors.spot_edges import GAP, beside, edges_of
+from rlml_slam.sensing.reflectors.spot_settings import Beams, Settings, Spot, angle_of
 from rlml_slam.sensing.reflectors.spot_shape import CURVED, ROUGH, centre_of, is_flat
 
 LIT = 0.8  # share of a cylinder's diameter that shines back at least
@@ -26,6 +27,7 @@ WHOLE = 0.3  # share of its brightness down to which a thing of one depth is one
 # columns of what a bright spot is
 FATE, RANGE, BEARING, VAR_RANGE, VAR_BEARING, DIAMETER, BEAM, WIDTH, PEAK = range(9)
 COLUMNS = 9
+Ints = NDArray[np.int64]
 
 
 class Fate(IntEnum):
@@ -43,27 +45,24 @@ class Fate(IntEnum):
 
 
 @kernel
-def find(
-    ranges: Array,
-    bright: Array,
-    bound: Array,
-    angle_min: float,
-    increment: float,
-    circular: bool,
-    settings: Settings,
-) -> Array:
+def find(beams: Beams, bound: Array, settings: Settings) -> Array:
     """One row per bright spot; ``bound`` (n,) is the threshold of each beam."""
-    n = len(ranges)
-    step = abs(increment)
-    # a bright spot extends to where it falls below a share of the threshold
-    limit = settings.extent * bound
     size = max(settings.diameter, settings.flat_width)
-    jump = size + settings.size_tolerance + 3.0 * settings.sigma_range
-    # bright beams that touch each other, or nearly so
+    spans = _spans(beams, size + settings.size_tolerance + 3.0 * settings.sigma_range)
+    rows = np.zeros((len(spans), COLUMNS))
+    for s in range(len(spans)):
+        rows[s, FATE] = _examine(rows[s], spans[s, 0], spans[s, 1], beams, bound, settings).value
+    return rows
+
+
+@part
+def _spans(beams: Beams, jump: float) -> Ints:
+    """First and last of bright beams (m, 2) that touch each other, or nearly so."""
+    ranges, n, step = beams.ranges, len(beams.ranges), abs(beams.increment)
     spans = np.empty((n + 1, 2), np.int64)
     m = 0
     for k in range(n):
-        if not bright[k] > limit[k] or ranges[k] <= 0.0:
+        if not beams.bright[k] > beams.limit[k] or ranges[k] <= 0.0:
             continue
         if m > 0:
             last = spans[m - 1, 1]
@@ -73,93 +72,87 @@ def find(
                 continue
         spans[m, 0] = spans[m, 1] = k
         m += 1
-    if circular and m > 1:
+    if beams.circular and m > 1:
         first, last = spans[0, 0] + n, spans[m - 1, 1]
         is_near = first - last <= 2 or (first - last - 1) * step * ranges[last] <= GAP
         if is_near and abs(ranges[first - n] - ranges[last]) <= jump:
             spans[m - 1, 1] = spans[0, 1] + n
             spans[0] = spans[m - 1]
             m -= 1
-    rows = np.zeros((m, COLUMNS))
-    for s in range(m):
-        _judge(
-            rows[s], spans[s, 0], spans[s, 1], ranges, bright, limit, bound, angle_min, increment,
-            circular, settings,
-        )  # fmt: skip
-    return rows
+    return spans[:m]
 
 
 @part
-def _judge(
-    row: Array,
-    first: int,
-    last: int,
-    ranges: Array,
-    bright: Array,
-    limit: Array,
-    bound: Array,
-    angle_min: float,
-    increment: float,
-    circular: bool,
-    settings: Settings,
-) -> None:
-    """What the bright spot of beams ``first`` to ``last`` is."""
-    n = len(ranges)
-    step = abs(increment)
-    diameter, flat = settings.diameter, settings.flat_width
-    # means weighted by received power: whatever the width of the beam, those over all beams are
-    # the means over the surface
-    beams, power, peak = 0, 0.0, 0.0
+def _spot_of(first: int, last: int, beams: Beams, bound: Array) -> tuple[Spot, bool]:
+    """The bright spot of beams ``first`` to ``last``, and whether one exceeds its bound.
+
+    Means are weighted by received power: whatever the width of the beam, those over all beams are
+    the means over the surface.
+    """
+    n, num, power, peak = len(beams.ranges), 0, 0.0, 0.0
     is_bright = False
     r = bearing = middle = 0.0
-    start = angle_of(first, n, angle_min, increment)
+    start = angle_of(first, beams)
     for k in range(first, last + 1):
         j = k % n
-        if not bright[j] > limit[j]:
+        if not beams.bright[j] > beams.limit[j]:
             continue
-        is_bright = is_bright or bright[j] > bound[j]
-        beams += 1
-        power += bright[j]
-        peak = max(peak, bright[j])
-        r += bright[j] * ranges[j]
-        bearing += bright[j] * (angle_of(k, n, angle_min, increment) - start)
-        middle += bright[j] * k
-    r, bearing, middle = r / power, start + bearing / power, middle / power
-    span = r * abs(angle_of(last, n, angle_min, increment) - start)
-    row[RANGE], row[BEARING], row[BEAM], row[PEAK] = r, bearing, middle, peak
-    row[WIDTH] = span + r * step
+        is_bright = is_bright or beams.bright[j] > bound[j]
+        num += 1
+        power += beams.bright[j]
+        peak = max(peak, beams.bright[j])
+        r += beams.bright[j] * beams.ranges[j]
+        bearing += beams.bright[j] * (angle_of(k, beams) - start)
+        middle += beams.bright[j] * k
+    r = r / power
+    spacing = r * abs(beams.increment)
+    return Spot(
+        first, last, r, start + bearing / power, middle / power, num, peak, spacing
+    ), is_bright
+
+
+@part
+def _examine(
+    row: Array, first: int, last: int, beams: Beams, bound: Array, settings: Settings
+) -> Fate:
+    """What the bright spot of beams ``first`` to ``last`` is."""
+    spot, is_bright = _spot_of(first, last, beams, bound)
+    span = spot.range * abs(angle_of(last, beams) - angle_of(first, beams))
+    row[RANGE], row[BEARING] = spot.range, spot.bearing
+    row[BEAM], row[PEAK] = spot.middle, spot.peak
+    row[WIDTH] = span + spot.spacing
     if not is_bright:
-        row[FATE] = Fate.DIM.value
-        return
-    if beams < settings.min_beams:
-        row[FATE] = Fate.FEW.value
-        return
-    if r < settings.min_range or r > settings.max_range:
-        row[FATE] = Fate.RANGE.value
-        return
-    depth = 0.5 * max(diameter, flat) + 3.0 * settings.sigma_range
-    # whatever is as far away and not much darker belongs to it
-    more = beside(first, last, r, WHOLE * peak, depth, r * step, ranges, bright, circular)
-    whole = span + more * r * step
-    hidden, fading = edges_of(
-        first, last, r, peak, ranges, bright, limit, step, circular,
-        depth, settings,
-    )  # fmt: skip
+        return Fate.DIM
+    if spot.num < settings.min_beams:
+        return Fate.FEW
+    if spot.range < settings.min_range or spot.range > settings.max_range:
+        return Fate.RANGE
+    size = max(settings.diameter, settings.flat_width)
+    depth = 0.5 * size + 3.0 * settings.sigma_range
+    hidden, fading = edges_of(spot, beams, depth, settings)
     # glare that something cuts off looks like a reflector that something hides; where beams lie
     # far apart, what is nearer may also stand beside it
-    if hidden == 2 or (hidden and r * step < SPACED * max(diameter, flat)):
-        row[FATE] = Fate.HIDDEN.value
-        return
+    if hidden == 2 or (hidden and spot.spacing < SPACED * size):
+        return Fate.HIDDEN
     if fading:
-        row[FATE] = Fate.FADING.value
-        return
-    footprint = r * settings.divergence
-    spacing = r * step
+        return Fate.FADING
+    # whatever is as far away and not much darker belongs to it
+    whole = span + beside(spot, beams, WHOLE * spot.peak, depth) * spot.spacing
+    return _place(row, spot, beams, span, whole, hidden > 0, settings)
+
+
+@part
+def _place(
+    row: Array, spot: Spot, beams: Beams, span: float, whole: float, hidden: bool,
+    settings: Settings,
+) -> Fate:  # fmt: skip
+    """Range and variances of the shapes that fit, into ``row``; or why none does."""
+    footprint, spacing = spot.range * settings.divergence, spot.spacing
     weights, total = np.zeros(2), 0.0
     along, spread = np.zeros(2), np.zeros(2)
     narrow, wide = True, True
     for shape in range(2):
-        width = diameter if shape == 0 else flat
+        width = settings.diameter if shape == 0 else settings.flat_width
         if width <= 0.0:
             continue
         least = (LIT if shape == 0 else TILT) * width - settings.size_tolerance
@@ -168,36 +161,35 @@ def _judge(
         narrow, wide = narrow and is_narrow, wide and is_wide
         if is_narrow or is_wide:
             continue
-        along[shape], spread[shape] = centre_of(
-            0.5 * width if shape == 0 else 0.0, first, last, r, bearing, ranges, bright, limit,
-            angle_min, increment, footprint,
-        )  # fmt: skip
-        # at most what noise and the surface's own roughness leave: chi^2 by Wilson and Hilferty
-        share = 2.0 / (9.0 * max(beams - 1.0, 1.0))
-        noise = settings.sigma_range**2 * (1.0 - share + SIGMAS * math.sqrt(share)) ** 3
-        if beams >= CURVED and spread[shape] > noise + (ROUGH * width) ** 2:
+        radius = 0.5 * width if shape == 0 else 0.0
+        along[shape], spread[shape] = centre_of(radius, spot, beams, settings.divergence)
+        if spot.num >= CURVED and spread[shape] > _noise(spot, settings) + (ROUGH * width) ** 2:
             continue
-        if shape == 0 and not hidden and is_flat(
-            first, last, r, bearing, beams, spread[0], 0.5 * width, ranges, bright, limit,
-            angle_min, increment, circular, settings,
-        ):  # fmt: skip
+        if shape == 0 and not hidden and is_flat(spot, beams, spread[0], radius, settings):
             continue
         # each of the two edges is uniform within one spacing of beams: variance spacing^2 / 12
         var_width = spacing**2 / 6.0 + (0.5 * settings.size_tolerance) ** 2 + 1e-12
         weights[shape] = math.exp(-0.5 * (row[WIDTH] - width) ** 2 / var_width) + 1e-9
         total += weights[shape]
     if total == 0.0:
-        fate = Fate.NARROW if narrow else (Fate.WIDE if wide else Fate.DEEP)
-        row[FATE] = fate.value
-        return
+        return Fate.NARROW if narrow else (Fate.WIDE if wide else Fate.DEEP)
+    is_round = weights[0] >= weights[1]
     mean = (weights[0] * along[0] + weights[1] * along[1]) / total
     between = weights[0] * weights[1] / total**2 * (along[0] - along[1]) ** 2
-    width = diameter if weights[0] >= weights[1] else flat
+    width = settings.diameter if is_round else settings.flat_width
     row[RANGE] = mean
-    row[VAR_RANGE] = settings.sigma_range**2 / beams + settings.sigma_floor**2 + between
+    row[VAR_RANGE] = settings.sigma_range**2 / spot.num + settings.sigma_floor**2 + between
     # the middle of samples that lie ``spacing`` apart; one alone lies anywhere on the reflector
-    across = min(spacing, width + footprint) ** 2 / 12.0 / beams
+    across = min(spacing, width + footprint) ** 2 / 12.0 / spot.num
     if hidden:
         across += width**2 / 12.0
     row[VAR_BEARING] = across / mean**2 + settings.sigma_bearing**2
-    row[DIAMETER] = diameter if weights[0] >= weights[1] else np.nan
+    row[DIAMETER] = settings.diameter if is_round else np.nan
+    return Fate.FOUND
+
+
+@part
+def _noise(spot: Spot, settings: Settings) -> float:
+    """Bound of the mean square that noise leaves: of chi^2, by Wilson and Hilferty."""
+    share = 2.0 / (9.0 * max(spot.num - 1.0, 1.0))
+    return settings.sigma_range**2 * (1.0 - share + SIGMAS * math.sqrt(share)) ** 3

@@ -25,7 +25,7 @@ from rlml_slam.sensing.reflectors.bright_spots import (
     Fate,
     find,
 )
-from rlml_slam.sensing.reflectors.spot_settings import settings_of
+from rlml_slam.sensing.reflectors.spot_settings import Beams, settings_of
 from rlml_slam.sensing.reflectors.spot_shape import surface_depth
 from rlml_slam.types import ANONYMOUS, Detections, Scan
 
@@ -79,13 +79,13 @@ def detect(scan: Scan, params: Detector) -> Found:
     n = len(scan.ranges)
     if len(scan.intensities) != n or n == 0 or scan.angle_increment == 0.0:
         return _found(scan, np.zeros((0, COLUMNS)))
-    ranges, bright, limit = levels(scan, params)
-    rows = find(
-        ranges, bright, limit,
+    ranges, bright, bound = levels(scan, params)
+    settings = settings_of(params)
+    beams = Beams(
+        ranges, bright, settings.extent * bound,
         float(scan.angle_min), float(scan.angle_increment), is_circular(scan),
-        settings_of(params),
     )  # fmt: skip
-    return _found(scan, rows)
+    return _found(scan, find(beams, bound, settings))
 
 
 def threshold(scan: Scan, params: Detector) -> Array:

@@ -9,8 +9,7 @@ import numpy as np
 
 from rlml_slam.compiled import kernel, part
 from rlml_slam.se2 import Array
-from rlml_slam.sensing.reflectors.spot_edges import angle_of
-from rlml_slam.sensing.reflectors.spot_settings import Settings
+from rlml_slam.sensing.reflectors.spot_settings import Beams, Settings, Spot, angle_of
 
 PROFILE = 7  # samples of a beam's profile on either side of its middle
 BESIDE = 5  # beams on either side of a spot that are checked for a surface around it
@@ -21,94 +20,74 @@ SUNK = 0.5  # radius by which a cylinder is out of the line of what is beside it
 
 
 @part
-def is_flat(
-    first: int,
-    last: int,
-    r: float,
-    bearing: float,
-    beams: int,
-    spread: float,
-    radius: float,
-    ranges: Array,
-    bright: Array,
-    limit: Array,
-    angle_min: float,
-    increment: float,
-    circular: bool,
-    settings: Settings,
-) -> bool:
+def is_flat(spot: Spot, beams: Beams, spread: float, radius: float, settings: Settings) -> bool:
     """Whether what is bright is a part of a flat surface rather than a cylinder.
 
     It is flat if a plane fits its ranges better than a cylinder by FLATTER in chi^2, ``spread``
     being the mean squared residual of the cylinder; or if it lies in a surface that goes on
     straight at both sides, as paint and glare do: a cylinder stands out of what it is fixed to.
     """
-    footprint = r * settings.divergence
-    _, flat = centre_of(
-        0.0, first, last, r, bearing, ranges, bright, limit, angle_min, increment, footprint
-    )
+    _, flat = centre_of(0.0, spot, beams, settings.divergence)
     variance = settings.sigma_range**2
     better = spread - flat - (ROUGH * radius) ** 2
-    if beams >= CURVED and (beams - 1) * better > FLATTER * variance:
+    if spot.num >= CURVED and (spot.num - 1) * better > FLATTER * variance:
         return True
-    n = len(ranges)
-    # the line through two returns on each side, far enough not to be of a post or a plate that
-    # the reflector is a part of
     x, y = np.empty(4), np.empty(4)
-    m = 0
-    spacing = r * abs(increment)
-    clear = max(int(settings.min_separation / spacing - 0.5 * (last - first)) + 1, 2)
-    for side in (-1, 1):
-        outer = first if side < 0 else last
-        met = 0
-        for k in range(clear, clear + BESIDE):
-            j = outer + side * k
-            if not circular and not 0 <= j < n:
-                return False
-            if ranges[j % n] <= 0.0:
-                continue
-            off = angle_of(j, n, angle_min, increment) - bearing
-            x[m], y[m] = ranges[j % n] * math.sin(off), ranges[j % n] * math.cos(off)
-            met, m = met + 1, m + 1
-            if met == 2:
-                break
-        if met < 2:
-            return False
+    if not _beside_spot(spot, beams, settings, x, y):
+        return False
     mx, my = np.mean(x), np.mean(y)
     slope = np.sum((x - mx) * (y - my)) / np.sum((x - mx) ** 2)
     off_line = y - my - slope * (x - mx)
     if np.sum(off_line**2) > FLATTER * variance:
         return False
-    return bool(abs(my - slope * mx - r) < SUNK * radius)
+    return bool(abs(my - slope * mx - spot.range) < SUNK * radius)
 
 
 @part
-def centre_of(
-    radius: float,
-    first: int,
-    last: int,
-    r: float,
-    bearing: float,
-    ranges: Array,
-    bright: Array,
-    limit: Array,
-    angle_min: float,
-    increment: float,
-    footprint: float,
-) -> tuple[float, float]:
+def _beside_spot(spot: Spot, beams: Beams, settings: Settings, x: Array, y: Array) -> bool:
+    """Two returns on each side into x and y (4,), across and along; False where there are fewer.
+
+    They are far enough not to be of a post or a plate that the reflector is a part of.
+    """
+    n, m = len(beams.ranges), 0
+    clear = int(settings.min_separation / spot.spacing - 0.5 * (spot.last - spot.first)) + 1
+    clear = max(clear, 2)
+    for side in (-1, 1):
+        outer = spot.first if side < 0 else spot.last
+        met = 0
+        for k in range(clear, clear + BESIDE):
+            j = outer + side * k
+            if not beams.circular and not 0 <= j < n:
+                return False
+            r = beams.ranges[j % n]
+            if r <= 0.0:
+                continue
+            off = angle_of(j, beams) - spot.bearing
+            x[m], y[m] = r * math.sin(off), r * math.cos(off)
+            met, m = met + 1, m + 1
+            if met == 2:
+                break
+        if met < 2:
+            return False
+    return True
+
+
+@part
+def centre_of(radius: float, spot: Spot, beams: Beams, divergence: float) -> tuple[float, float]:
     """Range of the centre, and the variance that beams leave about it and a tilt."""
-    n = len(ranges)
+    n, r = len(beams.ranges), spot.range
+    footprint = r * divergence
     power = mean = squares = 0.0
     sx = sy = sxx = sxy = syy = 0.0
-    for k in range(first, last + 1):
+    for k in range(spot.first, spot.last + 1):
         j = k % n
-        if not bright[j] > limit[j]:
+        if not beams.bright[j] > beams.limit[j]:
             continue
-        off = angle_of(k, n, angle_min, increment) - bearing
+        off = angle_of(k, beams) - spot.bearing
         x = r * math.sin(off)
-        y = ranges[j] * math.cos(off) + surface_depth(x, 0.5 * footprint, radius)
+        y = beams.ranges[j] * math.cos(off) + surface_depth(x, 0.5 * footprint, radius)
         # by power: a beam that met the edge alone may have mixed it with what is behind
-        w = bright[j]
+        w = beams.bright[j]
         power += w
         squares += w * w
         mean += w * y
