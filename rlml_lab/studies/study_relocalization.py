@@ -23,7 +23,7 @@ from rlml_slam.cli.support.progress import Progress
 from rlml_slam.cli.support.text_table import aligned
 from rlml_slam.errors import ParameterError
 from rlml_slam.matching.reflectors.constellation import Constellation, locate
-from rlml_slam.matching.reflectors.pair_votes import warm_up
+from rlml_slam.matching.reflectors.pose_fit import warm_up
 from rlml_slam.params import Relocalization
 from rlml_slam.se2 import Array
 from rlml_slam.types import Verdict

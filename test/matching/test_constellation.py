@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from rlml_slam import se2
-from rlml_slam.matching.reflectors import pair_votes
+from rlml_slam.matching.reflectors import pair_votes, pose_fit
 from rlml_slam.matching.reflectors.constellation import Prior, locate
 from rlml_slam.params import Relocalization
 from rlml_slam.types import Verdict
@@ -428,10 +428,10 @@ def test_search_that_may_take_longer_finds_the_same():
 
 
 def test_kernels_are_compiled_by_the_warm_up():
-    pair_votes.warm_up()
+    pose_fit.warm_up()
     rng = np.random.default_rng(19)
     reflectors, z = with_ghosts(rng)
     prior = Prior(TRUTH, np.eye(3))
     assert search(z, np.asfortranarray(reflectors), prior=prior).verdict is Verdict.UNIQUE
-    for kernel in (pair_votes._fill, pair_votes.vote, pair_votes.refine):
+    for kernel in (pair_votes._fill, pair_votes.vote, pose_fit.refine):
         assert len(kernel.signatures) == 1

@@ -18,14 +18,15 @@ from scipy.special import bdtr, bdtrc, betaincinv
 from rlml_slam import se2
 from rlml_slam.matching.reflectors.association import gate
 from rlml_slam.matching.reflectors.pair_votes import (
-    LOOSE,
     MAX_TESTS,
     MIN_MATCHES,
+    Measured,
+    PosePrior,
     buckets_of,
     pairs_of,
-    refine,
     vote,
 )
+from rlml_slam.matching.reflectors.pose_fit import LOOSE, refine
 from rlml_slam.params import Relocalization
 from rlml_slam.se2 import Array
 from rlml_slam.types import Verdict
@@ -167,21 +168,20 @@ class _Search:
         pairs = pairs_of(self._p, float(pdist(self._z).max() + np.sqrt(2.0 * self._floor2)))
         if pairs is None:
             return [], 0, False
-        counts, bases, proposals, searched = vote(
-            self._z, self._z_var, self._p, self._p_var, pairs, buckets, self._gate2,
-            pose, information, gate(self._params.gate, 3), self._max_tests,
-        )  # fmt: skip
+        seen = Measured(self._z, self._z_cov, self._z_var)
+        known = Measured(self._p, self._p_cov, self._p_var)
+        before = PosePrior(pose, information, gate(self._params.gate, 3))
+        votes = vote(seen, known, pairs, buckets, self._gate2, before, self._max_tests)
         found: list[Candidate] = []
         matches = np.full((MAX_CANDIDATES, len(self._z)), -1, dtype=np.int64)
-        for n in np.argsort(-counts, kind='stable'):
-            a, b, i, j = bases[n]
+        for n in np.argsort(-votes.counts, kind='stable'):
+            a, b, i, j = votes.bases[n]
             # a pose that has both matches of the proposal already is what it would lead to
             if ((matches[:, a] == i) & (matches[:, b] == j)).any():
                 continue
             T, cov, match, chi2 = refine(
-                bases[n], self._z, self._z_cov, self._p, self._p_cov, buckets, self._gate2,
-                self._noise, pose, information,
-            )  # fmt: skip
+                votes.bases[n], seen, known, buckets, self._gate2, self._noise, before
+            )
             if (match >= 0).sum() < MIN_MATCHES:
                 continue
             candidate = self._scored(T, cov, match, chi2)
@@ -193,7 +193,7 @@ class _Search:
                 matches[twin], found[twin] = match, candidate
             if len(found) == MAX_CANDIDATES:
                 break
-        return sorted(found, key=_rank), proposals, searched
+        return sorted(found, key=_rank), votes.proposals, votes.searched
 
     def _scored(self, T: Array, cov: Array, match: NDArray[np.int64], chi2: float) -> Candidate:
         """The likelihood ratio of a pose against one at which every detection is a ghost.
