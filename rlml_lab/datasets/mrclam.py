@@ -30,6 +30,7 @@ from rlml_slam.datasets.text_file import SECOND, parse_numbers, parse_stamp, rea
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.errors import FileFormatError
 from rlml_slam.se2 import Array
+from rlml_slam.sensing.polar import polar_covariance
 from rlml_slam.types import ANONYMOUS, Detections, Odometry
 
 FIRST_LANDMARK = 6  # subjects 1 to 5 are the robots
@@ -177,11 +178,8 @@ def _message(
 
 def from_polar(r: Array, bearing: Array, sigma_r: Array, sigma_b: Array) -> tuple[Array, Array]:
     """Points (n, 2) and covariances (n, 2, 2) of range and bearing measurements (n,)."""
-    R = se2.rotation(bearing)
-    points = r[:, None] * R[:, :, 0]
-    D = np.zeros((len(r), 2, 2))
-    D[:, 0, 0], D[:, 1, 1] = sigma_r**2, (r * sigma_b) ** 2
-    return points, R @ D @ np.swapaxes(R, -1, -2)
+    u = np.stack([np.cos(bearing), np.sin(bearing)], -1)
+    return r[:, None] * u, polar_covariance(u, sigma_r**2, (r * sigma_b) ** 2)
 
 
 def _truth(folder: Path, name: str) -> Trajectory | None:

@@ -9,15 +9,28 @@ and by how far the rays' angles are from evenly spaced. Where that angle is unbo
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.compiled import kernel
-from rlml_slam.se2 import Array
+from rlml_slam.compiled import kernel, part
+from rlml_slam.se2 import Array, wrapped_by_turns
 from rlml_slam.simulation.world import NOTHING, Geometry
 
 NO_OBJECT = -1
+
+
+class Shape(NamedTuple):
+    """A segment from (x, y) by (ex, ey), or a disc of a ``radius``, which segments have not."""
+
+    x: float
+    y: float
+    ex: float
+    ey: float
+    vx: float
+    vy: float
+    radius: float
 
 
 @kernel
@@ -40,28 +53,9 @@ def _cast(
         span = max(span, abs(tau[k]))
     best = np.full(n, max_range)
     for j in range(len(segments) + len(discs)):
-        is_segment = j < len(segments)
-        ax = ay = ex = ey = vx = vy = radius = 0.0
-        if is_segment:
-            ax, ay = segments[j, 0], segments[j, 1]
-            ex, ey = segments[j, 2] - ax, segments[j, 3] - ay
-            vx, vy = segments[j, 4], segments[j, 5]
-            # nearest point of the segment to the middle origin, then the angle it spans
-            px, py = ax - mx, ay - my
-            f = min(1.0, max(0.0, -(px * ex + py * ey) / (ex * ex + ey * ey)))
-            distance = math.hypot(px + f * ex, py + f * ey)
-            first = math.atan2(py, px)
-            turn = math.atan2(py + ey, px + ex) - first
-            half = 0.5 * (turn - 2.0 * math.pi * round(turn / (2.0 * math.pi)))
-            centre = first + half
-            half = abs(half)
-        else:
-            d = discs[j - len(segments)]
-            ax, ay, radius, vx, vy = d[0], d[1], d[2], d[3], d[4]
-            distance = math.hypot(ax - mx, ay - my) - radius
-            centre = math.atan2(ay - my, ax - mx)
-            half = math.asin(radius / (distance + radius)) if distance > 0.0 else math.pi
-        moved = reach + span * math.hypot(vx, vy)
+        shape = _shape(segments, discs, j)
+        distance, centre, half = _window(shape, mx, my)
+        moved = reach + span * math.hypot(shape.vx, shape.vy)
         if distance - moved > max_range:
             continue
         # beyond one and a half turns, the three windows below would not be all there are
@@ -77,33 +71,69 @@ def _cast(
                 high = math.floor(min(n - 1.0, (middle + half) / step))
             for k in range(low, high + 1):
                 # the object's own motion, seen as the opposite motion of the origin
-                qx, qy = ax + vx * tau[k] - x[k], ay + vy * tau[k] - y[k]
-                if is_segment:
-                    det = c[k] * ey - s[k] * ex
-                    if abs(det) < 1e-12:
-                        continue
-                    t = (qx * ey - qy * ex) / det
-                    if not 0.0 < t < best[k]:
-                        continue
-                    u = (qx * s[k] - qy * c[k]) / det
-                    if u < -1e-12 or u > 1.0 + 1e-12:
-                        continue
-                    cosines[k] = det / math.sqrt(ex * ex + ey * ey)
-                else:
-                    along = qx * c[k] + qy * s[k]
-                    across = qx * s[k] - qy * c[k]
-                    root = radius * radius - across * across
-                    if along <= 0.0 or root < 0.0:
-                        continue
-                    root = math.sqrt(root)
-                    t = along - root
-                    if not 0.0 < t < best[k]:
-                        continue
-                    cosines[k] = root / radius
-                best[k] = t
-                ranges[k] = t
-                objects[k] = j
+                qx = shape.x + shape.vx * tau[k] - x[k]
+                qy = shape.y + shape.vy * tau[k] - y[k]
+                t, cosine = _meet(shape, qx, qy, c[k], s[k], best[k])
+                if t < best[k]:
+                    best[k] = ranges[k] = t
+                    cosines[k], objects[k] = cosine, j
     return ranges, objects, cosines
+
+
+@part
+def _shape(segments: Array, discs: Array, j: int) -> Shape:
+    """Object j, the discs after the segments."""
+    if j < len(segments):
+        g = segments[j]
+        return Shape(g[0], g[1], g[2] - g[0], g[3] - g[1], g[4], g[5], -1.0)
+    d = discs[j - len(segments)]
+    return Shape(d[0], d[1], 0.0, 0.0, d[3], d[4], d[2])
+
+
+@part
+def _window(o: Shape, x: float, y: float) -> tuple[float, float, float]:
+    """Distance of an object from a point; middle and half of the angle that it spans there."""
+    px, py = o.x - x, o.y - y
+    if o.radius < 0.0:
+        # nearest point of the segment, then the angle it spans
+        f = min(1.0, max(0.0, -(px * o.ex + py * o.ey) / (o.ex * o.ex + o.ey * o.ey)))
+        first = math.atan2(py, px)
+        half = 0.5 * wrapped_by_turns(math.atan2(py + o.ey, px + o.ex) - first)
+        return math.hypot(px + f * o.ex, py + f * o.ey), first + half, abs(half)
+    distance = math.hypot(px, py) - o.radius
+    half = math.asin(o.radius / (distance + o.radius)) if distance > 0.0 else math.pi
+    return distance, math.atan2(py, px), half
+
+
+@part
+def _meet(
+    o: Shape, qx: float, qy: float, c: float, s: float, nearest: float
+) -> tuple[float, float]:
+    """Range at which a ray meets an object at (qx, qy) from its origin, infinite from ``nearest``.
+
+    Then the cosine of the incidence.
+    """
+    if o.radius < 0.0:
+        det = c * o.ey - s * o.ex
+        if abs(det) < 1e-12:
+            return math.inf, 0.0
+        t = (qx * o.ey - qy * o.ex) / det
+        if not 0.0 < t < nearest:
+            return math.inf, 0.0
+        u = (qx * s - qy * c) / det
+        if u < -1e-12 or u > 1.0 + 1e-12:
+            return math.inf, 0.0
+        return t, det / math.sqrt(o.ex * o.ex + o.ey * o.ey)
+    along = qx * c + qy * s
+    across = qx * s - qy * c
+    root = o.radius * o.radius - across * across
+    if along <= 0.0 or root < 0.0:
+        return math.inf, 0.0
+    root = math.sqrt(root)
+    t = along - root
+    if not 0.0 < t < nearest:
+        return math.inf, 0.0
+    return t, root / o.radius
 
 
 def cast(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from rlml_slam import se2
 from rlml_slam.params import Gyro, Laser, Markers, Wheels
 from rlml_slam.se2 import Array
+from rlml_slam.sensing.polar import polar_covariance
 from rlml_slam.simulation.ray_cast import cast
 from rlml_slam.simulation.robot import SECOND, Track
 from rlml_slam.simulation.world import GLOSS, REFLECTANCE, REFLECTOR, RETRO, Geometry, ReflectorSet
@@ -234,6 +235,7 @@ class MarkerSensor:
         bearing = np.arctan2(p[:, 1], p[:, 0]) + n.sigma_bearing * noise[seen, 1]
         ghost_r, ghost_bearing = self._false(laser)
         r, bearing = np.concatenate([r, ghost_r]), np.concatenate([bearing, ghost_bearing])
+        u = np.stack([np.cos(bearing), np.sin(bearing)], -1)
         g = len(ghost_r)
         ids = self.reflectors.ids[seen] if n.ids else np.full(len(seen), ANONYMOUS)
         diameters = np.where(np.isnan(self.reflectors.normals), self.reflectors.widths, np.nan)[
@@ -242,8 +244,8 @@ class MarkerSensor:
         return Detections(
             stamp,
             laser.frame_id,
-            np.stack([r * np.cos(bearing), r * np.sin(bearing)], -1),
-            polar_cov(r, bearing, n.sigma_range, n.sigma_bearing),
+            r[:, None] * u,
+            polar_covariance(u, n.sigma_range**2, (r * n.sigma_bearing) ** 2),
             np.concatenate([ids, np.full(g, ANONYMOUS)]).astype(np.int64),
             np.concatenate([diameters, np.full(g, np.nan)]),
         )
@@ -283,10 +285,3 @@ class MarkerSensor:
         facing = ~flat | (cosines >= math.cos(self._n.max_incidence))
         seen: NDArray[np.bool_] = (met == np.arange(m)) & facing & inside & near
         return seen
-
-
-def polar_cov(r: Array, bearing: Array, sigma_range: float, sigma_bearing: float) -> Array:
-    """Covariances (n, 2, 2) of points at range and bearing: diag(s_r^2, (r s_b)^2), rotated."""
-    rotation = se2.rotation(bearing)
-    var = np.stack([np.full_like(r, sigma_range**2), (r * sigma_bearing) ** 2], -1)
-    return np.asarray(np.einsum('nij,nj,nkj->nik', rotation, var, rotation))

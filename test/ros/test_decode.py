@@ -205,7 +205,7 @@ def test_imu_without_rates_is_refused(make):
 def some_detections(n=5, seed=0) -> Detections:
     rng = np.random.default_rng(seed)
     points = rng.uniform(-20.0, 20.0, (n, 2)).astype(np.float32).astype(np.float64)
-    cov = decode.polar_covariance(
+    cov = decode.detection_covariance(
         points, rng.uniform(0.01, 0.1, n), rng.uniform(0.001, 0.01, n), 1
     )
     return Detections(
@@ -254,12 +254,12 @@ def test_polar_covariance_turns_with_the_bearing():
     for bearing in np.linspace(-np.pi, np.pi, 7):
         R = se2.rotation(bearing)
         p = R @ [[4.0], [0.0]]
-        cov = decode.polar_covariance(p.T, np.array([0.1]), np.array([0.02]), 1.0)
+        cov = decode.detection_covariance(p.T, np.array([0.1]), np.array([0.02]), 1.0)
         np.testing.assert_allclose(cov[0], R @ np.diag([0.01, 0.0064]) @ R.T, atol=1e-15)
 
 
 def test_detection_at_the_sensor_has_a_regular_covariance():
-    cov = decode.polar_covariance(np.zeros((1, 2)), np.ones(1), np.ones(1), 0.025)
+    cov = decode.detection_covariance(np.zeros((1, 2)), np.ones(1), np.ones(1), 0.025)
     np.testing.assert_array_equal(cov[0], 0.025**2 * np.eye(2))
 
 

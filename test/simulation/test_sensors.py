@@ -14,7 +14,6 @@ from rlml_slam.simulation.sensors import (
     LaserSensor,
     MarkerSensor,
     WheelSensor,
-    polar_cov,
 )
 from rlml_slam.simulation.simulation import START, STEP, Simulation
 from rlml_slam.simulation.world_file import load_world, parse_world
@@ -391,11 +390,6 @@ def test_noise_has_no_bias_and_the_covariance_that_is_stated():
         # chi-squared with 2 n degrees of freedom: mean 2 n, sigma sqrt(4 n); 4 sigmas
         assert abs(nees.sum() - 2 * 800) < 4 * math.sqrt(4 * 800)
         assert (np.abs(error.mean(0)) < 4 * np.sqrt(np.diag(cov) / 800)).all()
-
-
-def test_polar_covariance_is_long_across_where_bearing_noise_rules():
-    cov = polar_cov(np.array([10.0]), np.array([math.pi / 2]), 0.02, 0.01)[0]
-    np.testing.assert_allclose(cov, np.diag([0.1**2, 0.02**2]), atol=1e-12)
 
 
 def test_what_stands_between_hides_a_reflector():

@@ -139,7 +139,7 @@ class PosePrior(NamedTuple):
 class Votes(NamedTuple):
     """``counts`` (h,) of matches and ``bases`` (h, 4), detections a, b and their reflectors.
 
-    ``proposals`` is how many there were at all; ``searched`` is False where the search ended early.
+    ``proposals`` is how many there were at all, ``searched`` whether these are all.
     """
 
     counts: Ints

@@ -20,6 +20,7 @@ from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Reflector
 from rlml_slam.ros.codecs.point_cloud import bounded, column, read_cloud
 from rlml_slam.se2 import Array
+from rlml_slam.sensing.polar import polar_covariance
 from rlml_slam.types import ANONYMOUS, Detections, Imu, Odometry, Scan
 
 MAX_TILT = 0.35  # [rad] a larger roll or pitch is not a planar pose
@@ -158,7 +159,7 @@ def detections(msg: Any, noise: Reflector, topic: str = 'reflectors') -> Detecti
         stamp(msg, topic),
         frame(msg.header.frame_id),
         points,
-        polar_covariance(points, sigma_r, sigma_b, noise.sigma_fallback),
+        detection_covariance(points, sigma_r, sigma_b, noise.sigma_fallback),
         np.where(known, ids, ANONYMOUS).astype(np.int64),
         _positive(diameters, np.nan),
     )
@@ -175,8 +176,8 @@ def detections_of_poses(msg: Any, noise: Reflector, topic: str = 'reflector_pose
         stamp(msg, topic),
         frame(msg.header.frame_id),
         points,
-        polar_covariance(points, sigma_r, sigma_b, noise.sigma_fallback),
-        getattr(msg, 'ids', np.full(n, ANONYMOUS, dtype=np.int64)),
+        detection_covariance(points, sigma_r, sigma_b, noise.sigma_fallback),
+        np.full(n, ANONYMOUS, dtype=np.int64),
         np.full(n, np.nan),
     )
 
@@ -185,17 +186,12 @@ def _positive(values: Array, otherwise: float) -> Array:
     return np.where((values > 0.0) & (values < LARGEST_SIGMA), values, otherwise)
 
 
-def polar_covariance(points: Array, sigma_r: Array, sigma_b: Array, fallback: float) -> Array:
-    """R diag(sigma_r^2, (r sigma_b)^2) R^T (n, 2, 2), R the rotation by the bearing.
-
-    At the sensor itself, where there is no bearing, it is fallback^2 I.
-    """
+def detection_covariance(points: Array, sigma_r: Array, sigma_b: Array, fallback: float) -> Array:
+    """Covariances (n, 2, 2); at the sensor itself, where there is no bearing, fallback^2 I."""
     r = np.hypot(points[:, 0], points[:, 1])
     near = r < _NEAR
     u = points / np.where(near, 1.0, r)[:, None]
-    t = np.stack([-u[:, 1], u[:, 0]], -1)
-    cov = (sigma_r**2)[:, None, None] * u[:, :, None] * u[:, None, :]
-    cov += ((r * sigma_b) ** 2)[:, None, None] * t[:, :, None] * t[:, None, :]
+    cov = polar_covariance(u, sigma_r**2, (r * sigma_b) ** 2)
     cov[near] = fallback**2 * np.eye(2)
     return cov
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rlml_slam.params import Spikes
 from rlml_slam.se2 import Array
+from rlml_slam.sensing.polar import polar_covariance
 from rlml_slam.types import ANONYMOUS, Detections, Scan
 
 
@@ -132,8 +133,5 @@ def _spike(
 def _extracted(scan: Scan, params: Spikes, rows: Array) -> Extracted:
     angle = scan.angle_min + rows[:, 1] * scan.angle_increment
     u = np.stack([np.cos(angle), np.sin(angle)], -1)
-    t = np.stack([-u[:, 1], u[:, 0]], -1)
-    across = (rows[:, 0] * params.sigma_bearing) ** 2
-    cov = params.sigma_range**2 * u[:, :, None] * u[:, None, :]
-    cov = cov + across[:, None, None] * t[:, :, None] * t[:, None, :]
+    cov = polar_covariance(u, params.sigma_range**2, (rows[:, 0] * params.sigma_bearing) ** 2)
     return Extracted(rows[:, :1] * u, cov, rows[:, 1] % max(len(scan.ranges), 1))

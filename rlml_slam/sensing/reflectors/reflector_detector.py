@@ -10,6 +10,7 @@ import numpy as np
 from rlml_slam import se2
 from rlml_slam.params import Detector
 from rlml_slam.se2 import Array
+from rlml_slam.sensing.polar import polar_covariance
 from rlml_slam.sensing.reflectors.background_intensity import is_circular, levels
 from rlml_slam.sensing.reflectors.bright_spots import (
     BEAM,
@@ -99,10 +100,8 @@ def _found(scan: Scan, rows: Array) -> Found:
     rejected = {fate: int(counts[fate]) for fate in Fate if fate and counts[fate]}
     rows = rows[fates == Fate.FOUND]
     u = np.stack([np.cos(rows[:, BEARING]), np.sin(rows[:, BEARING])], -1)
-    t = np.stack([-u[:, 1], u[:, 0]], -1)
     r = rows[:, RANGE]
-    cov = rows[:, VAR_RANGE, None, None] * u[:, :, None] * u[:, None, :]
-    cov += (r**2 * rows[:, VAR_BEARING])[:, None, None] * t[:, :, None] * t[:, None, :]
+    cov = polar_covariance(u, rows[:, VAR_RANGE], r**2 * rows[:, VAR_BEARING])
     return Found(
         r[:, None] * u, cov, rows[:, DIAMETER], rows[:, BEAM] % max(len(scan.ranges), 1),
         rows[:, WIDTH], rows[:, PEAK], rejected,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rlml_slam import se2
 from rlml_slam.compiled import brief, kernel
-from rlml_slam.se2 import Array
+from rlml_slam.se2 import Array, wrapped
 from rlml_slam.types import Motion
 
 BIAS = 3
@@ -299,7 +299,7 @@ def predict(
     x[0] += gx
     x[1] += gy
     turn = x[2] + moved[2]
-    x[2] = np.pi - (np.pi - turn) % (2.0 * np.pi)
+    x[2] = wrapped(turn)
     for k in range(len(x)):
         heading, bias, speed, share = P[2, k], P[BIAS, k], P[SPEED, k], P[TURN, k]
         for r in range(3):
@@ -336,7 +336,7 @@ def measure_bias(x: Array, P: Array, bias: float, variance: float, turn: float) 
         x[r] += gain * error
         for c in range(len(x)):
             P[r, c] -= gain * PH[c]
-    x[2] = np.pi - (np.pi - x[2]) % (2.0 * np.pi)
+    x[2] = wrapped(x[2])
 
 
 @kernel
@@ -347,7 +347,7 @@ def update(x: Array, P: Array, columns: NDArray[np.int64], H: Array, R: Array, v
     S = np.dot(H, PH[columns]) + R
     K = np.linalg.solve(S, PH.T.copy()).T.copy()
     x += np.dot(K, v)
-    x[2] = np.pi - (np.pi - x[2]) % (2.0 * np.pi)
+    x[2] = wrapped(x[2])
     # Joseph form costs n^3; P - K S K^T, made symmetric, keeps it positive here because R > 0
     less = np.dot(K, PH.T.copy())
     for i in range(n):

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from rlml_slam.compiled import brief, part
-from rlml_slam.se2 import Array
+from rlml_slam.se2 import Array, wrapped
 from rlml_slam.slam.front_end.joint_state import ANCHORS, VELOCITY, JointState, update
 
 TARGET = ANCHORS[0]
@@ -50,7 +50,7 @@ def relative(x: Array, P: Array) -> tuple[Array, Array]:
     """The pose in the frame of the submap (3,) and its covariance (3, 3)."""
     c, s = math.cos(x[TARGET + 2]), math.sin(x[TARGET + 2])
     dx, dy, turn = x[0] - x[TARGET], x[1] - x[TARGET + 1], x[2] - x[TARGET + 2]
-    pose = np.array([c * dx + s * dy, c * dy - s * dx, np.pi - (np.pi - turn) % (2.0 * np.pi)])
+    pose = np.array([c * dx + s * dy, c * dy - s * dx, wrapped(turn)])
     J = jacobian_of(pose, x[TARGET + 2])
     cov = np.empty((6, 6))
     for k in range(6):
@@ -120,7 +120,7 @@ def fuse(
         scale = math.sqrt(values[first + k])
         root[k], inverse[:, k] = axes[:, first + k] * scale, axes[:, first + k] / scale
     offset = pose - prior
-    offset[2] = np.pi - (np.pi - offset[2]) % (2.0 * np.pi)
+    offset[2] = wrapped(offset[2])
     v = np.dot(root, offset)
     spread = np.dot(np.dot(root, cov), root.T.copy()) + np.eye(rows)
     if np.dot(v, np.linalg.solve(spread, v)) > prior_robust_scale**2 * rows:
