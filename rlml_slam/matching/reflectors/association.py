@@ -95,12 +95,14 @@ class Associator:
             rows, cols = _nearest(d2 + log_det - log_det.min(), compatible)
         if len(rows) > 1 and (not alone or joint2(rows, cols) > self._joint_gate(len(rows))):
             rows, cols = self._jointly(d2, compatible, joint2)
-        match, status, distance2 = association_status.judge(
-            pose, points, believed.ids, np.zeros(m, np.bool_) if recent is None else recent,
-            recent is not None, seen, noise, ids, d2, log_det, compatible, rows, cols,
-            self._limits,
-        )  # fmt: skip
-        return Association(match, status, distance2)
+        is_recent = np.zeros(m, np.bool_) if recent is None else recent
+        known = association_status.Known(points, believed.ids, is_recent, recent is not None)
+        pairing = association_status.Pairing(d2, log_det, compatible, rows, cols)
+        return Association(
+            *association_status.judge(
+                pose, known, association_status.Seen(seen, noise, ids), pairing, self._limits
+            )
+        )
 
     def _joint_gate(self, matches: int) -> float:
         return self._joint[min(matches, len(self._joint)) - 1]

@@ -30,6 +30,39 @@ class Limits(NamedTuple):
     sure: float
 
 
+class Seen(NamedTuple):
+    """Detections: ``points`` (k, 2) in the base frame, covariances ``noise`` (k, 2, 2), ids."""
+
+    points: Array
+    noise: Array
+    ids: Indices
+
+
+class Known(NamedTuple):
+    """Reflectors: ``points`` (m, 2) in the map, ids, and whether seen recently (m,).
+
+    With ``is_careful``, an anonymous match with what is not recent must be sure.
+    """
+
+    points: Array
+    ids: Indices
+    recent: NDArray[np.bool_]
+    is_careful: bool
+
+
+class Pairing(NamedTuple):
+    """Squared distances ``d2`` and ``log_det`` of their covariances (k, m), ``compatible`` (k, m).
+
+    The chosen pairs are ``rows`` and ``cols``.
+    """
+
+    d2: Array
+    log_det: Array
+    compatible: NDArray[np.bool_]
+    rows: Indices
+    cols: Indices
+
+
 @kernel
 def compatible_pairs(
     seen: Indices, known: Indices, d2: Array, limits: Limits
@@ -80,65 +113,56 @@ def separable(noise: Array, ids: Indices, limits: Limits) -> Array:
 
 @kernel
 def judge(
-    pose: Array,
-    points: Array,
-    known: Indices,
-    recent: NDArray[np.bool_],
-    is_careful: bool,
-    seen: Array,
-    noise: Array,
-    ids: Indices,
-    d2: Array,
-    log_det: Array,
-    compatible: NDArray[np.bool_],
-    rows: Indices,
-    cols: Indices,
-    limits: Limits,
+    pose: Array, known: Known, seen: Seen, pairing: Pairing, limits: Limits
 ) -> tuple[Indices, Indices, Array]:
-    """Match (k,), status (k,) and distance2 (k,) of detections from the pairs ``rows``, ``cols``.
-
-    With ``is_careful``, an anonymous match with what is not ``recent`` (m,) must be sure.
-    """
-    k, m = d2.shape
+    """Match (k,), status (k,) and distance2 (k,) of detections from the chosen pairs."""
+    k, d2, log_det = len(seen.ids), pairing.d2, pairing.log_det
     match, status = np.full(k, -1, np.int64), np.full(k, NEW, np.int64)
     distance2 = np.full(k, np.nan)
-    for h in range(len(rows)):
-        i, j = rows[h], cols[h]
-        doubtful = is_careful and ids[i] == ANONYMOUS and not recent[j]
+    for h in range(len(pairing.rows)):
+        i, j = pairing.rows[h], pairing.cols[h]
+        doubtful = known.is_careful and seen.ids[i] == ANONYMOUS and not known.recent[j]
         if doubtful and not odds(d2[i], log_det[i], j, limits.density) > limits.sure:
             continue
         match[i], status[i], distance2[i] = j, USED, d2[i, j]
-    limit = separable(noise, ids, limits)
-    c, s = math.cos(pose[2]), math.sin(pose[2])
+    limit = separable(seen.noise, seen.ids, limits)
     for i in range(k):
-        if match[i] >= 0:
-            continue
-        x = pose[0] + c * seen[i, 0] - s * seen[i, 1]
-        y = pose[1] + s * seen[i, 0] + c * seen[i, 1]
-        fits = is_near = is_recent = is_known = False
-        likeliest = 0
-        for j in range(m):
-            near = math.hypot(points[j, 0] - x, points[j, 1] - y) < limit[i]
-            near = near or d2[i, j] < limits.new_gate
-            is_near = is_near or near
-            is_recent = is_recent or (near and recent[j])
-            fits = fits or compatible[i, j]
-            is_known = is_known or known[j] == ids[i]
-            if d2[i, j] + log_det[i, j] < d2[i, likeliest] + log_det[i, likeliest]:
-                likeliest = j
-        if ids[i] == ANONYMOUS:
-            if is_near:  # neither used nor new
-                status[i] = AMBIGUOUS if fits else GATED
-                own = math.log(noise[i, 0, 0] * noise[i, 1, 1] - noise[i, 0, 1] * noise[i, 1, 0])
-                # the likeliest reflector's place is less certain than the detection itself
-                is_wide = log_det[i, likeliest] > own + WIDE
-                if is_careful and is_wide and not is_recent:
-                    status[i] = DEFERRED
-        elif is_known:
-            status[i] = AMBIGUOUS if fits else GATED
-    if is_careful:
-        keep_apart(seen, ids, limit, status)
+        if match[i] < 0:
+            status[i] = _unmatched(i, pose, known, seen, pairing, limit[i], limits)
+    if known.is_careful:
+        keep_apart(seen.points, seen.ids, limit, status)
     return match, status, distance2
+
+
+@part
+def _unmatched(
+    i: int, pose: Array, known: Known, seen: Seen, pairing: Pairing, limit: float, limits: Limits
+) -> int:
+    """Status of detection i, which has no match."""
+    d2, log_det = pairing.d2[i], pairing.log_det[i]
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    x = pose[0] + c * seen.points[i, 0] - s * seen.points[i, 1]
+    y = pose[1] + s * seen.points[i, 0] + c * seen.points[i, 1]
+    fits = is_near = is_recent = is_known = False
+    likeliest = 0
+    for j in range(len(known.ids)):
+        near = math.hypot(known.points[j, 0] - x, known.points[j, 1] - y) < limit
+        near = near or d2[j] < limits.new_gate
+        is_near = is_near or near
+        is_recent = is_recent or (near and known.recent[j])
+        fits = fits or pairing.compatible[i, j]
+        is_known = is_known or known.ids[j] == seen.ids[i]
+        if d2[j] + log_det[j] < d2[likeliest] + log_det[likeliest]:
+            likeliest = j
+    if not (is_near if seen.ids[i] == ANONYMOUS else is_known):
+        return NEW
+    if seen.ids[i] == ANONYMOUS and known.is_careful and not is_recent:
+        S = seen.noise[i]
+        own = math.log(S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0])
+        # the likeliest reflector's place is less certain than the detection itself
+        if log_det[likeliest] > own + WIDE:
+            return DEFERRED
+    return AMBIGUOUS if fits else GATED  # neither used nor new
 
 
 @part
@@ -177,7 +201,6 @@ def warm_up() -> None:
     ids, noise, d2 = np.zeros(1, np.int64), np.eye(2)[None], np.ones((1, 1))
     compatible, rows, cols, _ = compatible_pairs(ids, ids, d2, limits)
     separable(noise, ids, limits)
-    judge(
-        np.zeros(3), np.ones((1, 2)), ids, np.ones(1, np.bool_), True, np.ones((1, 2)), noise,
-        ids, d2, d2, compatible, rows, cols, limits,
-    )  # fmt: skip
+    known = Known(np.ones((1, 2)), ids, np.ones(1, np.bool_), True)
+    seen = Seen(np.ones((1, 2)), noise, ids)
+    judge(np.zeros(3), known, seen, Pairing(d2, d2, compatible, rows, cols), limits)

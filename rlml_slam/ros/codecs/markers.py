@@ -45,7 +45,8 @@ class _Markers:
         self._make = make
         self._header = encode.header(make, stamp, frame_id)
         self.list: list[Any] = []
-        self.add('', 0, WHITE, (0.0, 0.0, 0.0), action=DELETEALL)
+        self.add('', 0, WHITE, (0.0, 0.0, 0.0))
+        self.list[0].action = DELETEALL
 
     def add(
         self,
@@ -53,15 +54,14 @@ class _Markers:
         kind: int,
         color: tuple[float, float, float, float],
         scale: tuple[float, float, float],
-        T: Array | None = None,
-        z: float = 0.0,
+        at: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
         points: Array | None = None,
         text: str = '',
-        action: int = 0,
     ) -> None:
+        """A marker ``at`` (x, y, heading, z)."""
         make = self._make
-        pose = encode.pose(make, np.zeros(3) if T is None else T)
-        pose.position.z = float(z)
+        pose = encode.pose(make, np.array(at[:3]))
+        pose.position.z = float(at[3])
         lines = np.zeros((0, 2)) if points is None else points.reshape(-1, 2)
         duration = make('builtin_interfaces/msg/Duration', sec=0, nanosec=0)
         rgba = dict(zip('rgba', map(float, color), strict=True))
@@ -72,7 +72,7 @@ class _Markers:
                 ns=namespace,
                 id=len(self.list),
                 type=kind,
-                action=action,
+                action=0,
                 pose=pose,
                 scale=encode.vector(make, *scale),
                 color=make('std_msgs/msg/ColorRGBA', **rgba),
@@ -119,13 +119,13 @@ def reflector_markers(make: Make, stamp: int, frame_id: str, reflectors: Reflect
         x, y = reflectors.points[k]
         known = np.isfinite(reflectors.diameters[k])
         diameter = float(reflectors.diameters[k]) if known else 0.1
-        at = np.array([x, y, 0.0])
-        out.add('reflectors', CYLINDER, ORANGE, (diameter, diameter, HEIGHT), at, HEIGHT / 2)
+        middle = (x, y, 0.0, HEIGHT / 2)
+        out.add('reflectors', CYLINDER, ORANGE, (diameter, diameter, HEIGHT), middle)
         major, minor, heading = ellipse(reflectors.cov[k])
         flat = (max(major, 1e-3), max(minor, 1e-3), 0.01)
-        out.add('ellipses', CYLINDER, YELLOW, flat, np.array([x, y, heading]))
-        size = (0.0, 0.0, 0.3)
-        out.add('keys', TEXT, WHITE, size, at, HEIGHT + 0.3, text=str(int(reflectors.keys[k])))
+        out.add('ellipses', CYLINDER, YELLOW, flat, (x, y, heading, 0.0))
+        above, key = (x, y, 0.0, HEIGHT + 0.3), str(int(reflectors.keys[k]))
+        out.add('keys', TEXT, WHITE, (0.0, 0.0, 0.3), above, text=key)
     return out.array()
 
 
