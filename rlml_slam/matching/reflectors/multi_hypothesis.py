@@ -22,8 +22,8 @@ from rlml_slam.se2 import Array
 
 MAX_HYPOTHESES = 64
 MEMORY = 2e7  # values of all covariances: with very many reflectors there are fewer hypotheses
-LEAD = 14.0  # of log weight over a hypothesis that is given up
-GATE = 30.0  # squared Mahalanobis distance beyond which a reflector is no answer
+LEAD = 14.0  # of log weight over a hypothesis that is given up: it is right once in e^14 = 1e6
+GATE = 30.0  # squared distance beyond which a reflector is no answer: e^-15 = 3e-7 of the true
 UNKNOWN = 0.05  # share of the first sightings that are of a reflector not yet mapped
 OUTLIER = math.log(0.02 / 50.0)  # 2 % of sightings are of nothing, anywhere within 50 m²
 TOGETHER = -3.0  # log prior that two keys in view at one time are one reflector after all

@@ -19,9 +19,10 @@ from rlml_slam.sensing.reflectors.spot_edges import GAP, beside, edges_of
 from rlml_slam.sensing.reflectors.spot_settings import Beams, Settings, Spot, angle_of
 from rlml_slam.sensing.reflectors.spot_shape import CURVED, ROUGH, centre_of, is_flat
 
-LIT = 0.8  # share of a cylinder's diameter that shines back at least
-TILT = 0.5  # cosine of the widest angle at which a flat reflector is still seen
-SIGMAS = 4.0  # of the noise of a shape
+# Reflective film returns little beyond an incidence of 50 to 60 degrees: a cylinder shines over at
+# least sin(53 deg) of its diameter, and a flat one that is turned by 60 degrees is half as wide.
+LIT, TILT = 0.8, 0.5
+SIGMAS = 4.0  # of the noise of a shape: 3 of 100 000 reflectors are noisier
 SPACED = 0.5  # reflectors' widths between beams that may well miss a gap beside one
 WHOLE = 0.3  # share of its brightness down to which a thing of one depth is one thing
 # columns of what a bright spot is

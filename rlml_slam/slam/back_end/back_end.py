@@ -139,8 +139,7 @@ class BackEnd:
         closures = self._close_loops(key)
         self._join_reflectors()
         self._keyframes_since_solve += 1
-        is_due = self._keyframes_since_solve >= self._p.back_end.optimize_every
-        if is_due and self._has_changed:
+        if self._keyframes_since_solve >= self._p.back_end.optimize_every and self._has_changed:
             self.optimize()
             self.maintenance.after_solve(self.keyframes)
         elif not closures:
@@ -224,25 +223,28 @@ class BackEnd:
     def optimize(self, final: bool = False) -> None:
         """Solve eq. 13, merge reflectors, align with the survey, check closures, correct.
 
-        ``final``: by the batch solver, and a selection of closures is not put off.
+        Solved is what came since the last time, and once more after each step that changed the
+        graph. ``final``: by the batch solver, and a selection of closures is not put off.
         """
         if len(self.keyframes) < 2:
             return
         solve = self.solver.solve_all if final else self.solver.solve
         solve()
-        if self._merge_reflectors():
-            solve()
-        if self._align_with_survey():
-            solve()
+        for has_changed in (self._merge_reflectors, self._align_with_survey):
+            if has_changed():
+                solve()
         if self.loop_closer.needs_selection(final):
-            enabled = self.loop_closer.select()
-            self.solver.solve_all()
-            changed = self.loop_closer.update_states(enabled)
-            self._changed += changed
-            if changed:
-                self.path_covariance.remove_closures()
-        self.solver.solve()  # the incremental factorization, where the batch solver was last
+            self._select_closures()
+        self.solver.solve()  # the incremental factorization, unless it is there already
         self._correct_local_frame()
+
+    def _select_closures(self) -> None:
+        """Disable the closures that contradict the others; a selection moves the estimate."""
+        enabled = self.loop_closer.select()
+        self.solver.solve_all()
+        if changed := self.loop_closer.update_states(enabled):
+            self._changed += changed
+            self.path_covariance.remove_closures()
 
     def optimize_after_join(self) -> None:
         """Optimize after reflectors were joined that are as far apart as the drift.
@@ -256,9 +258,8 @@ class BackEnd:
         self.optimize()
 
     def _merge_reflectors(self) -> bool:
-        if self.associations_are_final:
-            return False
-        return self.reflector_graph.merge(self.delayed_association.pending)
+        merge, pending = self.reflector_graph.merge, self.delayed_association.pending
+        return not self.associations_are_final and merge(pending)
 
     def _align_with_survey(self) -> bool:
         """Whether the survey changed the graph; pending hypotheses keep the current frame."""
@@ -273,8 +274,8 @@ class BackEnd:
         self.reflector_graph.mark_solved()
         last = self.keyframes[-1]
         self.T_map_local = T = se2.compose(self.graph.poses[last.index], se2.inverse(last.T_local))
-        is_surveyed = self.survey_frame is not None and self.survey_frame.found
-        bound = None if is_surveyed else self.path_covariance
+        survey = self.survey_frame
+        bound = None if survey is not None and survey.found else self.path_covariance
         records = self.loop_closer.records
         self.known = newest_covariance(self.solver, bound, records, self.keyframes, T)
 
