@@ -148,23 +148,6 @@ class Votes(NamedTuple):
     searched: bool
 
 
-class Hypothesis(NamedTuple):
-    """The pose (cos, sin, x, y) that puts a pair of detections onto a pair of reflectors.
-
-    The mean of the two at (mx, my), base frame, is known with ``var_mean``, the heading with
-    ``var_turn``.
-    """
-
-    cos: float
-    sin: float
-    x: float
-    y: float
-    mx: float
-    my: float
-    var_mean: float
-    var_turn: float
-
-
 @kernel
 def vote(
     seen: Measured, known: Measured, pairs: Pairs, buckets: Buckets, gate2: float,
@@ -174,46 +157,92 @@ def vote(
 
     A pose must lie within the gate of the prior. After ``max_tests`` the search ends.
     """
-    z, k, m = seen.points, len(seen.points), len(known.points)
-    g, widest_var = math.sqrt(gate2), 0.0
+    z, z_var, p, p_var = seen.points, seen.var, known.points, known.var
+    information = prior.information
+    k, m = len(z), len(p)
+    g = math.sqrt(gate2)
+    widest_var = 0.0
     for i in range(m):
-        widest_var = max(widest_var, known.var[i])
-    counts, bases = np.zeros(CAPACITY, np.int64), np.zeros((CAPACITY, 4), np.int64)
-    kept, proposals, best, need = 0, 0, 0, MIN_MATCHES
-    taken = np.zeros(m + 1, np.int64)  # the proposal that a reflector matches; last, the newest
+        widest_var = max(widest_var, p_var[i])
+    counts = np.zeros(CAPACITY, np.int64)
+    bases = np.zeros((CAPACITY, 4), np.int64)
+    kept, proposals, best, need, stamp = 0, 0, 0, MIN_MATCHES, 0
+    taken = np.zeros(m, np.int64)
     lens = np.zeros(k, np.int64)
     tests = 0
     for a in range(k):
         for b in range(a + 1, k):
             if tests > max_tests:
                 return Votes(counts[:0], bases[:0], proposals, False)
-            length = math.hypot(z[b, 0] - z[a, 0], z[b, 1] - z[a, 1])
-            tolerance = g * math.sqrt(seen.var[a] + seen.var[b] + 2.0 * widest_var)
+            dx, dy = z[b, 0] - z[a, 0], z[b, 1] - z[a, 1]
+            length = math.hypot(dx, dy)
+            tolerance = g * math.sqrt(z_var[a] + z_var[b] + 2.0 * widest_var)
             if length <= 2.0 * tolerance:
                 continue  # too short a baseline to determine the heading
             low = _bisect(pairs.length, length - tolerance)
             high = _bisect(pairs.length, length + tolerance)
             if low == high:
                 continue
-            others = lens[: _within(z, a, b, length, lens)]
+            inside = _within(z, a, b, length, lens)
             tests += k + 2 * (high - low)
             for q in range(2 * low, 2 * high):
                 i, j = pairs.first[q // 2], pairs.second[q // 2]
                 if q % 2 == 1:
                     i, j = j, i
-                both = seen.var[a] + known.var[i] + (seen.var[b] + known.var[j])
-                if (pairs.length[q // 2] - length) ** 2 > gate2 * both:
+                var_a, var_b = z_var[a] + p_var[i], z_var[b] + p_var[j]
+                both = var_a + var_b
+                l_map = pairs.length[q // 2]
+                if (l_map - length) ** 2 > gate2 * both:
                     continue
-                h = _hypothesis(seen, known, (a, b), (i, j), length, pairs.length[q // 2])
-                if _distance2(h, prior) > prior.gate2:
-                    continue
+                ex, ey = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1]
+                cos = (dx * ex + dy * ey) / (length * l_map)
+                sin = (dx * ey - dy * ex) / (length * l_map)
+                # the fixed point of the two: their mean, the better known one counting more
+                share = var_a / both
+                mx, my = z[a, 0] + share * dx, z[a, 1] + share * dy
+                nx, ny = p[i, 0] + share * ex, p[i, 1] + share * ey
+                tx, ty = nx - cos * mx + sin * my, ny - sin * mx - cos * my
+                if information[2, 2] > 0.0:
+                    ux, uy = tx - prior.pose[0], ty - prior.pose[1]
+                    ut = wrapped_by_turns(math.atan2(sin, cos) - prior.pose[2])
+                    d2 = (
+                        information[0, 0] * ux * ux + information[1, 1] * uy * uy
+                        + information[2, 2] * ut * ut + 2.0 * information[0, 1] * ux * uy
+                        + 2.0 * (information[0, 2] * ux + information[1, 2] * uy) * ut
+                    )  # fmt: skip
+                    if d2 > prior.gate2:
+                        continue
                 proposals += 1
-                if 2 + len(others) < need:
+                if 2 + inside < need:
                     continue
-                taken[m] += 1
-                taken[i] = taken[j] = taken[m]
-                count, more = _count_matches(h, seen, known, buckets, gate2, others, need, taken)
-                tests += more
+                stamp += 1
+                taken[i] = taken[j] = stamp
+                count = 2
+                var_mean = var_a * var_b / both
+                var_turn = both / (length * length)
+                for n in range(inside):
+                    if count + inside - n < need:
+                        break
+                    tests += 1
+                    c = lens[n]
+                    x = tx + cos * z[c, 0] - sin * z[c, 1]
+                    y = ty + sin * z[c, 0] + cos * z[c, 1]
+                    cell = cell_of(x, y, buckets)
+                    if cell < 0:
+                        continue
+                    arm2 = (z[c, 0] - mx) ** 2 + (z[c, 1] - my) ** 2
+                    var = z_var[c] + var_mean + arm2 * var_turn
+                    nearest, least = -1, math.inf
+                    begin, end = buckets.starts[cell], buckets.starts[cell + 1]
+                    tests += end - begin
+                    for s in range(begin, end):
+                        r = buckets.members[s]
+                        d2 = ((x - p[r, 0]) ** 2 + (y - p[r, 1]) ** 2) / (var + p_var[r])
+                        if d2 <= gate2 and d2 < least:
+                            nearest, least = r, d2
+                    if nearest >= 0 and taken[nearest] != stamp:
+                        taken[nearest] = stamp
+                        count += 1
                 if count < need:
                     continue
                 if count > best:
@@ -243,82 +272,6 @@ def _within(z: Array, a: int, b: int, length: float, lens: Ints) -> int:
             lens[inside] = c
             inside += 1
     return inside
-
-
-@part
-def _hypothesis(
-    seen: Measured, known: Measured, ab: tuple[int, int], ij: tuple[int, int], length: float,
-    l_map: float,
-) -> Hypothesis:  # fmt: skip
-    """The pose at which detections ``ab`` are reflectors ``ij``, as far apart as stated."""
-    z, p = seen.points, known.points
-    (a, b), (i, j) = ab, ij
-    dx, dy = z[b, 0] - z[a, 0], z[b, 1] - z[a, 1]
-    ex, ey = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1]
-    var_a, var_b = seen.var[a] + known.var[i], seen.var[b] + known.var[j]
-    both = var_a + var_b
-    cos = (dx * ex + dy * ey) / (length * l_map)
-    sin = (dx * ey - dy * ex) / (length * l_map)
-    # the fixed point of the two: their mean, the better known one counting more
-    share = var_a / both
-    mx, my = z[a, 0] + share * dx, z[a, 1] + share * dy
-    nx, ny = p[i, 0] + share * ex, p[i, 1] + share * ey
-    return Hypothesis(
-        cos, sin, nx - cos * mx + sin * my, ny - sin * mx - cos * my, mx, my,
-        var_a * var_b / both, both / (length * length),
-    )  # fmt: skip
-
-
-@part
-def _distance2(h: Hypothesis, prior: PosePrior) -> float:
-    """Squared Mahalanobis distance of a pose from the prior, 0 without one."""
-    W = prior.information
-    if not W[2, 2] > 0.0:
-        return 0.0
-    ux, uy = h.x - prior.pose[0], h.y - prior.pose[1]
-    ut = wrapped_by_turns(math.atan2(h.sin, h.cos) - prior.pose[2])
-    d2: float = (
-        W[0, 0] * ux * ux + W[1, 1] * uy * uy + W[2, 2] * ut * ut
-        + 2.0 * W[0, 1] * ux * uy + 2.0 * (W[0, 2] * ux + W[1, 2] * uy) * ut
-    )  # fmt: skip
-    return d2
-
-
-@part
-def _count_matches(
-    h: Hypothesis, seen: Measured, known: Measured, buckets: Buckets, gate2: float, others: Ints,
-    need: int, taken: Ints,
-) -> tuple[int, int]:  # fmt: skip
-    """Matches of a pose, its two own ones among them, as far as ``need`` is within reach.
-
-    A reflector that matches gets the last number of ``taken``. Then how many tests that took.
-    """
-    z, p, stamp = seen.points, known.points, taken[-1]
-    count, tests = 2, 0
-    for n in range(len(others)):
-        if count + len(others) - n < need:
-            break
-        tests += 1
-        c = others[n]
-        x = h.x + h.cos * z[c, 0] - h.sin * z[c, 1]
-        y = h.y + h.sin * z[c, 0] + h.cos * z[c, 1]
-        cell = cell_of(x, y, buckets)
-        if cell < 0:
-            continue
-        arm2 = (z[c, 0] - h.mx) ** 2 + (z[c, 1] - h.my) ** 2
-        var = seen.var[c] + h.var_mean + arm2 * h.var_turn
-        nearest, least = -1, math.inf
-        begin, end = buckets.starts[cell], buckets.starts[cell + 1]
-        tests += end - begin
-        for s in range(begin, end):
-            r = buckets.members[s]
-            d2 = ((x - p[r, 0]) ** 2 + (y - p[r, 1]) ** 2) / (var + known.var[r])
-            if d2 <= gate2 and d2 < least:
-                nearest, least = r, d2
-        if nearest >= 0 and taken[nearest] != stamp:
-            taken[nearest] = stamp
-            count += 1
-    return count, tests
 
 
 @part
