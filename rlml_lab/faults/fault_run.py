@@ -12,12 +12,12 @@ from rlml_lab.faults.fault_catalog import Fault
 from rlml_lab.faults.recording import Recording
 from rlml_lab.support.drives import feed_one
 from rlml_slam import se2, warm_up
-from rlml_slam.cli.replay import patient
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.evaluation.ate import trajectory_errors
 from rlml_slam.evaluation.relations import relation_errors
 from rlml_slam.evaluation.run_record import FrameLog
 from rlml_slam.params import Parameters
+from rlml_slam.recordings.bag_replay import patient
 from rlml_slam.se2 import Array
 from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.types import Level

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from rlml_lab.support.drives import simulate
-from rlml_slam.cli.support.bag_inputs import BagInputs
 from rlml_slam.datasets.tum import Trajectory, read_tum
 from rlml_slam.errors import InputError
 from rlml_slam.evaluation.relations import Relations, read_relations
 from rlml_slam.params import Parameters, SimulatorParameters
+from rlml_slam.recordings.bag_inputs import BagInputs
 from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.se2 import Array

@@ -52,7 +52,7 @@ def replay(
     """
     warm_up.compile_loaded()
     with BagReader(path) as bag:
-        params = _patient(params)
+        params = patient(params)
         inputs = BagInputs(bag, params)
         slam = SYSTEMS[system][1](params)
         if known is not None:
@@ -97,7 +97,7 @@ def replay(
     return result
 
 
-def _patient(params: Parameters) -> Parameters:
+def patient(params: Parameters) -> Parameters:
     """Nobody waits for the pose: a pause of the odometry that can be bridged is waited for."""
     n = params.node
     longest = max(n.transform_timeout, params.motion.max_gap)

@@ -177,7 +177,7 @@ def detections_of_poses(msg: Any, noise: Reflector, topic: str = 'reflector_pose
         frame(msg.header.frame_id),
         points,
         detection_covariance(points, sigma_r, sigma_b, noise.sigma_fallback),
-        np.full(n, ANONYMOUS, dtype=np.int64),
+        getattr(msg, 'ids', np.full(n, ANONYMOUS, dtype=np.int64)),
         np.full(n, np.nan),
     )
 
