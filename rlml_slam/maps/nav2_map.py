@@ -182,7 +182,9 @@ def _shades(path: Path, mode: str) -> tuple[NDArray[np.uint16], int, NDArray[np.
             f'{path}: more than {Image.MAX_IMAGE_PIXELS} pixels: too large for a map'
         ) from e
     # what Pillow raises for damaged images depends on the format
-    except (OSError, SyntaxError, ValueError, EOFError, OverflowError, IndexError) as e:
+    except (
+        OSError, SyntaxError, ValueError, EOFError, OverflowError, IndexError, MemoryError
+    ) as e:  # fmt: skip
         raise FileFormatError(f'{path}: damaged image: {e}') from e
 
 

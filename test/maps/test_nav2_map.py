@@ -219,3 +219,16 @@ def test_image_that_would_fill_the_memory_is_refused(tmp_path):
     (tmp_path / 'm.pgm').write_bytes(b'P5\n200000 200000\n255\n')
     with pytest.raises(FileFormatError, match='too large for a map'):
         load(meta)
+
+
+def test_image_that_declares_more_than_the_memory_is_refused(tmp_path, monkeypatch):
+    """As the reader of PNG does for a chunk of 2 GB, where there is no room for it."""
+    grid = OccupancyGrid(0.05, (0.0, 0.0), np.zeros((4, 4), np.int8))
+    _, meta = save(grid, tmp_path / 'a')
+
+    def read(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr(Image, 'open', read)
+    with pytest.raises(FileFormatError, match='damaged image'):
+        load(meta)
