@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Package description for colcon (ament_python) and pip alike."""
 
+import os
+import subprocess
+import sys
 from glob import glob
 from pathlib import Path
 from xml.etree import ElementTree
 
-from setuptools import find_packages, setup
+from setuptools import Distribution, find_packages, setup
+from setuptools.command.build_py import build_py
+from setuptools.command.develop import develop
 
 NAME = 'rlml_slam'
 NODES = (
@@ -16,8 +21,47 @@ NODES = (
 ABOUT = ElementTree.parse(Path(__file__).with_name('package.xml')).getroot()
 PEOPLE = ABOUT.findall('maintainer')
 
+
+class WithKernels(Distribution):
+    """The library of kernels is of one machine's kind."""
+
+    def has_ext_modules(self):
+        """Whether a wheel is of one platform."""
+        return True
+
+
+class BuildWithKernels(build_py):
+    """The sources, and the library that is compiled from them."""
+
+    def run(self):
+        """Copy, then compile in the copy; an editable package compiles by `rlml warm-up`."""
+        super().run()
+        if not self.editable_mode:
+            compile_kernels(os.path.abspath(self.build_lib))
+
+
+class DevelopWithKernels(develop):
+    """What `colcon build --symlink-install` runs."""
+
+    def run(self):
+        """Link, then compile beside the sources."""
+        super().run()
+        compile_kernels(os.path.dirname(os.path.realpath(NAME)))
+
+
+def compile_kernels(root):
+    """Compile the library into the package in ``root``, where there are Numba and a compiler."""
+    command = [sys.executable, '-m', NAME, 'warm-up', '--into', os.path.join(root, NAME)]
+    path = os.pathsep.join([root, *filter(None, [os.environ.get('PYTHONPATH')])])
+    done = subprocess.run(command, cwd=root, env={**os.environ, 'PYTHONPATH': path}, check=False)
+    if done.returncode:
+        print('the kernels are compiled when they are first called, or by `rlml warm-up`')
+
+
 setup(
     name=NAME,
+    distclass=WithKernels,
+    cmdclass={'build_py': BuildWithKernels, 'develop': DevelopWithKernels},
     version=ABOUT.findtext('version'),
     description=ABOUT.findtext('description'),
     author=', '.join(p.text for p in PEOPLE),
@@ -28,7 +72,7 @@ setup(
     license=ABOUT.findtext('license'),
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed', 'simulation/worlds/*.yaml']},
+    package_data={NAME: ['py.typed', 'kernels/table.c', 'simulation/worlds/*.yaml']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),

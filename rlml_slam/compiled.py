@@ -1,90 +1,44 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one way kernels are compiled: Numba, cached on disk, IEEE arithmetic, GIL released.
+"""The one way kernels are compiled: IEEE arithmetic, the same code from either compiler.
 
-No fastmath and no threads inside a kernel, so a replay is bit-identical from run to run.
-
-Those on disk that were compiled from other sources go when the package is first used.
+No fastmath and no threads inside a kernel, so a replay is bit-identical from run to run. An
+installed package has them in a library, and its processes need no compiler: they start in a
+second and keep 200 MB less. Where there is none of these sources, Numba compiles a kernel at its
+first call and caches it on disk.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING
 
-import numba
-from llvmlite import ir
-from numba.extending import intrinsic, register_jitable
+from rlml_slam.kernels.library import open_library
 
-from rlml_slam.kernel_cache import remove_stale
+LIBRARY = open_library(Path(__file__).parent)  # None: Numba compiles
+if TYPE_CHECKING or LIBRARY is None:
+    from rlml_slam.kernels.jit import (
+        array_at,
+        brief,
+        fetch,
+        formula,
+        intrinsic,
+        kernel,
+        load8,
+        part,
+    )
+else:
+    from rlml_slam.kernels.native import (
+        array_at,
+        fetch,
+        formula,
+        intrinsic,
+        kernel_of,
+        load8,
+        part,
+    )
 
-F = TypeVar('F', bound=Callable[..., Any])
+    kernel = brief = kernel_of(LIBRARY)
 
-
-remove_stale(Path(__file__).parent)
-
-
-def kernel(function: F) -> F:
-    """The function, compiled at its first call with each signature and cached on disk."""
-    return cast(F, numba.njit(cache=True, error_model='numpy', nogil=True)(function))
-
-
-def brief(function: F) -> F:
-    """A kernel of some microseconds, which keeps the GIL.
-
-    One that lets go of it waits to get it back, for as long as another thread is in Python.
-    """
-    return cast(F, numba.njit(cache=True, error_model='numpy')(function))
-
-
-def part(function: F) -> F:
-    """A kernel that kernels alone call: without an entry from Python it compiles much faster."""
-    options: dict[str, Any] = {'no_cpython_wrapper': True, 'no_cfunc_wrapper': True}
-    return cast(F, numba.njit(cache=True, error_model='numpy', nogil=True, **options)(function))
-
-
-def formula(function: F) -> F:
-    """An expression of numbers that kernels inline; called from Python, NumPy evaluates it.
-
-    So that an equation is written once: kernels call it with scalars, batched code with arrays.
-    """
-    inlined: F = register_jitable(forceinline=True, error_model='numpy')(function)
-    return inlined
-
-
-def _load_word(_typing: Any, array: Any, _at: Any) -> Any:
-    """Typing and code of load8: one load that need not be aligned."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        data = context.make_array(signature.args[0])(context, builder, args[0]).data
-        word = context.get_value_type(signature.return_type)
-        place = builder.bitcast(builder.gep(data, [args[1]]), word.as_pointer())
-        return builder.load(place, align=1)
-
-    return numba.uint64(array, numba.int64), generate
-
-
-# load8(bytes, at): the eight bytes of a contiguous uint8 array from ``at`` on as one word, the
-# first one lowest (little-endian); for kernels only, and not checked
-load8: Any = intrinsic(_load_word)
-
-
-def _fetch_line(_typing: Any, array: Any, _at: Any, _offset: Any) -> Any:
-    """Typing and code of fetch: a hint to the processor."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        data = context.make_array(signature.args[0])(context, builder, args[0]).data
-        byte, flag = ir.IntType(8).as_pointer(), ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [byte, flag, flag, flag])
-        hint = builder.module.declare_intrinsic('llvm.prefetch', [byte], kind)
-        place = builder.bitcast(builder.gep(data, [args[1]]), byte)
-        # to be read, to be kept near, data
-        builder.call(hint, [builder.gep(place, [args[2]]), flag(0), flag(3), flag(1)])
-        return context.get_dummy_value()
-
-    return numba.void(array, numba.int64, numba.int64), generate
-
-
-# fetch(array, at, offset): bring near the line of memory that holds the byte ``offset`` of an
-# element, which is needed soon; for kernels only
-fetch: Any = intrinsic(_fetch_line)
+__all__ = [
+    'LIBRARY', 'array_at', 'brief', 'fetch', 'formula', 'intrinsic', 'kernel', 'load8', 'part',
+]  # fmt: skip

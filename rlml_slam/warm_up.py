@@ -43,3 +43,9 @@ def compile_loaded() -> None:
     """Compile the kernels of every module imported so far; quick if they are cached on disk."""
     for _, warm_up in loaded():
         warm_up()
+
+
+def has_library() -> bool:
+    """Whether the kernels come from a library: then nothing is compiled."""
+    compiled = sys.modules.get('rlml_slam.compiled')
+    return compiled is not None and compiled.LIBRARY is not None

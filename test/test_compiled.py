@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import rlml_slam
-from rlml_slam.kernel_cache import remove_stale
+from rlml_slam.kernels.cache import remove_stale
 
 
 @pytest.fixture
@@ -22,7 +22,7 @@ def package(tmp_path):
     (folder / 'kernels.py').write_text(
         'from pathlib import Path\n'
         'from rlml_slam.compiled import kernel\n'
-        'from rlml_slam.kernel_cache import remove_stale\n'
+        'from rlml_slam.kernels.cache import remove_stale\n'
         'remove_stale(Path(__file__).parent)\n'
         'from some.constants import N\n'
         '@kernel\n'
@@ -39,7 +39,10 @@ def answer(package, cache=None):
     cache_env = {} if cache is None else {'NUMBA_CACHE_DIR': str(cache)}
     done = subprocess.run(
         [sys.executable, '-c', code],
-        env={'PYTHONPATH': path, 'HOME': str(package.parent), **cache_env},
+        env={
+            'PYTHONPATH': path, 'HOME': str(package.parent), 'RLML_SLAM_KERNELS': 'jit',
+            **cache_env,
+        },
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     return int(done.stdout)
@@ -105,6 +108,7 @@ def test_kernel_stays_where_only_the_api_changes(package):
 def test_every_file_with_kernels_is_known():
     """One that is not would keep kernels of other sources."""
     package = Path(rlml_slam.__file__).parent
+    remove_stale(package)
     known = json.loads((package / '__pycache__' / 'kernels.stamp').read_text())
     for compiled in package.rglob('__pycache__/*.nbi'):
         source = compiled.parents[1] / (compiled.name.split('.')[0] + '.py')

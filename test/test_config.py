@@ -169,14 +169,19 @@ def test_every_kernel_is_compiled_ahead(drive):
     """After the warm-up, a drive with closures asks for no kernel that is not there yet."""
     code = """
 import sys
-from numba.core.dispatcher import Dispatcher
 from rlml_slam import warm_up
+from rlml_slam.compiled import LIBRARY
+from rlml_slam.kernels import native
 from rlml_slam.params import Parameters
 from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.ros.bags.bag import BagReader, choose_topics
 from rlml_slam.ros.sensor_input import SensorInput
 
 def compiled():
+    if LIBRARY is not None:
+        assert 'numba' not in sys.modules
+        return set(native.CONVERTED)
+    from numba.core.dispatcher import Dispatcher
     return {
         f'{value.__module__}.{value.__name__}{signature}'
         for name, module in list(sys.modules.items()) if name.startswith('rlml_slam.')

@@ -21,7 +21,7 @@ from rlml_slam.types import Detections
 # topic -> type, depth, whether it is sensor data, best effort
 TOPICS = {
     'carrier_velocity': ('geometry_msgs/msg/TwistStamped', 10, False),
-    'odom': ('nav_msgs/msg/Odometry', 50, True),
+    'odom': ('nav_msgs/msg/Odometry', 50, False),
     'reflectors': ('sensor_msgs/msg/PointCloud2', 5, True),
     'ground_truth': ('nav_msgs/msg/Odometry', 10, False),
     'ground_truth_features': ('sensor_msgs/msg/PointCloud2', 10, False),

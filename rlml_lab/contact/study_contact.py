@@ -24,7 +24,9 @@ FLOOR = 0.02  # [m] of error that is no change
 
 def add_parser(subparsers: Any) -> None:
     """Declare ``rlml-lab study contact``."""
-    parser = subparsers.add_parser('contact', help='messages that nobody should send')
+    parser = subparsers.add_parser(
+        'contact', help='messages that nobody should send: nodes go on, poses too'
+    )
     parser.add_argument('--messages', type=int, default=1_000_000, help='in process')
     parser.add_argument('--dds', type=int, default=100_000, help='over DDS')
     parser.add_argument('--rate', type=float, default=100.0, help='of these [Hz]')

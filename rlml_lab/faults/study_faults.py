@@ -28,7 +28,7 @@ def add_parser(subparsers: Any) -> None:
     """Declare ``rlml-lab study faults``."""
     parser = subparsers.add_parser(
         'faults',
-        help='faults put into a recording: error, health, cost',
+        help='faults put into a recording: error, health and cost of each',
         description='Puts faults of odometry, laser and reflector detector into a recording and '
         'replays it. OK and wrong: the pose is off by more than 0.5 m or 10° beyond 3 sigma and '
         'its health is OK. Without truth, published poses are compared with the replay without '

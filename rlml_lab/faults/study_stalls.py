@@ -102,7 +102,7 @@ def add_parser(subparsers: Any) -> None:
     """Declare ``rlml-lab study stalls``."""
     parser = subparsers.add_parser(
         'stalls',
-        help='odometry that stands still while the robot drives',
+        help='odometry that stands still while the robot drives, then catches up',
         description='Simulated drives whose odometry stalls every 9 s, with a 5 Hz laser of 180°.',
     )
     parser.add_argument('--seeds', type=int, default=10, metavar='N', help='default: %(default)s')

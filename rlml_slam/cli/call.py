@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import time
 from typing import Any
 
-from rlml_slam.cli.support.service_call import call, message_of
+from rlml_slam.cli.support.service_call import answer_of, asking, message_of
 from rlml_slam.errors import InputError
 
+PATIENCE = 3.0  # [s] for the next diagnostics, which come once a second
 SWITCH = {'on': True, 'off': False}
 # service -> type, and the field of its request that takes the argument
 SERVICES = {
@@ -32,7 +34,8 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('service', metavar='SERVICE', choices=SERVICES, help=', '.join(SERVICES))
     parser.add_argument(
         'argument', metavar='ARGUMENT', nargs='?',
-        help='of load_map the name of a map, of the two that switch something on or off',
+        help='of load_map the name of a map, which save_map takes as well, to save under another '
+        'one; of the two that switch something on or off',
     )  # fmt: skip
     parser.add_argument(
         '--node', metavar='NAME', default='/back_end',
@@ -44,17 +47,53 @@ def run(args: argparse.Namespace) -> int:
     """Call it and print what it says."""
     package, name, field = SERVICES[args.service]
     fields = {} if field is None else {field: value_of(args.service, field, args.argument)}
-    if field is None and args.argument is not None:
+    if field is None and args.argument is not None and args.service != 'save_map':
         raise InputError(f'{args.service} takes no argument')
     kind = getattr(importlib.import_module(f'{package}.srv'), name)
-    answer = call(args.node, args.service, kind, fields)
-    if name != 'LoadMap':
-        print(message_of(answer))
-    elif answer.result != kind.Response.RESULT_SUCCESS:
-        raise InputError(f'load_map: {args.node} refused the map, and its log says why')
-    else:
-        print(f'{args.argument}: loaded')
+    with asking() as asker:
+        if args.service == 'save_map' and args.argument is not None:
+            rename(asker, args.node, args.argument)
+        answer = answer_of(asker, args.node, args.service, kind, fields)
+        if name != 'LoadMap':
+            print(message_of(answer))
+        elif answer.result != kind.Response.RESULT_SUCCESS:
+            why = (
+                reason(asker, args.node) or 'the map is refused, and the log of the node says why'
+            )
+            raise InputError(why)
+        else:
+            print(f'{args.argument}: loaded')
     return 0
+
+
+def rename(asker: Any, node: str, name: str) -> None:
+    """Save under another name from now on; InputError where the node refuses it."""
+    from rcl_interfaces.srv import SetParameters
+    from rclpy.parameter import Parameter
+
+    given = [Parameter('map_file_name', value=name).to_parameter_msg()]
+    answer = answer_of(asker, node, 'set_parameters', SetParameters, {'parameters': given})
+    if not answer.results[0].successful:
+        raise InputError(answer.results[0].reason)
+
+
+def reason(asker: Any, node: str) -> str:
+    """Why the node refused a request, from its diagnostics; LoadMap's answer has no text."""
+    import rclpy
+    from diagnostic_msgs.msg import DiagnosticArray
+
+    found: list[str] = []
+
+    def look(message: Any) -> None:
+        for status in message.status:
+            if status.name.startswith(node.lstrip('/')):
+                found.extend(v.value for v in status.values if v.key == 'last refused request')
+
+    asker.create_subscription(DiagnosticArray, '/diagnostics', look, 10)
+    end = time.monotonic() + PATIENCE
+    while not found and time.monotonic() < end:
+        rclpy.spin_once(asker, timeout_sec=0.1)
+    return found[-1] if found else ''
 
 
 def value_of(service: str, field: str, argument: str | None) -> str | bool:

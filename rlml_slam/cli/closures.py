@@ -98,4 +98,7 @@ def text(rows: list[dict[str, str]], everything: bool) -> str:
     lines = [[r[name] for name in columns] for r in shown]
     states = [r['state'] for r in rows]
     counts = ', '.join(f'{states.count(s)} {s}' for s in ('active', 'disabled', 'revoked'))
-    return f'{aligned([columns, *lines])}\n{len(rows)} loop closures: {counts}'
+    total = f'{len(rows)} loop closures: {counts}'
+    if lines:
+        return f'{aligned([columns, *lines])}\n{total}'
+    return f'{total}; all are sound, --all lists them' if rows else total

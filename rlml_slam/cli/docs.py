@@ -94,7 +94,7 @@ def service_table() -> str:
 def parameter_table(of: type[Any], prefix: str = '') -> str:
     """All parameters of a declaration, or those whose names begin with ``prefix``."""
     rows = [
-        (f'`{d.name}`', f'`{_value(d.default)}`', d.unit, _range(d), d.meaning)
+        (f'`{d.name}`', f'`{_value(d.default)}`', d.unit, _range(d), d.meaning + ' ↻' * d.live)
         for d in declarations(of)
         if d.name.startswith(prefix)
     ]

@@ -48,6 +48,9 @@ COMMANDS: Table = {
     'replay': Command(
         'rlml_slam.cli.replay', 'run the system over a bag: no topics, deterministic'
     ),
+    'warm-up': Command(
+        'rlml_slam.cli.warm_up', 'compile the kernels once, into the package or else for this user'
+    ),
     'live': Command('rlml_slam.cli.live', 'play a bag to the live nodes, then a report'),
     'convert': Command('rlml_slam.cli.convert', 'a recorded log becomes a bag'),
     'evaluate': Command(

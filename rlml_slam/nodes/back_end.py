@@ -14,7 +14,6 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import PointCloud2
 
-from rlml_slam import warm_up
 from rlml_slam.params import Parameters
 from rlml_slam.ros.back_end.back_end_figures import figures
 from rlml_slam.ros.back_end.map_services import MapServices
@@ -23,39 +22,41 @@ from rlml_slam.ros.back_end.user_requests import UserRequests
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.codecs.frame_messages import POINT, FrameAssembler, read_points, read_record
 from rlml_slam.ros.codecs.reflector_clouds import ASSOCIATED, read_associated
-from rlml_slam.ros.declare import declare
+from rlml_slam.ros.declare import declare, pace
 from rlml_slam.ros.diagnostics import HealthPublisher
+from rlml_slam.ros.kernels import prepare
 from rlml_slam.ros.message_guard import SMALL, Listener
 from rlml_slam.ros.run import run
 from rlml_slam.slam.conversation import FrontEndCommand, SessionFrame
 
+Take = Callable[[FrontEndCommand], None]
 DEPTH = 200  # of the front end's answers: none may be lost while the map is drawn
 SETTLE_PERIOD = 0.1  # [s] between two looks whether the input has fallen silent
 
 
 class BackEndNode(Node):
-    """Joins the front end's messages by stamp and gives the frames to the mapper.
+    """Gives frames to the mapper, which come by messages or, in the same process, by ``take``."""
 
-    A front end in the same process gets its commands by ``command``, and gives frames to ``take``.
-    """
-
-    def __init__(
-        self, command: Callable[[FrontEndCommand], None] | None = None, **options: Any
-    ) -> None:
+    def __init__(self, command: Take | None = None, **options: Any) -> None:
         super().__init__('back_end', **options)
-        self.params: Parameters = declare(self)
-        self.mapper = Mapper(self, self.params, command)
+        checks: dict[str, Any] = {}
+        self.params: Parameters = declare(self, checks=checks)
+        self.mapper, n = Mapper(self, self.params, command), self.params.node
+        path = checks['map_file_name'] = self.mapper.archive.folder.path
+        self.get_logger().info(f'{n.mode}; the map is {path(n.map_file_name)}')
         self.requests = UserRequests(self.mapper, self.params, self.get_logger())
-        warm_up.compile_loaded()
+        prepare(self)
         self.join = FrameAssembler()
         self.health = HealthPublisher(self, None, self.figures, self.mapper.problems)
         self.map_services = MapServices(self, self.params, self.mapper, self.requests)
         if command is None:
             self._subscribe()
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        period = self.params.node.transform_publish_period
-        self.create_timer(period, self.mapper.send_transform, clock=steady)
-        self.create_timer(SETTLE_PERIOD, self.mapper.settle, clock=steady)
+        timer = self._every(n.transform_publish_period, self.mapper.send_transform)
+        checks['transform_publish_period'] = pace(timer)
+        self._every(SETTLE_PERIOD, self.mapper.settle)
+
+    def _every(self, period: float, act: Callable[[], None]) -> Any:
+        return self.create_timer(period, act, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _subscribe(self) -> None:
         join, n = self.join, self.params.node
@@ -80,10 +81,8 @@ class BackEndNode(Node):
 
     def figures(self) -> dict[str, object]:
         """Figures for /diagnostics."""
-        return {
-            **figures(self.mapper), **self.map_services.figures(),
-            'frames without their points or detections': self.join.incomplete,
-        }  # fmt: skip
+        own = {'frames without their points or detections': self.join.incomplete}
+        return {**figures(self.mapper), **self.map_services.figures(), **own}
 
     def destroy_node(self) -> None:
         """Finish the running jobs first."""

@@ -11,12 +11,12 @@ import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 
-from rlml_slam import warm_up
 from rlml_slam.deformable.slam import DeformableSlam
 from rlml_slam.params import DeformableParameters, Parameters
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.declare import declare
 from rlml_slam.ros.diagnostics import HealthPublisher
+from rlml_slam.ros.kernels import prepare
 from rlml_slam.ros.message_guard import Listener
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensor_input import STREAMS
@@ -38,7 +38,7 @@ class DeformableSlamNode(Node):
         self._map_frame = p.node.map_frame
         self._cost = np.zeros((KEPT, 2))  # wall and CPU time of an update [s]
         self._updates = 0
-        warm_up.compile_loaded()
+        prepare(self)
         self.answers = EstimatePublisher(self, p)
         self.velocity = VelocityInput(self, p.node, self.slam.announce)
         shared = Parameters(node=p.node, motion=p.motion, reflector=p.reflector)

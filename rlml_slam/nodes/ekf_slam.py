@@ -10,7 +10,6 @@ import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 
-from rlml_slam import warm_up
 from rlml_slam.ekf.estimator import Estimator
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import EkfParameters
@@ -18,6 +17,7 @@ from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.declare import declare
 from rlml_slam.ros.diagnostics import HealthPublisher
 from rlml_slam.ros.front_end.frame_publisher import FramePublisher
+from rlml_slam.ros.kernels import prepare
 from rlml_slam.ros.map_publisher import TOPICS, MapPublisher
 from rlml_slam.ros.message_guard import Listener
 from rlml_slam.ros.odom_frame import OdomFrame
@@ -40,7 +40,7 @@ class EkfSlamNode(Node):
         n = self.params.node
         self.estimator = Estimator(self.params)
         self.map_services = EkfServices(self, n, self.estimator, self.restart_in)
-        warm_up.compile_loaded()
+        prepare(self)
         self.answers = FramePublisher(self, n)
         self.products = MapPublisher(self, n, TOPICS)
         self.tf = TransformPublisher(self)

@@ -9,12 +9,12 @@ from typing import Any
 
 from rclpy.node import Node
 
-from rlml_slam import warm_up
 from rlml_slam.params import Parameters
 from rlml_slam.ros.declare import declare
 from rlml_slam.ros.diagnostics import HealthPublisher
 from rlml_slam.ros.front_end.frame_publisher import FramePublisher
 from rlml_slam.ros.front_end.front_end_control import FrontEndControl
+from rlml_slam.ros.kernels import prepare
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensor_input import STREAMS
 from rlml_slam.ros.sensors import Sensors
@@ -33,7 +33,7 @@ class FrontEndNode(Node):
     def __init__(self, has_back_end: bool = False, **options: Any) -> None:
         super().__init__('front_end', **options)
         self.params: Parameters = declare(self)
-        warm_up.compile_loaded()
+        prepare(self)
         self.answers = FramePublisher(self, self.params.node)
         self.take: Callable[[SessionFrame], None] | None = None
         self.control = FrontEndControl(self, self.params, self.answers.begin_session, has_back_end)

@@ -9,11 +9,11 @@ from typing import Any
 
 from rclpy.node import Node
 
-from rlml_slam import warm_up
 from rlml_slam.params import DetectorParameters, Parameters
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
 from rlml_slam.ros.declare import declare
+from rlml_slam.ros.kernels import prepare
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensors import SENSOR, Sensors
 from rlml_slam.ros.systems.detector_diagnostics import DetectorHealth
@@ -35,7 +35,7 @@ class ReflectorDetectorNode(Node):
         self._publisher = self.create_publisher(
             rclpy_class('sensor_msgs/msg/PointCloud2'), n.reflectors_topic, SENSOR
         )
-        warm_up.compile_loaded()
+        prepare(self)
         shared = Parameters(node=n, motion=self.params.motion)
         streams = ('scan', 'odom', 'imu')
         self.sensors = Sensors(self, shared, streams, self.process, self.restart)

@@ -13,10 +13,10 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
-from rlml_slam import warm_up
 from rlml_slam.params import SimulatorParameters
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.declare import declare
+from rlml_slam.ros.kernels import prepare
 from rlml_slam.ros.message_guard import Listener
 from rlml_slam.ros.playback_clock import PlaybackClock
 from rlml_slam.ros.run import run
@@ -44,7 +44,7 @@ class SimulatorNode(Node):
         self._finished: float | None = None
         if n.drive == 'cmd_vel':
             Listener(self, Twist, 'cmd_vel', self.on_cmd_vel, RELIABLE)
-        warm_up.compile_loaded()
+        prepare(self)
         # steady timers: with use_sim_time, a ROS timer would wait for this node's own clock
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(0.005, self.tick, clock=steady)

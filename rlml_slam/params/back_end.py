@@ -69,6 +69,7 @@ class BackEnd(Group):
         'm/s',
         0.0,
         100.0,
+        live=True,
     )
     correction_turn_rate: float = param(
         0.1,
@@ -76,9 +77,15 @@ class BackEnd(Group):
         'rad/s',
         0.001,
         100.0,
+        live=True,
     )
     jump_distance: float = param(
-        0.05, 'a correction that moves the robot by more is published on jumps', 'm', 0.0, 100.0
+        0.05,
+        'a correction that moves the robot by more is published on jumps',
+        'm',
+        0.0,
+        100.0,
+        live=True,
     )
     survey: str = param(
         '',

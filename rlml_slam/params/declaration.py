@@ -26,12 +26,19 @@ def param(
     low: float = -INF,
     high: float = INF,
     choices: tuple[str, ...] = (),
+    live: bool = False,
 ) -> Any:
-    """A dataclass field with its meaning, unit, inclusive bounds and choices."""
+    """A dataclass field with its meaning, unit, inclusive bounds and choices.
+
+    One that is ``live`` may change while a node runs: it is read where it is used.
+    """
     return field(
         default=default,
-        metadata={'meaning': meaning, 'unit': unit, 'low': low, 'high': high, 'choices': choices},
-    )
+        metadata={
+            'meaning': meaning, 'unit': unit, 'low': low, 'high': high, 'choices': choices,
+            'live': live,
+        },
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -52,6 +59,16 @@ class Group:
         """Check each field against its declared type, bounds and choices."""
         for f in dataclasses.fields(self):
             object.__setattr__(self, f.name, _checked(self._prefix, f, getattr(self, f.name)))
+
+    def change(self, name: str, value: Any) -> None:
+        """Give a live parameter another value, for all that read it from now on.
+
+        Raises ParameterError for one that is not live, or a value outside of its declaration.
+        """
+        f = next(f for f in dataclasses.fields(self) if f.name == name)
+        if not f.metadata['live']:
+            raise ParameterError(f'{self._prefix}{name} is read when the node starts: restart it')
+        object.__setattr__(self, name, _checked(self._prefix, f, value))
 
 
 def _checked(prefix: str, f: dataclasses.Field[Any], value: Any) -> Any:
@@ -115,6 +132,7 @@ class Declaration:
     high: float
     choices: tuple[str, ...]
     meaning: str
+    live: bool
 
 
 def declarations(of: type[Any]) -> Iterator[Declaration]:
@@ -128,5 +146,5 @@ def declarations(of: type[Any]) -> Iterator[Declaration]:
                 g.name,
                 f.name,
                 f.default,
-                *(f.metadata[k] for k in ('unit', 'low', 'high', 'choices', 'meaning')),
+                *(f.metadata[k] for k in ('unit', 'low', 'high', 'choices', 'meaning', 'live')),
             )

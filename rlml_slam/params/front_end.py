@@ -257,7 +257,7 @@ class HealthLimits(Group, prefix='health.'):
     """When the estimate counts as DEGRADED or LOST."""
 
     input_timeout: float = param(
-        1.0, 'DEGRADED when an input is missing for longer', 's', 0.0, 60.0
+        1.0, 'DEGRADED when an input is missing for longer', 's', 0.0, 60.0, live=True
     )
     confirmation_time: float = param(
         5.0, 'LOST when the start pose in a saved map has no match for this long', 's', 0.0, 600.0
@@ -272,8 +272,10 @@ class HealthLimits(Group, prefix='health.'):
         1e-3,
         10.0,
     )
-    sigma_degraded: float = param(0.5, 'DEGRADED beyond this position sigma', 'm', 1e-3, 100.0)
-    sigma_lost: float = param(2.0, 'LOST beyond this position sigma', 'm', 1e-3, 1000.0)
+    sigma_degraded: float = param(
+        0.5, 'DEGRADED beyond this position sigma', 'm', 1e-3, 100.0, live=True
+    )
+    sigma_lost: float = param(2.0, 'LOST beyond this position sigma', 'm', 1e-3, 1000.0, live=True)
     contradiction_ratio: float = param(
         0.6,
         'a scan whose score is below this share of the usual score contradicts the map',

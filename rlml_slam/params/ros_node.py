@@ -60,7 +60,9 @@ class Node(Group, prefix=''):
     )
     map_directory: str = param('maps', 'the only folder that maps are saved to and loaded from')
     map_file_name: str = param(
-        'map', 'name of the saved map in map_directory, without suffix; NAME.yaml is a map of nav2'
+        'map',
+        'name of the saved map in map_directory, without suffix; NAME.yaml is a map of nav2',
+        live=True,
     )
     continue_map: bool = param(
         False,
@@ -102,12 +104,18 @@ class Node(Group, prefix=''):
         's',
         0.001,
         10.0,
+        live=True,
     )
     transform_timeout: float = param(
         0.2, 'longest time that a scan waits for the odometry at its stamp', 's', 0.0, 10.0
     )
     map_update_interval: float = param(
-        2.0, 'period at which map, graph and trajectory are published', 's', 0.05, 600.0
+        2.0,
+        'period at which map, graph and trajectory are published',
+        's',
+        0.05,
+        600.0,
+        live=True,
     )
     tf_buffer_duration: float = param(
         30.0, 'length of the buffers of odometry and of waiting inputs', 's', 1.0, 600.0

@@ -2,7 +2,8 @@
 """Declare the parameters of rlml_slam.params as ROS parameters, and read their values.
 
 rclpy ignores names in a YAML file that nobody declares, and refuses a whole number where a
-fraction is expected. Here an unknown name is warned about and numbers are numbers.
+fraction is expected. Here an unknown name is warned about and numbers are numbers. Live parameters
+may be set while the node runs; of the others, the answer says that they need a restart.
 """
 
 from __future__ import annotations
@@ -10,11 +11,18 @@ from __future__ import annotations
 import difflib
 import math
 import sys
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.parameter import Parameter
 
+from rlml_slam.errors import RlmlError
 from rlml_slam.params import (
     NODES,
     ROS_OWN,
@@ -24,9 +32,16 @@ from rlml_slam.params import (
     from_mapping,
 )
 
+Check = Callable[[Any], object]
 
-def declare(node: Any, of: type[Any] = Parameters) -> Any:
+
+def declare(
+    node: Any, of: type[Any] = Parameters, checks: Mapping[str, Check] | None = None
+) -> Any:
     """Declare every parameter of ``of`` on the node; the values given to it, checked.
+
+    Live ones change in the groups that are returned. ``checks``: by name, what is called with a
+    new value before it is taken, and raises RlmlError against it.
 
     Raises ParameterError for a value that its field refuses. A name that no node of this package
     knows is warned about: one YAML file may serve them all.
@@ -38,12 +53,49 @@ def declare(node: Any, of: type[Any] = Parameters) -> Any:
     for name in sorted(given.keys() - set(everywhere)):
         if not name.startswith(ROS_OWN):
             near = difflib.get_close_matches(name, known, n=1)
-            hint = f'; is {near[0]!r} meant?' if near else ''
-            node.get_logger().warning(f'unknown parameter {name!r} has no effect{hint}')
+            hint = f'is {near[0]!r} meant?' if near else '--help lists those that have one'
+            node.get_logger().warning(f'unknown parameter {name!r} has no effect; {hint}')
     for d in known.values():
         value = getattr(getattr(parameters, d.group), d.field)
         node.declare_parameter(d.name, _ros_value(value), descriptor(d), ignore_override=True)
+    node.add_on_set_parameters_callback(
+        lambda given: _change(
+            node.get_logger(), parameters, known, given, {} if checks is None else checks
+        )
+    )
     return parameters
+
+
+def _change(
+    logger: Any,
+    parameters: Any,
+    known: Mapping[str, Declaration],
+    given: list[Any],
+    checks: Mapping[str, Check],
+) -> SetParametersResult:
+    """Take new values of live parameters, or none and say why."""
+    before = []
+    try:
+        for p in given:
+            d = known.get(p.name)
+            if d is None:
+                continue  # rclpy's own
+            group = getattr(parameters, d.group)
+            before.append((group, d.field, getattr(group, d.field)))
+            group.change(d.field, p.value)
+            checks.get(p.name, lambda _: None)(p.value)
+    except RlmlError as e:
+        for group, field, value in before:
+            object.__setattr__(group, field, value)
+        return SetParametersResult(successful=False, reason=str(e))
+    for group, field, value in before:
+        logger.info(f'{field}: {value} is now {getattr(group, field)}')
+    return SetParametersResult(successful=True)
+
+
+def pace(timer: Any) -> Check:
+    """What gives a timer another period [s]."""
+    return lambda seconds: setattr(timer, 'timer_period_ns', int(seconds * 1e9))
 
 
 def _ros_value(value: Any) -> Any:
@@ -54,12 +106,17 @@ def _ros_value(value: Any) -> Any:
 
 
 def descriptor(d: Declaration) -> ParameterDescriptor:
-    """Description with unit, choices and range; values are fixed when the node starts."""
+    """Description with unit, choices and range.
+
+    None is read-only for ROS, which would refuse a new value without a reason.
+    """
     unit = f' [{d.unit}]' if d.unit else ''
     out = ParameterDescriptor(
         description=d.meaning + unit,
-        additional_constraints=f'one of {", ".join(d.choices)}' if d.choices else '',
-        read_only=True,
+        additional_constraints='; '.join(
+            [f'one of {", ".join(d.choices)}'] * bool(d.choices)
+            + ['read when the node starts'] * (not d.live)
+        ),
     )
     if math.isinf(d.low) and math.isinf(d.high):
         return out

@@ -68,6 +68,12 @@ class HealthPublisher:
             figures['last refused input'] = inputs.last_error
         return figures
 
+    def summary(self) -> str:
+        """What there was, in a line for the end of a run."""
+        inputs = [f'{what} {n}' for what, n in self._inputs().items() if n]
+        refused = [f'{what} {n}' for what, n in self._guard.figures().items()]
+        return '; '.join([f'ends after {self._frames} frames', *inputs, *refused])
+
     def publish(self) -> None:
         """Send the status."""
         figures: dict[str, object] = {

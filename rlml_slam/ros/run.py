@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import gc
+import signal
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -12,10 +13,31 @@ import rclpy.utilities
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.exceptions import InvalidNodeNameException, NameValidationException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
 
 from rlml_slam.errors import FileFormatError, MapError, RlmlError
 from rlml_slam.ros.memory import keep_large_apart
 from rlml_slam.ros.message_guard import guard_of
+from rlml_slam.ros.usage import answered
+
+WAIT = 0.2  # [s] after which a signal is looked for where nothing comes
+
+
+class _Signals:
+    """SIGINT and SIGTERM: end the spinning, or what comes before it at once.
+
+    Those of rclpy take the topics away first, and whoever still publishes or logs fails.
+    """
+
+    def __init__(self) -> None:
+        self.came = self.is_spinning = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+    def _on_signal(self, _number: int, _frame: object) -> None:
+        self.came = True
+        if not self.is_spinning:
+            raise KeyboardInterrupt
 
 
 def run(*factories: Callable[[], Any]) -> int:
@@ -23,21 +45,25 @@ def run(*factories: Callable[[], Any]) -> int:
 
     A node ends the run by raising SystemExit in a callback. SIGINT and SIGTERM end it with 0.
     """
+    code = answered(factories[0], sys.argv)
+    if code is not None:
+        return code
     keep_large_apart()
     try:
-        rclpy.init(args=sys.argv)
+        rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
     except RCLError as e:
         print(f'rlml_slam: {_cause(e)}', file=sys.stderr)
         return 1
     nodes: list[Any] = []
-    executor = SingleThreadedExecutor()
+    executor, signals = SingleThreadedExecutor(), _Signals()
     try:
         for factory in factories:
             nodes.append(factory())
             executor.add_node(nodes[-1])
         # what is there now stays: looking through all of it again and again would hold up poses
         gc.freeze()
-        _spin(executor, nodes)
+        signals.is_spinning = True
+        _spin(executor, nodes, signals)
     except (RlmlError, NameValidationException, InvalidNodeNameException) as e:
         print(f'rlml_slam: {e}', file=sys.stderr)
         return 1
@@ -51,20 +77,22 @@ def run(*factories: Callable[[], Any]) -> int:
         return int(e.code or 0)
     finally:
         for node in nodes:
+            if hasattr(node, 'health'):
+                node.get_logger().info(node.health.summary())
             node.destroy_node()
         executor.shutdown(timeout_sec=1.0)
         rclpy.utilities.try_shutdown()
     return 0
 
 
-def _spin(executor: Any, nodes: list[Any]) -> None:
+def _spin(executor: Any, nodes: list[Any], signals: _Signals) -> None:
     """Spin; an error that nobody expected is logged, and the nodes go on.
 
     What they have mapped is worth more than a process that ends.
     """
-    while rclpy.utilities.ok():
+    while rclpy.utilities.ok() and not signals.came:
         try:
-            executor.spin()
+            executor.spin_once(timeout_sec=WAIT)
         except (MapError, FileFormatError, ExternalShutdownException):
             raise  # a map that a parameter names cannot be used, or a signal came
         except Exception as e:

@@ -31,6 +31,7 @@ from rlml_slam.ros.sensor_input import (
 from rlml_slam.ros.tf import Extrinsics, subscribe_static
 from rlml_slam.sensing.synchronization.synchronizer import Synchronizer
 from rlml_slam.types import Detections, Observation
+from rlml_slam.version import __version__
 
 TF_PATIENCE = 1_000_000_000  # [ns] of stamps that a sensor's place on /tf_static is waited for
 RELIABLE = QoSProfile(depth=10)
@@ -99,6 +100,9 @@ class Sensors:
             if getattr(params.node, USED_BY[stream]) or stream == 'scan':
                 for topic in topics_of(params.node, stream):
                     self._subscribe(node, stream, topic)
+        inputs = ', '.join(f'{s} on {q.topic_name}' for s, q in self._queues)
+        self._logger.info(f'rlml_slam {__version__}, {params.node.mode}: waits for {inputs}')
+        self._came: set[str] = set()
         self._missing = [k for k, (s, _) in enumerate(self._queues) if s in ('scan', 'odom')]
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(0.25 * SILENCE, self.flush_if_silent, clock=steady)
@@ -174,8 +178,20 @@ class Sensors:
             missing = [
                 f'{self._queues[k][0]} on {self._queues[k][1].topic_name}' for k in self._missing
             ]
-            self._logger.warning(f'waiting for {", ".join(missing)}')
+            self._logger.warning(f'waiting for {", ".join(missing)}{self._others(self._missing)}')
             self._missing = []
+
+    def _others(self, missing: list[int]) -> str:
+        """Other topics of the types that are missing."""
+        kinds = {STREAMS[self._queues[k][0]][1]: self._queues[k][0] for k in missing}
+        known = {subscription.topic_name for _, subscription in self._queues}
+        found = [
+            f'{topic} ({kinds[t]})'
+            for topic, types in sorted(self._node.get_topic_names_and_types())
+            for t in types
+            if t in kinds and topic not in known
+        ]
+        return f'; of these types there are {", ".join(found[:8])}' if found else ''
 
     def _tell_of_refused(self) -> None:
         """Say of each stream once why an input was not used; /diagnostics count all of them."""
@@ -200,6 +216,9 @@ class Sensors:
     def add(self, stream: str, msg: Any) -> None:
         """One message of a stream."""
         self._heard = time.monotonic()
+        if stream not in self._came:
+            self._came.add(stream)
+            self._logger.info(f'first {stream}, in frame {frame(msg.header.frame_id)[:100]!r}')
         if stream not in PLACED:
             self._use(stream, msg)
             return

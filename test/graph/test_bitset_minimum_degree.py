@@ -2,9 +2,10 @@
 import numba
 import numpy as np
 import pytest
+from numba_modules import compiled_by_numba
 
-from rlml_slam.graph.sparse.bitset_minimum_degree import minimum_degree_of_bits
-from rlml_slam.graph.sparse.symbolic_analysis import adjacency
+bitset, analysis = compiled_by_numba('bitset_minimum_degree', 'symbolic_analysis')
+minimum_degree_of_bits, adjacency = bitset.minimum_degree_of_bits, analysis.adjacency
 
 
 @numba.njit

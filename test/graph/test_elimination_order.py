@@ -2,10 +2,13 @@
 import numba
 import numpy as np
 import pytest
+from numba_modules import compiled_by_numba
 
-from rlml_slam.graph.sparse.elimination_order import FEW, elimination_order
-from rlml_slam.graph.sparse.minimum_degree import minimum_degree
-from rlml_slam.graph.sparse.symbolic_analysis import adjacency
+order, degree, analysis = compiled_by_numba(
+    'elimination_order', 'minimum_degree', 'symbolic_analysis'
+)
+FEW, elimination_order = order.FEW, order.elimination_order
+minimum_degree, adjacency = degree.minimum_degree, analysis.adjacency
 
 
 @numba.njit

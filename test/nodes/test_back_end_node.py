@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import re
 
 import numpy as np
@@ -10,10 +11,12 @@ import pytest
 from diagnostic_msgs.srv import AddDiagnostics
 from live import LATCHED, room
 from nav_msgs.srv import GetMap, LoadMap
+from rclpy.parameter import Parameter
 from std_srvs.srv import Empty, SetBool, Trigger
 
 from rlml_slam import se2
 from rlml_slam.cli.closures import parse
+from rlml_slam.errors import MapError
 from rlml_slam.maps import reflector_file
 from rlml_slam.nodes.back_end import BackEndNode
 from rlml_slam.nodes.front_end import FrontEndNode
@@ -235,11 +238,15 @@ def test_loop_closures_are_listed_and_revoked_by_service(live):
 
 @pytest.mark.parametrize('name', ['../map', '/etc/map', '.'])
 def test_maps_stay_inside_their_folder(live, tmp_path, name):
-    back = live.start(BackEndNode, map_directory=str(tmp_path / 'maps'), map_file_name=name)
-    answer = live.call(Trigger, 'back_end/save_map', Trigger.Request())
-    assert not answer.success
-    with pytest.raises(Exception, match='is not inside of map_directory'):
-        back.mapper.archive.folder.path(name)
+    folder = str(tmp_path / 'maps')
+    with pytest.raises(MapError, match='is not inside of map_directory'):
+        live.start(BackEndNode, map_directory=folder, map_file_name=name)
+    gc.collect()  # the node that was not made
+    back = live.start(BackEndNode, map_directory=folder)
+    answer = back.set_parameters([Parameter('map_file_name', value=name)])[0]
+    assert not answer.successful
+    assert 'is not inside of map_directory' in answer.reason
+    assert back.params.node.map_file_name == 'map'
 
 
 def test_saved_map_serves_for_localization(live, tmp_path):

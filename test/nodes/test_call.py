@@ -44,7 +44,8 @@ def test_services_answer_in_words_and_refuse_in_words(live, command, tmp_path):
     assert command('load_map', 'hall') == (0, 'hall: loaded\n', '')
     code, out, err = command('load_map', 'nowhere')
     assert (code, out) == (1, '')
-    assert 'refused the map' in err
+    assert 'load_map: ' in err
+    assert 'nowhere' in err
     code, out, err = command('load_map', '')
     assert (code, out) == (1, '')
     code, out, err = command('save_map')
@@ -56,10 +57,27 @@ def test_services_answer_in_words_and_refuse_in_words(live, command, tmp_path):
     ('words', 'why'),
     [
         (['load_map'], 'load_map needs an argument'),
-        (['save_map', 'hall'], 'save_map takes no argument'),
+        (['reset', 'hall'], 'reset takes no argument'),
         (['set_localization_mode', 'yes'], "'yes' is neither on nor off"),
     ],
 )
 def test_wrong_argument_is_one_line(words, why, capsys):
     assert main(['call', *words]) == 1
     assert why in capsys.readouterr().err
+
+
+def test_absent_node_is_reported_at_once_with_those_that_are_there(live, command, tmp_path):
+    live.start(BackEndNode, map_directory=str(tmp_path))
+    code, out, err = command('save_map', '--node', '/nobody')
+    assert (code, out) == (1, '')
+    assert '/nobody: no such node; --node /back_end has the service save_map' in err
+
+
+def test_map_is_saved_under_another_name(live, command, tmp_path):
+    node = live.start(BackEndNode, map_directory=str(tmp_path))
+    code, out, err = command('save_map', '../outside')
+    assert (code, out) == (1, '')
+    assert 'is not inside of map_directory' in err
+    code, out, err = command('save_map', 'second')
+    assert 'there is no map yet' in err
+    assert node.params.node.map_file_name == 'second'

@@ -53,7 +53,7 @@ def test_every_parameter_is_declared_with_its_default_and_documented(make_node, 
         described = node.describe_parameter(d.name)
         assert d.meaning in described.description
         assert d.unit in described.description
-        assert described.read_only
+        assert ('read when the node starts' in described.additional_constraints) != d.live
 
 
 def test_ranges_and_choices_are_described(make_node):
@@ -63,7 +63,9 @@ def test_ranges_and_choices_are_described(make_node):
     assert (bounds.from_value, bounds.to_value) == (0.01, 1.0)
     whole = node.describe_parameter('submap.insertions').integer_range[0]
     assert (whole.from_value, whole.to_value) == (2, 10000)
-    assert node.describe_parameter('mode').additional_constraints == 'one of mapping, localization'
+    assert node.describe_parameter('mode').additional_constraints == (
+        'one of mapping, localization; read when the node starts'
+    )
 
 
 def test_given_values_are_taken_and_whole_numbers_serve_as_fractions(make_node):
@@ -87,6 +89,12 @@ def test_unknown_name_is_warned_about_with_what_may_be_meant(make_node, monkeypa
     said = warnings_of(node, monkeypatch)
     declare(node)
     assert said == ["unknown parameter 'scan_topik' has no effect; is 'scan_topic' meant?"]
+    node, said[:] = make_node(nosuchparam=3), []
+    said = warnings_of(node, monkeypatch)
+    declare(node)
+    assert said == [
+        "unknown parameter 'nosuchparam' has no effect; --help lists those that have one"
+    ]
 
 
 def test_names_of_the_other_nodes_and_of_rclpy_are_no_mistakes(make_node, monkeypatch):
@@ -94,3 +102,35 @@ def test_names_of_the_other_nodes_and_of_rclpy_are_no_mistakes(make_node, monkey
     said = warnings_of(node, monkeypatch)
     assert declare(node) == Parameters()
     assert said == []
+
+
+def test_live_parameters_change_and_others_say_why_not(make_node):
+    node, taken = make_node(), []
+
+    def check(name):
+        if name == 'bad':
+            raise ParameterError('bad is no name')
+        taken.append(name)
+
+    parameters = declare(node, checks={'map_file_name': check})
+    limits = parameters.health
+
+    def given(**values):
+        new = [Parameter(n.replace('__', '.'), value=v) for n, v in values.items()]
+        return node.set_parameters_atomically(new)
+
+    assert given(health__sigma_lost=1.0, map_file_name='second').successful
+    assert limits.sigma_lost == 1.0
+    assert (parameters.node.map_file_name, taken) == ('second', ['second'])
+    for values, why in (
+        ({'mode': 'localization'}, 'mode is read when the node starts: restart it'),
+        ({'health.sigma_lost': -1.0}, 'out of range'),
+        ({'health.sigma_lost': 'much'}, ''),
+        ({'map_file_name': 'bad'}, 'bad is no name'),
+    ):
+        answer = given(**values)
+        assert not answer.successful
+        assert why in answer.reason
+    assert (limits.sigma_lost, parameters.node.map_file_name) == (1.0, 'second')
+    assert not given(health__sigma_degraded=0.1, use_imu=False).successful
+    assert limits.sigma_degraded == Parameters().health.sigma_degraded

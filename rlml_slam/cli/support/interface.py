@@ -125,7 +125,7 @@ TOPICS = (
     Topic('simulator', IN, 'cmd_vel', 'geometry_msgs/Twist', RELIABLE, 'with `drive:=cmd_vel`'),
     Topic('simulator', OUT, 'scan', 'sensor_msgs/LaserScan', SENSOR,
           'with intensities and time per ray'),
-    Topic('simulator', OUT, 'odom', 'nav_msgs/Odometry', SENSOR, 'wheel odometry'),
+    Topic('simulator', OUT, 'odom', 'nav_msgs/Odometry', RELIABLE, 'wheel odometry'),
     Topic('simulator', OUT, 'imu', 'sensor_msgs/Imu', SENSOR, 'yaw rate with a bias'),
     Topic('simulator', OUT, 'reflectors', CLOUD, SENSOR, 'detections, anonymous by default'),
     Topic('simulator', OUT, 'ground_truth', 'nav_msgs/Odometry', RELIABLE, 'true pose in the map'),

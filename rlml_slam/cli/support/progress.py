@@ -13,11 +13,14 @@ LINE_EVERY = 10.0  # [s] between two lines where there is no terminal
 class Progress:
     """Shows how far a job is, as a context manager; costs next to nothing per update."""
 
-    def __init__(self, what: str, total: float, quiet: bool = False) -> None:
+    def __init__(
+        self, what: str, total: float, quiet: bool = False, every: float = LINE_EVERY
+    ) -> None:
         self._what, self._total = what, max(total, 1e-9)
         self._bar = None
         self._last = time.monotonic()
         self._quiet = quiet
+        self._every = every
         if not quiet and sys.stderr.isatty():
             from rich.console import Console
             from rich.progress import BarColumn, TaskProgressColumn, TextColumn
@@ -49,7 +52,7 @@ class Progress:
             self._bar.update(self._task, completed=min(done, self._total), note=note)
             return
         now = time.monotonic()
-        if self._quiet or now - self._last < LINE_EVERY:
+        if self._quiet or now - self._last < self._every:
             return
         self._last = now
         share = min(100.0, 100.0 * done / self._total)

@@ -3,11 +3,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import time
+from collections.abc import Iterator
 from typing import Any
 
 from rlml_slam.errors import InputError
 
-PATIENCE = 10.0  # [s] in which a running node is found
+PATIENCE = 2.0  # [s] in which a running node is found,
+ALONE = 6.0  # and where none at all has been found so far, on a busy machine
 WORK = 120.0  # [s] in which it answers: to save or to search a large map takes its time
 
 
@@ -28,22 +33,62 @@ def message_of(answer: Any) -> str:
     return str(answer.message)
 
 
-def call(node: str, service: str, kind: Any, fields: dict[str, Any]) -> Any:
-    """The response of a service of a running node; InputError where there is none."""
+@contextlib.contextmanager
+def asking() -> Iterator[Any]:
+    """A node that asks."""
     import rclpy
 
     rclpy.init()
     try:
-        asker = rclpy.create_node('rlml_ask')
-        client = asker.create_client(kind, f'{node}/{service}')
-        if not client.wait_for_service(PATIENCE):
-            raise InputError(f'{node}: no node with the service {service} is running')
-        future = client.call_async(kind.Request(**fields))
-        rclpy.spin_until_future_complete(asker, future, timeout_sec=WORK)
-        answer = future.result() if future.done() else None
-        asker.destroy_node()
+        yield rclpy.create_node('rlml_ask')
     finally:
         rclpy.shutdown()
-    if answer is None:
+
+
+def call(node: str, service: str, kind: Any, fields: dict[str, Any]) -> Any:
+    """The response of a service of a running node; InputError where there is none."""
+    with asking() as asker:
+        return answer_of(asker, node, service, kind, fields)
+
+
+def answer_of(asker: Any, node: str, service: str, kind: Any, fields: dict[str, Any]) -> Any:
+    """The same of the node that asks."""
+    import rclpy
+
+    client = asker.create_client(kind, f'{node}/{service}')
+    began = time.monotonic()
+    while not client.wait_for_service(PATIENCE):
+        if _others(asker) or time.monotonic() - began > ALONE:
+            raise InputError(_absent(asker, node, service))
+    future = client.call_async(kind.Request(**fields))
+    rclpy.spin_until_future_complete(asker, future, timeout_sec=WORK)
+    if not future.done() or future.result() is None:
         raise InputError(f'{node}: no answer within {WORK:.0f} s')
-    return answer
+    return future.result()
+
+
+def _absent(asker: Any, node: str, service: str) -> str:
+    """Why a service was not found: which nodes there are, and which of them has it."""
+    running, having = [], []
+    for full, name, namespace in _others(asker):
+        running.append(full)
+        offered = asker.get_service_names_and_types_by_node(name, namespace)
+        if f'{full}/{service}' in (offer for offer, _ in offered):
+            having.append(full)
+    if having:
+        return f'{node}: no such node; --node {having[0]} has the service {service}'
+    if node in running:
+        return f'{node} runs, and has no service {service}'
+    nodes = f'there are {", ".join(sorted(running))}' if running else 'no node is running'
+    return f'{node}: no such node; {nodes} (in ROS_DOMAIN_ID {_domain()})'
+
+
+def _others(asker: Any) -> list[tuple[str, str, str]]:
+    """Full name, name and namespace of the nodes that are seen."""
+    seen = [(f'{s.rstrip("/")}/{n}', n, s) for n, s in asker.get_node_names_and_namespaces()]
+    own = asker.get_fully_qualified_name()
+    return [node for node in seen if node[0] != own and not node[1].startswith('_')]
+
+
+def _domain() -> str:
+    return os.environ.get('ROS_DOMAIN_ID', '0')

@@ -11,13 +11,9 @@ import ctypes
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
-from numba.np.numpy_support import carray
 from numpy.typing import NDArray
 
-from rlml_slam.compiled import part
+from rlml_slam.compiled import array_at, intrinsic, part
 from rlml_slam.graph.model.packed_system import Factors, Tables
 from rlml_slam.graph.sparse.symbolic_analysis import Ints
 from rlml_slam.se2 import Array
@@ -52,6 +48,8 @@ def buffers_of(buffers: tuple[NDArray[Any], ...], last: Buffers | None = None) -
 
 def _to_pointer(_typing: Any, address: Any) -> Any:
     """Typing and code of pointer: an address is taken for one."""
+    from numba import types
+    from numba.core import cgutils
 
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         return builder.inttoptr(args[0], cgutils.voidptr_t)
@@ -60,14 +58,13 @@ def _to_pointer(_typing: Any, address: Any) -> Any:
 
 
 _pointer: Any = intrinsic(_to_pointer)
-_array: Any = carray
 
 
 @part
 def nodes_at(at: Ints) -> tuple[Array, Array]:
     """Poses (n, 3) and landmarks (m, 2) of a graph with its buffers ``at`` (Graph.addresses)."""
-    poses = _array(_pointer(at[0, 0]), (at[0, 1], 3), np.float64)
-    landmarks = _array(_pointer(at[1, 0]), (at[1, 1], 2), np.float64)
+    poses = array_at(_pointer(at[0, 0]), (at[0, 1], 3), np.float64)
+    landmarks = array_at(_pointer(at[1, 0]), (at[1, 1], 2), np.float64)
     return poses, landmarks
 
 
@@ -75,8 +72,8 @@ def nodes_at(at: Ints) -> tuple[Array, Array]:
 def tables_at(at: Ints, losses: Array) -> Tables:
     """The tables of a graph with its buffers ``at``, as Graph.tables."""
     return Tables(
-        _array(_pointer(at[2, 0]), (at[2, 1],), np.bool_),
-        _array(_pointer(at[3, 0]), (at[3, 1],), np.bool_),
+        array_at(_pointer(at[2, 0]), (at[2, 1],), np.bool_),
+        array_at(_pointer(at[3, 0]), (at[3, 1],), np.bool_),
         _factors_at(at[4:9], 2, 3), _factors_at(at[9:14], 2, 2),
         _factors_at(at[14:19], 1, 3), _factors_at(at[19:24], 1, 2), losses,
     )  # fmt: skip
@@ -86,9 +83,9 @@ def tables_at(at: Ints, losses: Array) -> Tables:
 def _factors_at(at: Ints, nodes: int, size: int) -> Factors:
     k = at[0, 1]
     return Factors(
-        _array(_pointer(at[0, 0]), (k, nodes), np.int64),
-        _array(_pointer(at[1, 0]), (k, size), np.float64),
-        _array(_pointer(at[2, 0]), (k, size, size), np.float64),
-        _array(_pointer(at[3, 0]), (k,), np.int64),
-        _array(_pointer(at[4, 0]), (k,), np.bool_),
+        array_at(_pointer(at[0, 0]), (k, nodes), np.int64),
+        array_at(_pointer(at[1, 0]), (k, size), np.float64),
+        array_at(_pointer(at[2, 0]), (k, size, size), np.float64),
+        array_at(_pointer(at[3, 0]), (k,), np.int64),
+        array_at(_pointer(at[4, 0]), (k,), np.bool_),
     )

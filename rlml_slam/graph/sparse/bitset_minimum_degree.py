@@ -16,15 +16,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import types
-from numba.extending import intrinsic
 
-from rlml_slam.compiled import part
+from rlml_slam.compiled import intrinsic, part
 from rlml_slam.graph.sparse.symbolic_analysis import Ints
 
 
 def _count_bits(_typing: Any, word: Any) -> Any:
     """Typing and code of ones: one instruction."""
+    from numba import types
 
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         return builder.ctpop(args[0])

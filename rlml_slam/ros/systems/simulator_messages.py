@@ -19,7 +19,7 @@ from rlml_slam.simulation.robot import SECOND
 from rlml_slam.simulation.simulation import START, Event, GroundTruth, Message, Simulation
 from rlml_slam.types import Detections, Health, Imu, Odometry, Scan
 
-# topic (relative) -> type, depth of its queue; the first four are sensor data, best effort
+# topic (relative) -> type, depth of its queue
 TOPICS = {
     'odom': ('nav_msgs/msg/Odometry', 50),
     'imu': ('sensor_msgs/msg/Imu', 50),
@@ -28,6 +28,7 @@ TOPICS = {
     'ground_truth': ('nav_msgs/msg/Odometry', 10),
 }
 SENSOR_TOPICS = ('odom', 'imu', 'scan', 'reflectors')
+BEST_EFFORT = SENSOR_TOPICS[1:]  # a subscriber with default settings hears the odometry too
 # latched: where the reflectors really are, in the map frame
 TRUE_REFLECTORS = 'ground_truth_reflectors'
 SETTLE = 0.5  # [s] from the last subscriber to the begin of time
@@ -132,7 +133,7 @@ class SimulatedTopics:
         self.published = dict.fromkeys(TOPICS, 0)
         for topic, (msgtype, depth) in TOPICS.items():
             qos = QoSProfile(depth=depth)
-            if topic in SENSOR_TOPICS:
+            if topic in BEST_EFFORT:
                 qos.reliability = ReliabilityPolicy.BEST_EFFORT
             self._publishers[topic] = node.create_publisher(rclpy_class(msgtype), topic, qos)
         self._name = node.get_fully_qualified_name().lstrip('/')

@@ -44,6 +44,16 @@ def remove_stale(package: Path) -> None:
         stamp.write_text(json.dumps({'times': times, **made_of}), encoding='utf-8')
 
 
+def sources_of(package: Path) -> tuple[str, ...]:
+    """All files that the kernels of a package are made of, by name."""
+    texts = _texts(package, sorted(package.rglob('*.py')))
+    imported: dict[str, set[str]] = {}
+    makers = [name for name, text in texts.items() if MAKER.encode() in text]
+    return tuple(
+        sorted(set().union(*(_reached(n, texts, imported, package.name) for n in makers)))
+    )
+
+
 def _cache_of(folder: Path) -> Path:
     """Where Numba keeps the kernels of a folder's sources."""
     config: Any = numba.config
@@ -74,26 +84,38 @@ def _times(package: Path, paths: list[Path]) -> str:
 
 def _made_of(package: Path, paths: list[Path]) -> dict[str, str]:
     """Digest of all that the kernels of a file are made of, by the name of the file."""
-    texts = {path.relative_to(package).as_posix(): path.read_bytes() for path in paths}
+    texts = _texts(package, paths)
     imported: dict[str, set[str]] = {}
     digests = {}
     for name, text in texts.items():
         if MAKER.encode() not in text:
             continue
-        reached, ahead = {name}, [name]
-        while ahead:
-            at = ahead.pop()
-            if at not in imported:
-                # the package itself only names its API, which no kernel is made of
-                found = set() if at == '__init__.py' else _imports(texts[at], package.name)
-                imported[at] = found & texts.keys()
-            ahead += imported[at] - reached
-            reached |= imported[at]
         seen = hashlib.sha256()
-        for one in sorted(reached):
+        for one in sorted(_reached(name, texts, imported, package.name)):
             seen.update(f'{one} {len(texts[one])}\n'.encode() + texts[one])
         digests[name] = seen.hexdigest()
     return digests
+
+
+def _texts(package: Path, paths: list[Path]) -> dict[str, bytes]:
+    """Content of each file by its name in the package."""
+    return {path.relative_to(package).as_posix(): path.read_bytes() for path in paths}
+
+
+def _reached(
+    name: str, texts: dict[str, bytes], imported: dict[str, set[str]], package: str
+) -> set[str]:
+    """A file and all that it imports of the package; ``imported`` is what is known so far."""
+    reached, ahead = {name}, [name]
+    while ahead:
+        at = ahead.pop()
+        if at not in imported:
+            # the package itself only names its API, which no kernel is made of
+            found = set() if at == '__init__.py' else _imports(texts[at], package)
+            imported[at] = found & texts.keys()
+        ahead += imported[at] - reached
+        reached |= imported[at]
+    return reached
 
 
 def _imports(text: bytes, package: str) -> set[str]:

@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Makes the library of kernels: Numba compiles in several processes, the C compiler links."""
+
+from __future__ import annotations
+
+import functools
+import multiprocessing
+import os
+import pickle
+import shlex
+import shutil
+import subprocess
+import sysconfig
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rlml_slam.errors import RlmlError
+from rlml_slam.kernels import library
+from rlml_slam.kernels.cache import sources_of
+from rlml_slam.kernels.emit import Entry, entries_of, machine_for
+
+PACKAGE = Path(__file__).parents[1]
+MEMORY = 1.5e9  # [bytes] that a process compiling all kernels may need
+TICK = 1.0  # [s] at which progress is reported
+Progress = Callable[[int, int, str], None]  # done, of how many, the last module
+
+
+class BuildError(RlmlError):
+    """The library cannot be made here; kernels are then compiled when first called."""
+
+
+def build(folder: Path, processor: str, progress: Progress) -> Path:
+    """Make the library of the package's sources in ``folder``; its path.
+
+    Raises BuildError where there is no C compiler, and OSError where ``folder`` is read-only.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    sources = sources_of(PACKAGE)
+    index = library.Index(sources, library.digest(PACKAGE, sources), processor, {})
+    with tempfile.TemporaryDirectory(prefix='.kernels-', dir=folder) as name:
+        work = Path(name)
+        runtime = _start_runtime(work)
+        entries = _compile(work, processor, progress)
+        for entry in entries:
+            index.entries.setdefault(entry.kernel, []).append((entry.check, entry.name))
+        _write_table(work / 'entries.h', entries)
+        _link(work, runtime, [entry.object_file for entry in entries])
+        (work / library.INDEX).write_bytes(pickle.dumps(asdict(index)))
+        # the index last: a library with another one's index would be of other sources
+        (folder / library.INDEX).unlink(missing_ok=True)
+        os.replace(work / library.LIBRARY, folder / library.LIBRARY)
+        os.replace(work / library.INDEX, folder / library.INDEX)
+    return folder / library.LIBRARY
+
+
+def _compile(work: Path, processor: str, progress: Progress) -> list[Entry]:
+    """Entries of all kernels; the modules are shared out among processes."""
+    os.environ |= {
+        library.BY_USER: 'jit', 'RLML_SLAM_NO_CACHE': '1',
+        'NUMBA_CPU_NAME': processor, 'NUMBA_CPU_FEATURES': '',
+    }  # fmt: skip
+    free = os.sysconf('SC_AVPHYS_PAGES') * os.sysconf('SC_PAGE_SIZE')
+    workers = max(1, min(len(os.sched_getaffinity(0)), int(free / MEMORY)))
+    found: dict[str, list[Entry]] = {}
+    with multiprocessing.get_context('spawn').Pool(workers) as pool:
+        names = pool.apply(_modules)
+        one = functools.partial(_compile_module, work, processor)
+        results, module = pool.imap_unordered(one, names), ''
+        for k in range(len(names)):
+            while True:
+                progress(k, len(names), module)
+                try:
+                    module, entries = results.next(timeout=TICK)
+                    break
+                except multiprocessing.TimeoutError:
+                    pass
+            # two processes may have compiled the same kernel; either will do
+            found = entries | found
+    return [entry for name in sorted(found) for entry in found[name]]
+
+
+def _modules() -> list[str]:
+    """Modules with kernels, those that take longest first."""
+    from rlml_slam import warm_up
+
+    warm_up.import_core()
+    names = [name for name, _ in warm_up.loaded()]
+    return sorted(names, key=lambda n: (not n.startswith('rlml_slam.graph'), n))
+
+
+def _compile_module(work: Path, processor: str, name: str) -> tuple[str, dict[str, list[Entry]]]:
+    """In a process of its own: what the warm-up of a module compiles."""
+    from rlml_slam import warm_up
+    from rlml_slam.kernels import jit
+
+    warm_up.import_core()
+    dict(warm_up.loaded())[name]()
+    machine = machine_for(processor)
+    made = {}
+    for number, (kernel, dispatcher) in enumerate(sorted(jit.KERNELS.items())):
+        if dispatcher.overloads and kernel not in _EMITTED:
+            _EMITTED.add(kernel)
+            prefix = f'entry_{os.getpid()}_{number}'
+            made[kernel] = entries_of(kernel, dispatcher, machine, work, prefix)
+    return name, made
+
+
+_EMITTED: set[str] = set()  # by this process
+
+
+def _write_table(path: Path, entries: list[Entry]) -> None:
+    """The tables that Numba's modulemixin.c reads: methods, constants, and where they go."""
+    declared, constants, places = [], [], []
+    others = [one for e in entries for one in e.environments[1:]]
+    for variable, pickled in [*(e.environments[0] for e in entries), *others]:
+        declared.append(f'extern void *{variable};')
+        text = ''.join(f'\\{byte:03o}' for byte in pickled)
+        constants.append(f'{{"{text}", {len(pickled)}, "", 0, 0}},')
+        places.append(f'&{variable},')
+    methods = []
+    for entry in entries:
+        declared.append(f'PyObject *{entry.name}(PyObject *, PyObject *, PyObject *);')
+        method = f'(PyCFunction)(void (*)(void)){entry.name}'
+        methods.append(f'{{"{entry.name}", {method}, METH_VARARGS | METH_KEYWORDS, 0}},')
+    lines = [
+        *declared,
+        'static PyMethodDef entries[] = {', *methods, '{0}};',
+        'static env_def_t environments[] = {', *constants, '{0}};',
+        'static env_gv_t places[] = {', *places, '0};',
+    ]  # fmt: skip
+    path.write_text('\n'.join(lines) + '\n', encoding='ascii')
+
+
+def _compiler() -> list[str]:
+    """The C compiler; BuildError where there is none."""
+    for command in (os.environ.get('CC'), sysconfig.get_config_var('CC'), 'cc', 'gcc', 'clang'):
+        if command and shutil.which(shlex.split(command)[0]):
+            return shlex.split(command)
+    raise BuildError('no C compiler: install gcc and g++ (Debian, Ubuntu: build-essential)')
+
+
+def _run(command: list[str]) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        said = (done.stderr.strip().splitlines() or ['no message'])[-1]
+        raise BuildError(f'{command[0]} failed: {said}')
+
+
+def _flags() -> list[str]:
+    """Of the C compiler, for files that include Numba's."""
+    import numba
+    import numpy as np
+    from numba import _helperlib
+
+    wide = int(getattr(_helperlib, 'LAPACK_BUILD_ILP64', 0))
+    folder = Path(numba.__file__).parent
+    return [
+        '-O2', '-fPIC', '-w', '-DPYCC_MODULE_NAME=_kernels', '-DPYCC_USE_NRT=1',
+        f'-DNUMBA_LAPACK_BUILD_ILP64={wide}', f'-I{folder / "pycc"}', f'-I{np.get_include()}',
+        f'-I{sysconfig.get_path("include")}',
+    ]  # fmt: skip
+
+
+def _start_runtime(work: Path) -> list[Path]:
+    """Numba's runtime as objects; early, because it is quick and may fail."""
+    import numba
+    from numba import cext
+
+    flags, made = _flags(), list[Path]()
+    libraries: Any = cext.get_extension_libs
+    root = Path(numba.__file__).parent
+    for source in [*map(Path, libraries()), root / 'core/runtime/nrt.cpp']:
+        made.append(work / f'runtime_{source.stem}.o')
+        _run([*_compiler(), *flags, '-c', str(source), '-o', str(made[-1])])
+    return made
+
+
+def _link(work: Path, runtime: list[Path], objects: list[Path]) -> None:
+    """The shared library of all objects."""
+    table = str(Path(__file__).with_name('table.c'))
+    _run([
+        *_compiler(), *_flags(), f'-I{work}', '-shared', '-Wl,-s', table,
+        *map(str, [*runtime, *objects]), '-o', str(work / library.LIBRARY), '-lpthread', '-lm',
+    ])  # fmt: skip

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels of a library do what Numba's own do, and check what they are given."""
+
+import pickle
+from dataclasses import asdict
+from pathlib import Path
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import pytest
+
+from rlml_slam.kernels import build, library, native
+from rlml_slam.kernels.emit import check_of, entries_of, machine_for
+from rlml_slam.kernels.library import Index, Library
+
+PACKAGE = Path(library.__file__).parents[1]
+
+
+class Pair(NamedTuple):
+    values: np.ndarray
+    scale: float
+
+
+def scaled(pair, k, on, out):
+    """Writes into ``out``; a negative k raises."""
+    if k < 0:
+        raise ValueError('k is negative')
+    if on:
+        out[:] = pair.values * pair.scale + k
+    return pair, out.sum()
+
+
+def read(rows):
+    return rows['a'].sum()
+
+
+ROWS = np.zeros(3, [('a', np.int64), ('b', np.float64)])
+
+
+def arguments(n=4):
+    return Pair(np.arange(n, dtype=float), 2.0), 3, True, np.zeros(n)
+
+
+@pytest.fixture(scope='module')
+def made(tmp_path_factory):
+    """A library of two kernels, and the decorator that takes them from it."""
+    work = tmp_path_factory.mktemp('library')
+    runtime = build._start_runtime(work)
+    entries = []
+    for function, given in ((scaled, arguments()), (read, (ROWS,))):
+        dispatcher = numba.njit(error_model='numpy')(function)
+        dispatcher(*given)
+        name = f'{function.__module__}.{function.__name__}'
+        machine = machine_for(library.best_processor())
+        entries += entries_of(name, dispatcher, machine, work, function.__name__)
+    build._write_table(work / 'entries.h', entries)
+    build._link(work, runtime, [entry.object_file for entry in entries])
+    index = Index((), '', 'generic', {e.kernel: [(e.check, e.name)] for e in entries})
+    path = work / library.LIBRARY
+    return native.kernel_of(Library(path, index, library._load(path)))
+
+
+@pytest.fixture
+def kernel(made):
+    native.CONVERTED.clear()
+    return made(scaled)
+
+
+def test_it_computes_returns_and_raises_as_the_function_does(kernel):
+    pair, k, on, out = arguments()
+    same, total = kernel(pair, k, on, out)
+    np.testing.assert_array_equal(out, [3.0, 5.0, 7.0, 9.0])
+    assert total == 24.0
+    assert type(same) is Pair
+    np.testing.assert_array_equal(same.values, pair.values)
+    with pytest.raises(ValueError, match='k is negative'):
+        kernel(pair, -1, on, out)
+    assert kernel.__doc__ == scaled.__doc__
+    assert not native.CONVERTED
+
+
+def test_array_of_records_is_taken(made):
+    rows = ROWS.copy()
+    rows['a'] = 5
+    assert made(read)(rows) == 15
+    with pytest.raises(TypeError, match='array of'):
+        made(read)(np.zeros(3))
+
+
+def test_view_is_written_through(kernel):
+    wide = np.zeros((4, 2))
+    kernel(arguments()[0], np.int64(3), np.bool_(True), wide[:, 1])
+    np.testing.assert_array_equal(wide[:, 1], [3.0, 5.0, 7.0, 9.0])
+    assert not wide[:, 0].any()
+    assert native.CONVERTED.total() == 1
+
+
+def test_whole_numbers_and_names_are_taken(kernel):
+    out = np.zeros(4)
+    kernel(Pair(np.arange(4), 2), k=3, on=True, out=out)
+    np.testing.assert_array_equal(out, [3.0, 5.0, 7.0, 9.0])
+
+
+@pytest.mark.parametrize(
+    ('wrong', 'why'),
+    [
+        (('pair', 3, True, np.zeros(4)), 'a Pair of 2'),
+        ((arguments()[0], 3.5, True, np.zeros(4)), 'an integer'),
+        ((arguments()[0], 3, 1, np.zeros(4)), 'True or False'),
+        ((arguments()[0], 3, True, np.zeros((4, 1))), '1 dimensions'),
+        ((arguments()[0], 3, True, np.zeros(4, complex)), 'of complex128'),
+        ((Pair(np.zeros(4), 'x'), 3, True, np.zeros(4)), 'a number'),
+        ((arguments()[0], 3, True, None), 'an array'),
+    ],
+)
+def test_what_it_was_not_compiled_for_is_refused(kernel, wrong, why):
+    with pytest.raises(TypeError, match=why):
+        kernel(*wrong)
+
+
+def test_arguments_that_cannot_come_from_python_have_no_entry():
+    assert check_of(numba.types.literal(3)) is None
+    assert check_of(numba.float64[:, :]) is None
+    assert check_of(numba.float32) is None
+
+
+def test_library_of_other_sources_or_processors_is_not_used(tmp_path):
+    (tmp_path / 'a.py').write_text('N = 1\n')
+    index = Index(('a.py',), library.digest(tmp_path, ('a.py',)), library.best_processor(), {})
+    assert library.fits(index, tmp_path)
+    (tmp_path / 'a.py').write_text('N = 2\n')
+    assert not library.fits(index, tmp_path)
+    (tmp_path / 'a.py').unlink()
+    assert not library.fits(index, tmp_path)
+    assert not library.runs('another')
+    assert library.runs(library.best_processor())
+
+
+def test_damaged_index_is_no_library(tmp_path):
+    assert library.read_index(tmp_path) is None
+    (tmp_path / library.LIBRARY).write_bytes(b'')
+    good = pickle.dumps(asdict(Index((), '', 'generic', {})))
+    for text in (b'', b'nonsense', good[:-3], pickle.dumps(5), pickle.dumps({'sources': ()})):
+        (tmp_path / library.INDEX).write_bytes(text)
+        assert library.read_index(tmp_path) is None
+    (tmp_path / library.INDEX).write_bytes(good)
+    assert library.read_index(tmp_path) is not None
+
+
+def test_without_a_compiler_it_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(build.shutil, 'which', lambda _: None)
+    with pytest.raises(build.BuildError, match='install gcc'):
+        build._compiler()
