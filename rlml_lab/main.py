@@ -105,6 +105,9 @@ COMMANDS: Table = {
             'robust': Command(
                 'rlml_lab.bench.bench_robust', 'wrong closures in graphs, against GTSAM'
             ),
+            'search': Command(
+                'rlml_lab.bench.bench_search', 'global searches by scan in a large building'
+            ),
             'live': Command(
                 'rlml_lab.bench.bench_live', 'whether the live nodes keep up with a fast laser'
             ),

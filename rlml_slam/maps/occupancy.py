@@ -18,7 +18,7 @@ UNKNOWN = -1
 MAX_CELLS = 400_000_000  # a larger grid is a mistake in the poses, not a map
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OccupancyGrid:
     """``cells`` (rows = y, columns = x) int8: -1 unknown, 0 free .. 100 occupied.
 

@@ -186,6 +186,14 @@ class Relocalization(Group):
     max_sigma: float = param(
         0.2, 'a pose with a larger position sigma is not unique', 'm', 1e-3, 100.0
     )
+    max_lookups: int = param(
+        250_000_000,
+        'end points that one search looks up in the map, about a second of work; beyond, the '
+        'verdict is: not searched',
+        '',
+        1000,
+        1_000_000_000_000,
+    )
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numba
 import numpy as np
 import pytest
 from made_rooms import ROOM, built, path, scan, walls
 
 from rlml_slam import se2
 from rlml_slam.errors import InputError
-from rlml_slam.matching.scans import branch_and_bound
+from rlml_slam.matching.scans import branch_and_bound, search_pyramid
+from rlml_slam.matching.scans.branch_and_bound import Criteria, Window, wide
+from rlml_slam.matching.scans.search_pyramid import Pyramid
 from rlml_slam.matching.scans.submap import P_MAX, P_MIN, Submap
 from rlml_slam.matching.scans.voxel_filter import thin
 
@@ -21,8 +26,8 @@ def room() -> Submap:
 
 
 @pytest.fixture(scope='module')
-def pyramid(room) -> branch_and_bound.Pyramid:
-    return branch_and_bound.Pyramid(room)
+def pyramid(room) -> Pyramid:
+    return Pyramid(room)
 
 
 @pytest.fixture(scope='module')
@@ -30,9 +35,23 @@ def points():
     return thin(scan(ROOM, TRUE, 360, sigma=0.01), 0.05, 150)
 
 
+def cells_of(pyramid):
+    """The cells without what they are padded by."""
+    v = pyramid.levels
+    grid = v.cells[: len(v.cells) - search_pyramid.LANES].reshape(-1, v.columns)
+    before = search_pyramid.BEFORE
+    return grid[before : before + v.rows, before : before + v.width]
+
+
+def searched(pyramid, points, pose, half_width, half_angle, **criteria):
+    return wide(
+        pyramid, points, Window(pose, (half_width, half_width), half_angle), Criteria(**criteria)
+    )
+
+
 def brute_force(pyramid, points, pose, n, thetas):
     """Sums (angles, rows, columns) of every candidate."""
-    grid = pyramid.levels[0].reshape(pyramid.rows, pyramid.columns).astype(np.int64)
+    grid = cells_of(pyramid).astype(np.int64)
     padded = np.pad(grid, n + 200)
     sums = np.zeros((len(thetas), 2 * n + 1, 2 * n + 1), dtype=np.int64)
     for a, theta in enumerate(thetas):
@@ -54,7 +73,7 @@ def test_branch_and_bound_equals_brute_force(pyramid, points, seed):
     pose = TRUE + rng.normal(size=3) * [0.3, 0.3, 0.1]
     thetas = branch_and_bound.angles(points, pyramid.resolution, 0.15)
     sums = brute_force(pyramid, points, pose, 9, thetas)
-    found = branch_and_bound.wide(
+    found = searched(
         pyramid, points, pose, 9 * pyramid.resolution, 0.15, separation=0.2,
         separation_angle=0.1, second_share=0.0,
     )  # fmt: skip
@@ -73,7 +92,7 @@ def test_branch_and_bound_equals_brute_force(pyramid, points, seed):
 
 
 def test_branch_and_bound_finds_the_pose_from_anywhere(pyramid, points):
-    found = branch_and_bound.wide(pyramid, points, np.array([-1.0, 1.0, -2.0]), 3.0, np.pi)
+    found = searched(pyramid, points, np.array([-1.0, 1.0, -2.0]), 3.0, np.pi)
     error = se2.between(TRUE, found.best.pose)
     # half a cell and half a step of the angle, and the noise
     assert np.hypot(error[0], error[1]) < 0.06
@@ -82,14 +101,14 @@ def test_branch_and_bound_finds_the_pose_from_anywhere(pyramid, points):
     assert found.second is None or found.second.score < 0.85 * found.best.score
     # nearly all of the poses are never looked at
     poses = len(branch_and_bound.angles(points, pyramid.resolution, np.pi)) * 121**2
-    assert found.evaluated < 0.05 * poses
+    assert found.lookups < 0.05 * poses * len(points)
 
 
 def test_symmetric_box_has_a_second_place_as_good(points):
     submap = built(BOX, np.zeros((1, 3)))
-    pyramid = branch_and_bound.Pyramid(submap)
+    pyramid = Pyramid(submap)
     seen = thin(scan(BOX, TRUE, 360), 0.05, 300)
-    found = branch_and_bound.wide(pyramid, seen, np.zeros(3), 1.0, np.pi)
+    found = searched(pyramid, seen, np.zeros(3), 1.0, np.pi)
     opposite = np.array([-TRUE[0], -TRUE[1], TRUE[2] - np.pi])
     for expected in (TRUE, opposite):
         errors = [np.abs(se2.between(expected, c.pose)) for c in (found.best, found.second)]
@@ -99,41 +118,108 @@ def test_symmetric_box_has_a_second_place_as_good(points):
 
 def test_score_below_the_minimum_is_no_candidate(pyramid):
     noise = np.random.default_rng(0).uniform(-2, 2, size=(100, 2))
-    assert branch_and_bound.wide(pyramid, noise, np.zeros(3), 0.5, 0.2, min_score=0.6).best is None
+    assert searched(pyramid, noise, np.zeros(3), 0.5, 0.2, min_score=0.6).best is None
     with pytest.raises(InputError, match='no points'):
-        branch_and_bound.wide(pyramid, np.zeros((0, 2)), np.zeros(3), 0.5, 0.2)
+        searched(pyramid, np.zeros((0, 2)), np.zeros(3), 0.5, 0.2)
 
 
-@pytest.mark.parametrize(('k', 'i', 'j'), [(1, 60, 70), (1, 61, 77), (2, 20, 30), (2, 33, 3)])
-def test_levels_bound_the_blocks_below_them(pyramid, k, i, j):
-    cells = pyramid.levels[0].reshape(pyramid.rows, pyramid.columns)
-    assert pyramid.bound(k, i, j) == cells[i : i + 8**k, j : j + 8**k].max()
+@pytest.mark.parametrize('side', [8, 4, 2])
+def test_levels_bound_the_blocks_below_them(pyramid, side):
+    v = pyramid.levels
+    level = {8: v.eight, 4: v.four, 2: v.two}[side]
+    cells = v.cells[: len(v.cells) - search_pyramid.LANES].reshape(-1, v.columns).astype(int)
+    rng = np.random.default_rng(side)
+    for _ in range(200):
+        i, j = rng.integers(0, np.array(cells.shape) - 100)
+        extent = 0 if side == 2 else int(rng.integers(30))
+        at = placed(level, i, j, extent)
+        assert at >= 0
+        value = level.data[at] & 15
+        block = cells[i : i + side + extent, j : j + side + extent]
+        # no less than the largest cell of the block, and no more than that of a wider window
+        assert 17 * value >= block.max()
+        if value:
+            size = next(w for w in level.windows if w >= side + extent + level.phase - 1)
+            wider = cells[max(i - 1, 0) : i + size + 1, max(j - 1, 0) : j + size + 1]
+            assert 17 * (value - 1) < wider.max()
+        if side < 8:  # the value of the row of blocks below is in the upper bits
+            assert level.data[at] >> 4 == level.data[at + level.columns] & 15
+
+
+def test_points_that_move_too_far_within_a_block_count_as_hits(pyramid):
+    assert placed(pyramid.levels.eight, 80, 80, 100) == -1
+    near = 0.2 * np.random.default_rng(0).standard_normal((40, 2)) + [1.0, 0.0]
+    far = np.vstack([near, [[60.0, 0.0], [0.0, -80.0]]])  # of cells that angles move by hundreds
+    window, least = (0.5, np.pi), {'second_share': 0.0}
+    pose = np.zeros(3)
+    thetas = branch_and_bound.angles(far, pyramid.resolution, np.pi)
+    sums = brute_force_far(pyramid, far, pose, 10, thetas)
+    found = searched(pyramid, far, pose, *window, **least)
+    assert found.best.score == pytest.approx(score(sums.max(), len(far)), abs=1e-12)
+
+
+def brute_force_far(pyramid, points, pose, n, thetas):
+    """As brute_force(), of points of which some are far outside."""
+    grid = cells_of(pyramid).astype(np.int64)
+    rows, columns = grid.shape
+    sums = np.zeros((len(thetas), 2 * n + 1, 2 * n + 1), dtype=np.int64)
+    for a, theta in enumerate(thetas):
+        at = se2.transform(pose + np.array([0.0, 0.0, theta]), points)
+        cells = np.floor(at / pyramid.resolution).astype(int) - pyramid.corner
+        for i in range(-n, n + 1):
+            for j in range(-n, n + 1):
+                q, r = cells[:, 0] + j, cells[:, 1] + i
+                inside = (q >= 0) & (q < columns) & (r >= 0) & (r < rows)
+                sums[a, i + n, j + n] = grid[r[inside], q[inside]].sum()
+    return sums
+
+
+@numba.njit
+def placed(level, i, j, extent):
+    return search_pyramid.place(level, i, j, extent)
 
 
 def test_sums_of_many_points_do_not_overflow(pyramid, points):
     many = np.tile(points, (6, 1))
-    assert len(many) > 2 * branch_and_bound.CARRY_FREE
-    few, all_ = (branch_and_bound.wide(pyramid, p, TRUE, 0.5, 0.1) for p in (points, many))
+    few, all_ = (searched(pyramid, p, TRUE, 0.5, 0.1) for p in (points, many))
     np.testing.assert_array_equal(few.best.pose, all_.best.pose)
     assert few.best.score == pytest.approx(all_.best.score, abs=1e-12)
 
 
-def test_batches_of_blocks_find_the_same(room, pyramid, points, monkeypatch):
+def test_window_around_another_lattice_point_finds_the_same(pyramid, points):
     start = np.array([-1.0, 1.0, -2.0])
-    whole = branch_and_bound.wide(pyramid, points, start, 3.0, np.pi)
-    assert len(branch_and_bound.angles(points, 0.05, np.pi)) * 4 > branch_and_bound.BATCH
-    # the same window around another lattice point covers the same places
-    shifted = branch_and_bound.wide(
-        pyramid, points, start + np.array([0.5, -0.5, 0.0]), 3.0, np.pi
-    )
+    whole = searched(pyramid, points, start, 3.0, np.pi)
+    shifted = searched(pyramid, points, start + np.array([0.5, -0.5, 0.0]), 3.0, np.pi)
     assert shifted.best.score == pytest.approx(whole.best.score, abs=1e-12)
     np.testing.assert_allclose(shifted.best.pose, whole.best.pose, atol=1e-9)
 
 
+def test_window_of_mapped_places_leaves_out_what_nobody_saw(pyramid, points):
+    def far(mapped):
+        pose = np.array([40.0, 0.0, 0.0])
+        return wide(pyramid, points, Window(pose, (5.0, 3.0), np.pi, mapped))
+
+    assert far(False).lookups > 0
+    assert far(True).lookups == 0
+    everywhere = Window(np.zeros(3), (40.0, 30.0), np.pi)
+    found = [wide(pyramid, points, replace(everywhere, mapped=m)) for m in (False, True)]
+    np.testing.assert_array_equal(found[0].best.pose, found[1].best.pose)
+    assert found[1].lookups < 0.8 * found[0].lookups
+
+
+def test_search_ends_when_its_budget_does(pyramid, points):
+    whole = searched(pyramid, points, np.zeros(3), 3.0, np.pi)
+    assert whole.complete
+    assert searched(pyramid, points, np.zeros(3), 3.0, np.pi, budget=whole.lookups).complete
+    for share in (0.99, 0.3):  # ends while blocks are divided, while the first are bounded
+        budget = int(share * whole.lookups)
+        cut = searched(pyramid, points, np.zeros(3), 3.0, np.pi, budget=budget)
+        assert not cut.complete
+        # a block at most beyond it
+        assert cut.lookups < budget + 200 * len(points)
+
+
 def test_search_is_the_same_to_the_last_bit(room, points):
-    results = [
-        branch_and_bound.wide(branch_and_bound.Pyramid(room), points, np.zeros(3), 1.0, np.pi)
-        for _ in range(2)
-    ]
+    results = [searched(Pyramid(room), points, np.zeros(3), 1.0, np.pi) for _ in range(2)]
     assert results[0].best.pose.tobytes() == results[1].best.pose.tobytes()
-    assert results[0].evaluated == results[1].evaluated
+    assert results[0].lookups == results[1].lookups

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Correlative search in a large window: branch and bound (Hess et al. 2016, section V-B).
 
-A block of 2^h x 2^h shifts is bounded by the largest cell that each end point can meet in it.
-Blocks are divided by 8 x 8, not by 2 x 2: eight neighbours lie side by side in memory and are
-summed up as one word, so 64 bounds cost little more than one.
+The poses of the window are divided into blocks of 8 x 8 shifts and four angles. All of these are
+bounded, 64 neighbours at a time. Those that may hold a better pose than what was found are divided
+into halves, best first: 4 x 4 shifts and two angles, 2 x 2 shifts and one, single poses.
 """
 
 from __future__ import annotations
@@ -14,17 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.compiled import kernel, load8, part
+from rlml_slam.compiled import kernel
 from rlml_slam.errors import InputError
+from rlml_slam.matching.scans.block_search import SIDE, Goal, Integers, Lattice, search
+from rlml_slam.matching.scans.search_pyramid import BEFORE, Bytes, Pyramid
 from rlml_slam.matching.scans.submap import P_MAX, P_MIN, Submap
 from rlml_slam.se2 import Array, wrap
 
-BRANCH, BITS = 8, 3  # a block is divided into BRANCH x BRANCH = 2^BITS x 2^BITS
-BYTES = 0x00FF00FF00FF00FF  # every second byte of a word, so that sums have 16 bits each
-ROOT = BRANCH * BRANCH  # side of the largest blocks
-BATCH = 1024  # of them that are divided before the best parts are searched
-NUM_LEVELS = 3  # cells, blocks of side BRANCH, blocks of side ROOT
-CARRY_FREE = 256  # bytes that can be summed in 16 bits
+ENDLESS = 1 << 62  # look-ups of a search without a budget
 
 
 @dataclass(frozen=True)
@@ -36,107 +33,87 @@ class Candidate:
 
 
 @dataclass(frozen=True)
+class Window:
+    """The poses that are searched, around ``pose`` (3,).
+
+    Shifts are whole cells within ``half_width`` (x, y) [m], angles within ``half_angle`` [rad]
+    (>= pi: all around). With ``mapped``, a base that is not near a known cell is left out.
+    """
+
+    pose: Array
+    half_width: tuple[float, float]
+    half_angle: float
+    mapped: bool = False
+
+
+@dataclass(frozen=True)
+class Criteria:
+    """What is looked for, and how long.
+
+    Candidates below ``min_score`` are not looked for. The second candidate differs from the best
+    by more than ``separation`` [m] in x or y or by more than ``separation_angle`` [rad], and is
+    looked for down to ``second_share`` of the best score. ``budget`` are look-ups of end points in
+    the grid, of which a processor does about a thousand million in a second.
+    """
+
+    min_score: float = 0.0
+    separation: float = 0.5
+    separation_angle: float = 0.3
+    second_share: float = 0.7
+    budget: int = ENDLESS
+
+
+@dataclass(frozen=True)
 class WideResult:
-    """The best pose of a wide search and the best one well separated from it, None if too weak."""
+    """The best pose of a wide search and the best one well separated from it, None if too weak.
+
+    ``lookups`` were made; the search is not ``complete`` if its budget did not suffice.
+    """
 
     best: Candidate | None
     second: Candidate | None
-    evaluated: int
-
-
-class Pyramid:
-    """Max-pooled grids of one submap for branch and bound.
-
-    Level k bounds blocks of side 8^k: its value at [i, j] is the largest of the side x side cells
-    from (i, j) on, quantised to a byte (0 = unknown or P_MIN, 255 = P_MAX). ``levels`` (3, rows *
-    columns) are padded by a block of the top level on each side, so that a block which begins or
-    ends outside is bounded too; in a row, the columns of neighbouring blocks are side by side
-    (see :func:`offset`).
-    """
-
-    def __init__(self, submap: Submap) -> None:
-        self.resolution = submap.resolution
-        self.version = submap.version
-        self.corner = (submap.corner[0] - ROOT, submap.corner[1] - ROOT)
-        height, width = submap.values.shape
-        self.rows, self.columns = height + 2 * ROOT, (-(-width // ROOT) + 2) * ROOT
-        grid = np.zeros((self.rows, self.columns), np.uint8)
-        # values reach LEVELS = 2^15 - 1; 0 and 1 (unknown, P_MIN) become 0
-        grid[ROOT : ROOT + height, ROOT : ROOT + width] = np.minimum(submap.values >> 7, 255)
-        self.levels = np.empty((NUM_LEVELS, grid.size), np.uint8)
-        self.levels[0] = grid.ravel()
-        for k in range(1, NUM_LEVELS):
-            side = BRANCH**k
-            for h in range(BITS):
-                grid = pool(grid, (side // BRANCH) << h)
-            self.levels[k] = grid.reshape(self.rows, -1, side).swapaxes(1, 2).ravel()
-
-    def bound(self, k: int, i: int, j: int) -> int:
-        """The value of level k at row i and column j."""
-        return int(self.levels[k, offset(self.columns, k * BITS, i, j)])
-
-
-@kernel
-def offset(columns: int, h: int, i: int, j: int) -> int:
-    """Where row i, column j of the level with blocks of side 2^h is."""
-    return i * columns + (j & ((1 << h) - 1)) * (columns >> h) + (j >> h)
-
-
-def pool(grid: NDArray[np.uint8], shift: int) -> NDArray[np.uint8]:
-    """Maximum of grid at (i, j), (i, j + shift), (i + shift, j), (i + shift, j + shift)."""
-    wide = grid.copy()
-    np.maximum(wide[:, :-shift], grid[:, shift:], out=wide[:, :-shift])
-    tall = wide.copy()
-    np.maximum(tall[:-shift], wide[shift:], out=tall[:-shift])
-    return tall
+    lookups: int
+    complete: bool = True
 
 
 def wide(
-    pyramid: Pyramid,
-    points: Array,
-    pose: Array,
-    half_width: float,
-    half_angle: float,
-    min_score: float = 0.0,
-    separation: float = 0.5,
-    separation_angle: float = 0.3,
-    second_share: float = 0.7,
+    pyramid: Pyramid, points: Array, window: Window, criteria: Criteria | None = None
 ) -> WideResult:
-    """Best pose on a lattice around ``pose`` (3,) by branch and bound, and the best other one.
+    """Best pose of ``points`` (n, 2), base frame, in a window, and the best other one.
 
-    ``points`` (n, 2) in the base frame; scores are mean hit probabilities at the nearest cells.
-    Shifts are whole cells within ``half_width`` [m], angles steps that move the far end points
-    by about a cell within ``half_angle`` (>= pi: all around). The second candidate differs by
-    more than ``separation`` [m] in x or y or by more than ``separation_angle``, and is
-    looked for down to ``second_share`` of the best score. Candidates below ``min_score`` are None.
-    Raises InputError for no points.
+    Scores are mean hit probabilities at the nearest cells. Angles are steps that move the far end
+    points by about a cell. Raises InputError for no points.
     """
     if not len(points):
         raise InputError('wide search: the scan has no points')
+    criteria = criteria or Criteria()
     points = np.ascontiguousarray(points, dtype=np.float64)
-    thetas = angles(points, pyramid.resolution, half_angle)
-    n = round(half_width / pyramid.resolution)
+    thetas = angles(points, pyramid.resolution, window.half_angle)
+    lattice = lattice_of(pyramid, points, window, thetas)
     unit = 255.0 * len(points) / (P_MAX - P_MIN)  # sum of cells per score
-    threshold = math.ceil((min_score - P_MIN) * unit) - 1
-    least = np.array([(second_share - 1.0) * P_MIN * unit, second_share])
-    found = np.empty((2, 4), dtype=np.int64)
-    turns = separation_angle / (thetas[1] - thetas[0]) if len(thetas) > 1 else math.inf
-    evaluated = branch_and_bound(
-        pyramid.levels, pyramid.rows, pyramid.columns, pyramid.corner[0], pyramid.corner[1],
-        1.0 / pyramid.resolution, points, np.ascontiguousarray(pose, dtype=np.float64), thetas, n,
-        max(threshold, -1), separation / pyramid.resolution, turns, half_angle >= math.pi, least,
-        found,
-    )  # fmt: skip
+    turn = thetas[1] - thetas[0] if len(thetas) > 1 else math.inf
+    goal = Goal(
+        max(math.ceil((criteria.min_score - P_MIN) * unit) - 1, -1),
+        (criteria.second_share - 1.0) * P_MIN * unit,
+        criteria.second_share,
+        criteria.separation / pyramid.resolution,
+        criteria.separation_angle / turn,
+        window.half_angle >= math.pi,
+        criteria.budget,
+    )
+    found = np.full((2, 4), -1, dtype=np.int64)
+    lookups = search(pyramid.levels, lattice, goal, found)
+    start = window.pose - np.array([*_half_shifts(pyramid, window), 0.0]) * pyramid.resolution
 
-    def candidate(row: NDArray[np.int64]) -> Candidate | None:
+    def candidate(row: Integers) -> Candidate | None:
         if row[0] < 0:
             return None
         shift = row[2:4] * pyramid.resolution
-        at = (pose[0] + shift[0], pose[1] + shift[1], float(wrap(pose[2] + thetas[row[1]])))
-        score = P_MIN + float(row[0]) / unit
-        return Candidate(np.array(at), score)
+        at = (start[0] + shift[0], start[1] + shift[1], float(wrap(start[2] + thetas[row[1]])))
+        return Candidate(np.array(at), P_MIN + float(row[0]) / unit)
 
-    return WideResult(candidate(found[0]), candidate(found[1]), evaluated)
+    complete = lookups <= criteria.budget
+    return WideResult(candidate(found[0]), candidate(found[1]), lookups, complete)
 
 
 def angles(points: Array, resolution: float, half_angle: float) -> Array:
@@ -157,217 +134,55 @@ def _quantile(ordered: Array, share: float) -> float:
     return float(b - (b - a) * (1.0 - rest) if rest >= 0.5 else a + (b - a) * rest)
 
 
-@kernel
-def branch_and_bound(
-    levels: NDArray[np.uint8],
-    rows: int,
-    columns: int,
-    corner_j: int,
-    corner_i: int,
-    scale: float,
-    points: Array,
-    pose: Array,
-    thetas: Array,
-    n: int,
-    threshold: int,
-    separation: float,
-    separation_turns: float,
-    circular: bool,
-    least: Array,
-    found: NDArray[np.int64],
-) -> int:
-    """Rows of ``found``: (sum, angle index, column shift, row shift) of best and second, -1 none.
+def _half_shifts(pyramid: Pyramid, window: Window) -> tuple[int, int]:
+    """Shifts (columns, rows) to each side of the window's pose."""
+    x, y = window.half_width
+    return round(x / pyramid.resolution), round(y / pyramid.resolution)
 
-    ``least`` (2,) = (a, b): the second has to have more than a + b * (sum of the best). Returns
-    the number of poses and blocks evaluated.
+
+def lattice_of(pyramid: Pyramid, points: Array, window: Window, thetas: Array) -> Lattice:
+    """The poses of a window, as cells of the padded grid."""
+    half = _half_shifts(pyramid, window)
+    (j, i), scale = pyramid.corner, 1.0 / pyramid.resolution
+    first = np.array([j - BEFORE + half[0], i - BEFORE + half[1]])
+    pose = np.ascontiguousarray(window.pose, dtype=np.float64)
+    cells = cells_of(points, pose, thetas, scale, first)
+    blocks = ((2 * half[1] + SIDE) // SIDE, (2 * half[0] + SIDE) // SIDE)
+    allowed = np.ones(blocks, np.uint8)
+    if window.mapped:
+        base = np.floor(pose[:2] * scale).astype(np.int64) - first
+        allowed = _near_known(pyramid.near, base[::-1] // SIDE, blocks)
+    return Lattice(cells, (2 * half[0], 2 * half[1]), allowed)
+
+
+def _near_known(near: Bytes, first: Integers, blocks: tuple[int, int]) -> NDArray[np.uint8]:
+    """Blocks of shifts (rows, columns) that hold a base near what is known.
+
+    ``first`` (row, column) is the block of the grid in which the first shift is; a block of shifts
+    lies across two of the grid's in each direction.
     """
-    cells = cells_of(points, pose, thetas, scale, corner_j, corner_i)
-    tiles = (2 * n + ROOT) // ROOT
-    roots = np.full(len(thetas) * tiles * tiles, CARRY_FREE * len(points))
-    order = np.arange(len(roots))
-    evaluated = 0
-    if len(roots) > BATCH:  # of fewer, nearly all are divided anyway
-        for m in range(len(roots)):
-            a, tile = divmod(m, tiles * tiles)
-            i, j = divmod(tile, tiles)
-            roots[m] = block_sum(levels[2], rows, columns, cells[a], j * ROOT - n, i * ROOT - n)
-        order = np.argsort(-roots, kind='mergesort')
-        evaluated = len(roots)
-    blocks = np.empty((min(BATCH, len(roots)) * BRANCH * BRANCH, 4), dtype=np.int32)
-    sums = np.empty(BRANCH * BRANCH, dtype=np.int64)
-    offsets = np.empty(len(points), dtype=np.int64)
-    count = 0
-    for rank in range(2):
-        found[rank] = -1
-        best = threshold
-        if rank == 1:
-            if found[0, 0] < 0:
-                break
-            best = max(threshold, int(np.floor(least[0] + least[1] * found[0, 0])))
-        for start in range(0, len(roots), BATCH):
-            if rank == 0 or len(roots) > BATCH:  # else those of the first search are all there
-                count = 0
-                for m in order[start : start + BATCH]:
-                    if roots[m] <= best:
-                        break
-                    a, tile = divmod(int(m), tiles * tiles)
-                    i, j = tile // tiles * ROOT - n, tile % tiles * ROOT - n
-                    evaluated += divide(
-                        levels[1], rows, columns, BITS, cells[a], j, i, n, offsets, sums
-                    )
-                    for k in range(len(sums)):
-                        if sums[k] > best:
-                            blocks[count, 0], blocks[count, 1] = sums[k], a
-                            blocks[count, 2] = j + k % BRANCH * BRANCH
-                            blocks[count, 3] = i + k // BRANCH * BRANCH
-                            count += 1
-            for b in np.argsort(-blocks[:count, 0], kind='mergesort'):
-                if blocks[b, 0] <= best:
-                    break
-                a, j, i = int(blocks[b, 1]), int(blocks[b, 2]), int(blocks[b, 3])
-                if rank == 1 and excluded(
-                    found[0], a, j, i, BRANCH - 1, len(thetas), separation, separation_turns,
-                    circular,
-                ):  # fmt: skip
-                    continue
-                evaluated += divide(levels[0], rows, columns, 0, cells[a], j, i, n, offsets, sums)
-                for k in range(len(sums)):
-                    q, r = j + k % BRANCH, i + k // BRANCH
-                    if sums[k] <= best or (
-                        rank == 1
-                        and excluded(
-                            found[0], a, q, r, 0, len(thetas), separation, separation_turns,
-                            circular,
-                        )
-                    ):  # fmt: skip
-                        continue
-                    best = sums[k]
-                    found[rank, 0], found[rank, 1] = best, a
-                    found[rank, 2], found[rank, 3] = q, r
-    return evaluated
+    out = np.zeros(blocks, np.uint8)
+    rows, columns = (first[axis] + np.arange(blocks[axis]) for axis in (0, 1))
+    for di, dj in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        i, j = rows + di, columns + dj
+        at_i, at_j = ((v >= 0) & (v < n) for v, n in zip((i, j), near.shape, strict=True))
+        out[np.ix_(at_i, at_j)] |= near[np.ix_(i[at_i], j[at_j])]
+    return out
 
 
-@part
+@kernel
 def cells_of(
-    points: Array, pose: Array, thetas: Array, scale: float, corner_j: int, corner_i: int
+    points: Array, pose: Array, thetas: Array, scale: float, first: Integers
 ) -> NDArray[np.int32]:
-    """Cells (angles, n, 2) of the points at each angle, (column, row) of the padded grid."""
+    """Cells (angles, n, 2) of the points at each angle, (column, row) less ``first`` (2,)."""
     cells = np.empty((len(thetas), len(points), 2), dtype=np.int32)
     for a in range(len(thetas)):
         c, s = np.cos(pose[2] + thetas[a]), np.sin(pose[2] + thetas[a])
         for k in range(len(points)):
             px, py = points[k, 0], points[k, 1]
-            cells[a, k, 0] = int(np.floor((pose[0] + c * px - s * py) * scale)) - corner_j
-            cells[a, k, 1] = int(np.floor((pose[1] + s * px + c * py) * scale)) - corner_i
+            cells[a, k, 0] = int(np.floor((pose[0] + c * px - s * py) * scale)) - first[0]
+            cells[a, k, 1] = int(np.floor((pose[1] + s * px + c * py) * scale)) - first[1]
     return cells
-
-
-@part
-def block_sum(
-    level: NDArray[np.uint8],
-    rows: int,
-    columns: int,
-    cells: NDArray[np.int32],
-    j: int,
-    i: int,
-) -> int:
-    """Sum over the points of the top level's value at their cells shifted by (j, i)."""
-    total = 0
-    for k in range(len(cells)):
-        q, r = cells[k, 0] + j, cells[k, 1] + i
-        if 0 <= q < columns and 0 <= r < rows:
-            total += level[offset(columns, 2 * BITS, r, q)]
-    return total
-
-
-@part
-def divide(
-    level: NDArray[np.uint8],
-    rows: int,
-    columns: int,
-    h: int,
-    cells: NDArray[np.int32],
-    j: int,
-    i: int,
-    n: int,
-    offsets: NDArray[np.int64],
-    sums: NDArray[np.int64],
-) -> int:
-    """Block sums (64,) of the 8 x 8 blocks of side 2^h from shift (j, i) on; how many there are.
-
-    Those that begin beyond the window, at a shift of more than ``n``, get -1.
-    """
-    inside = 0
-    reach = (BRANCH - 1) << h
-    for k in range(len(cells)):
-        q, r = cells[k, 0] + j, cells[k, 1] + i
-        if 0 <= q < columns - reach and 0 <= r < rows - reach:
-            offsets[inside] = offset(columns, h, r, q)
-            inside += 1
-    sums[:] = 0
-    width = min(((n - j) >> h) + 1, BRANCH)
-    height = min(((n - i) >> h) + 1, BRANCH)
-    down, half = columns << h, np.uint64(8)
-    evens = np.uint64(BYTES)
-    for r in range(0, BRANCH, 4):  # four rows at once: as many sums as there are registers for
-        for first in range(0, inside, CARRY_FREE):
-            even_0 = even_1 = even_2 = even_3 = np.uint64(0)
-            odd_0 = odd_1 = odd_2 = odd_3 = np.uint64(0)
-            for k in range(first, min(first + CARRY_FREE, inside)):
-                at = offsets[k] + r * down
-                word = load8(level, at)
-                even_0 += word & evens
-                odd_0 += (word >> half) & evens
-                word = load8(level, at + down)
-                even_1 += word & evens
-                odd_1 += (word >> half) & evens
-                word = load8(level, at + 2 * down)
-                even_2 += word & evens
-                odd_2 += (word >> half) & evens
-                word = load8(level, at + 3 * down)
-                even_3 += word & evens
-                odd_3 += (word >> half) & evens
-            spread(even_0, odd_0, sums[BRANCH * r :])
-            spread(even_1, odd_1, sums[BRANCH * (r + 1) :])
-            spread(even_2, odd_2, sums[BRANCH * (r + 2) :])
-            spread(even_3, odd_3, sums[BRANCH * (r + 3) :])
-    for r in range(BRANCH):
-        for q in range(BRANCH):
-            if r >= height or q >= width:
-                sums[BRANCH * r + q] = -1
-    return width * height
-
-
-@part
-def spread(even: np.uint64, odd: np.uint64, sums: NDArray[np.int64]) -> None:
-    """Add the sums that lie side by side in two words to the first eight of ``sums``."""
-    for q in range(0, BRANCH, 2):
-        shift = np.uint64(8 * q)
-        sums[q] += np.int64((even >> shift) & np.uint64(0xFFFF))
-        sums[q + 1] += np.int64((odd >> shift) & np.uint64(0xFFFF))
-
-
-@part
-def excluded(
-    best: NDArray[np.int64],
-    a: int,
-    j: int,
-    i: int,
-    extra: int,
-    num_angles: int,
-    separation: float,
-    separation_turns: float,
-    circular: bool,
-) -> bool:
-    """Whether the whole block (j..j + extra, i..i + extra) at angle a is near the best pose."""
-    da = abs(a - best[1])
-    if circular:
-        da = min(da, num_angles - da)
-    if da > separation_turns:
-        return False
-    dj = max(abs(j - best[2]), abs(j + extra - best[2]))
-    di = max(abs(i - best[3]), abs(i + extra - best[3]))
-    return bool(dj <= separation and di <= separation)
 
 
 def warm_up() -> None:
@@ -375,4 +190,4 @@ def warm_up() -> None:
     submap = Submap()
     points = np.array([[1.0, 0.5], [-0.5, 1.0], [0.3, -0.8]])
     submap.insert(points, np.zeros(2))
-    wide(Pyramid(submap), points, np.zeros(3), 0.2, 0.1)
+    wide(Pyramid(submap), points, Window(np.zeros(3), (0.2, 0.2), 0.1))

@@ -14,8 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rlml_slam.matching.scans import branch_and_bound, scan_information
+from rlml_slam.matching.scans import scan_information
+from rlml_slam.matching.scans.branch_and_bound import Criteria, Window, wide
 from rlml_slam.matching.scans.scan_match import linearize, match
+from rlml_slam.matching.scans.search_pyramid import Pyramid
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.closure_candidates import Candidate
@@ -24,7 +26,9 @@ from rlml_slam.slam.closures.loop_closure import Closure
 from rlml_slam.slam.keyframes import Keyframe
 
 MAX_SIGMA = 1.0  # [m] largest standard deviation of the position of a match, in any direction
-PYRAMIDS = 6  # search pyramids kept, more than are searched at a time: each is twice its submap
+PYRAMIDS = (
+    6  # search pyramids kept, more than are searched at a time: each is three times its submap
+)
 SEARCH_SIGMA = np.array([0.5, 0.5, 0.2])  # [m, m, rad] prior of the refinement at the best cell
 
 AMBIGUOUS, DEGENERATE = 'a second pose fits as well', 'the scan does not constrain one direction'
@@ -74,7 +78,7 @@ class ClosureMatcher:
 
     def __init__(self, params: Parameters) -> None:
         self._p = params
-        self._pyramids: OrderedDict[KeyframeSubmap, branch_and_bound.Pyramid] = OrderedDict()
+        self._pyramids: OrderedDict[KeyframeSubmap, Pyramid] = OrderedDict()
 
     def match(self, candidate: Candidate, key: Keyframe, points: Array) -> SearchResult:
         """Match ``points`` (n, 2) of a keyframe; a Closure as record of a rejected match."""
@@ -85,10 +89,12 @@ class ClosureMatcher:
             closure = Closure(i, j, guess, score, -1, why)
             return SearchResult(candidate, closure, np.array(poses).reshape(-1, 3))
 
-        result = branch_and_bound.wide(
-            self._pyramid(m), points, guess, candidate.window, candidate.angle, p.min_score,
-            second_share=p.ambiguity_ratio,
-        )  # fmt: skip
+        result = wide(
+            self._pyramid(m),
+            points,
+            Window(guess, (candidate.window, candidate.window), candidate.angle),
+            Criteria(p.min_score, second_share=p.ambiguity_ratio),
+        )
         if result.best is None:
             return rejected('no pose in the search window fits')
         if (
@@ -118,9 +124,9 @@ class ClosureMatcher:
         )  # fmt: skip
         return SearchResult(candidate, fit, found.pose[None])
 
-    def _pyramid(self, m: KeyframeSubmap) -> branch_and_bound.Pyramid:
+    def _pyramid(self, m: KeyframeSubmap) -> Pyramid:
         if m not in self._pyramids:
-            self._pyramids[m] = branch_and_bound.Pyramid(m.submap)
+            self._pyramids[m] = Pyramid(m.submap)
             if len(self._pyramids) > PYRAMIDS:
                 self._pyramids.popitem(last=False)
         self._pyramids.move_to_end(m)

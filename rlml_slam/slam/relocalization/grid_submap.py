@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from rlml_slam import params, se2
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.matching.scans.scan_match import UNKNOWN
+from rlml_slam.matching.scans.search_pyramid import Pyramid
 from rlml_slam.matching.scans.submap import P_MAX, P_MIN, Submap, value_of
 from rlml_slam.se2 import Array
 
@@ -36,6 +38,11 @@ class GridSubmap:
         """By which the submap is turned in the map [rad]."""
         return float(self.T_map_submap[2])
 
+    @cached_property
+    def pyramid(self) -> Pyramid:
+        """Pooled grids for a search, built when it is first searched."""
+        return Pyramid(self.submap)
+
     def from_map(self, poses: Array) -> Array:
         """Poses (..., 3) of the map frame in that of the submap."""
         return se2.between(self.T_map_submap, poses) if self.T_map_submap.any() else poses
@@ -50,8 +57,9 @@ def is_mapped(grid: OccupancyGrid) -> bool:
     return bool((grid.cells > 0).any())
 
 
+@lru_cache(maxsize=1)
 def submap_of(grid: OccupancyGrid, parameters: params.Submap) -> GridSubmap:
-    """A grid as a submap; unknown cells stay unknown."""
+    """A grid as a submap; unknown cells stay unknown. That of the latest grid is kept."""
     submap, cells = Submap(parameters), grid.cells
     submap.resolution = grid.resolution
     if not ((cells > 0) & (cells < 100)).any():

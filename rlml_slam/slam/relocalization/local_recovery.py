@@ -12,8 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from rlml_slam.matching.scans import branch_and_bound
+from rlml_slam.matching.scans.branch_and_bound import Criteria, Window, wide
 from rlml_slam.matching.scans.scan_match import ScanMatchResult, match
+from rlml_slam.matching.scans.search_pyramid import Pyramid
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
@@ -42,10 +43,10 @@ def recover_locally(
     place about as well. The result leaves nothing of the prior: its weight is zero.
     """
     least = max(AS_USUAL * usual, p.loop_closure.min_score)
-    found = branch_and_bound.wide(
-        branch_and_bound.Pyramid(submap), points, guess, REACH, turn, MAX_SECOND * least,
-        second_share=MAX_SECOND,
-    )  # fmt: skip
+    window = Window(guess, (REACH, REACH), turn)
+    found = wide(
+        Pyramid(submap), points, window, Criteria(MAX_SECOND * least, second_share=MAX_SECOND)
+    )
     if found.best is None or found.second is not None:
         return None
     result = match(submap, points, found.best.pose, NEAR, p.scan_match, searched=False)

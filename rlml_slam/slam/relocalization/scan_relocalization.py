@@ -13,12 +13,18 @@ import numpy as np
 
 from rlml_slam import se2
 from rlml_slam.maps.occupancy import OccupancyGrid
-from rlml_slam.matching.scans import branch_and_bound, scan_information, voxel_filter
+from rlml_slam.matching.scans import scan_information, voxel_filter
+from rlml_slam.matching.scans.branch_and_bound import Criteria, WideResult, Window, wide
 from rlml_slam.matching.scans.scan_match import match
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
-from rlml_slam.slam.relocalization.grid_submap import is_mapped, possible, submap_of
+from rlml_slam.slam.relocalization.grid_submap import (
+    GridSubmap,
+    is_mapped,
+    possible,
+    submap_of,
+)
 from rlml_slam.types import Verdict
 
 SEARCHED = 150  # end points of the search; all of them count when its places are compared
@@ -59,14 +65,10 @@ def relocalize(
     saved = submap_of(grid, p.submap)
     submap = saved.submap
     points = voxel_filter.thin(points, p.scan_match.voxel_size, p.scan_match.max_points)
-    few = voxel_filter.thin(points, p.scan_match.voxel_size, SEARCHED)
-    middle = 0.5 * (submap.bounds[:2] + submap.bounds[2:])
-    # a robot stands inside of what it has seen
-    reach = 0.5 * float(np.max(submap.bounds[2:] - submap.bounds[:2]))
-    found = branch_and_bound.wide(
-        branch_and_bound.Pyramid(submap), few, np.array([*middle, 0.0]), reach, np.pi,
-        separation_angle=2.0 * SPREAD[2],
-    )  # fmt: skip
+    found = _search(saved, voxel_filter.thin(points, p.scan_match.voxel_size, SEARCHED), p)
+    if not found.complete:
+        why = f'the search was ended after {found.lookups / 1e6:.0f} million look-ups'
+        return Relocation(Verdict.NOT_SEARCHED, why)
     places = [
         _refined(submap, points, c.pose, p) for c in (found.best, found.second) if c is not None
     ]
@@ -76,11 +78,18 @@ def relocalize(
         score = places[0][1] if places else 0.0
         why = f'no pose fits: the best score is {score:.2f}, at least {least:.2f} is needed'
         return Relocation(Verdict.IMPOSSIBLE, why, score=score)
-    pose, score = places[0]
     second = places[1][1] if len(places) > 1 else 0.0
     if not complete and second:
-        second = possible(submap, points, places[1][0], second, score)
-    cov = se2.rotate_cov(_covariance(submap, points, pose, p), saved.yaw)
+        second = possible(submap, points, places[1][0], second, places[0][1])
+    return _compared(saved, points, places[0], second, p)
+
+
+def _compared(
+    saved: GridSubmap, points: Array, best: tuple[Array, float], second: float, p: Parameters
+) -> Relocation:
+    """The verdict on a pose that fits, by the score of the next best one and by its covariance."""
+    pose, score = best
+    cov = se2.rotate_cov(_covariance(saved.submap, points, pose, p), saved.yaw)
     sigma = float(np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]))
     verdict, why = Verdict.UNIQUE, f'score {score:.2f}, the next best pose {second:.2f}'
     if second > MAX_SECOND * score:
@@ -94,6 +103,22 @@ def relocalize(
             f'the scan does not observe one direction: sigma {sigma:.1f} m',
         )
     return Relocation(verdict, why, saved.to_map(pose), cov, score, second)
+
+
+def _search(saved: GridSubmap, points: Array, p: Parameters) -> WideResult:
+    """The two best places in the whole map, from wherever a base may stand.
+
+    A pose that fits has a lower score when it is refined than in the search. So the next best one
+    that could be a rival of the least score that fits has at least ``MAX_SECOND`` of that.
+    """
+    bounds = saved.submap.bounds
+    middle, half = 0.5 * (bounds[:2] + bounds[2:]), 0.5 * (bounds[2:] - bounds[:2])
+    window = Window(np.array([*middle, 0.0]), (half[0], half[1]), np.pi, mapped=True)
+    criteria = Criteria(
+        MAX_SECOND * p.loop_closure.min_score, separation_angle=2.0 * SPREAD[2],
+        budget=p.relocalization.max_lookups,
+    )  # fmt: skip
+    return wide(saved.pyramid, points, window, criteria)
 
 
 def scan_fits(grid: OccupancyGrid, points: Array, poses: Array, p: Parameters) -> Array:

@@ -3,7 +3,8 @@
 
 A search costs more than all else, and from the same pose its result is the same. So the
 longer it stays there, the rarer they are: it is found a tenth later than it could be at worst, or
-half a minute. Once it has moved on, it is looked for at once.
+half a minute. Once it has moved on, it is looked for at once. How far that is grows as well, by a
+tenth of all it has moved: a robot that drives through what is not mapped is searched ever less.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ PERIOD = 300_000_000  # [ns] of stamps between two searches at least
 RARER = 10  # part of the time since the first that is between two where the robot stands
 LONGEST = 30_000_000_000  # [ns] of stamps between two searches at most
 MOVED, TURNED = 1.0, 0.5  # [m], [rad] since the last search: from there, it may see more
+FARTHEST, FULL_TURN = 5.0, 2.0  # [m], [rad] of these at most
 
 
 class SearchSchedule:
@@ -28,14 +30,19 @@ class SearchSchedule:
         self.since = since
         self._last: int | None = None
         self._there = np.zeros(3)
+        self._moves = 0  # searches because it had moved
 
     def is_due(self, frame: Frame) -> bool:
         """Whether to search now; the next search counts from this one."""
         if self._last is not None and frame.stamp >= self._last:
             x, y, turn = se2.between(self._there, frame.T_map_base)
-            moved = math.hypot(x, y) > MOVED or abs(turn) > TURNED
+            more = 1.0 + self._moves / RARER
+            moved = math.hypot(x, y) > min(more * MOVED, FARTHEST) or abs(turn) > min(
+                more * TURNED, FULL_TURN
+            )
             pause = max(PERIOD, min((self._last - self.since) // RARER, LONGEST))
             if frame.stamp - self._last < (PERIOD if moved else pause):
                 return False
+            self._moves += moved
         self._last, self._there = frame.stamp, frame.T_map_base
         return True

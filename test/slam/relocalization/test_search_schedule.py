@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rlml_slam.slam.relocalization.search_schedule import (
+    FARTHEST,
     LONGEST,
     MOVED,
     PERIOD,
@@ -55,8 +56,17 @@ def test_once_it_moves_on_it_is_looked_for_where_it_comes(step):
     at = searched(3720, pose)
     moving = at[at >= 3600.0]
     assert moving[0] < 3600.0 + 50 * 0.1 + 0.2
-    # each time it has gone as far again
-    assert np.diff(moving).max() < 5.3
+    # each time it has gone as far again, and a tenth of MOVED or TURNED more than before
+    steps = np.diff(moving)
+    assert steps[0] < 5.3
+    assert steps.max() < 5.0 * (1.0 + len(moving) / RARER) + 0.3
+
+
+def test_robot_that_drives_on_through_what_is_not_mapped_is_searched_ever_less():
+    at = searched(600, lambda seconds: np.array([MOVED * seconds, 0.0, 0.0]))
+    assert np.diff(at[10:15]).max() < 2.0
+    assert np.diff(at)[-5:].max() < FARTHEST + 0.2
+    assert len(at) < 160
 
 
 def test_stamps_that_jump_back_do_not_end_the_search():
