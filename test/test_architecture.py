@@ -151,9 +151,9 @@ def test_folder_has_at_most_15_files(folder):
 
 MAX_CLASS = 250  # lines
 # of the installed package; the goal is 40 000. Raised for journal, guard, nav2, devices, motion
-# hypotheses, kernels, help and progress
-MAX_LINES = 45_271
-MAX_LONG_LISTS = 15
+# hypotheses, kernels, help and progress, bounded search
+MAX_LINES = 45_704
+MAX_LONG_LISTS = 11
 MAX_WORDS = 60  # in code and docs, the changelog aside
 # the present sizes of the classes that are larger
 LARGER = {'Recorder': 268}
