@@ -54,7 +54,8 @@ def run(args: argparse.Namespace) -> int:
     grid, params = building.grid(), Parameters()
     began = time.thread_time()
     pyramid = submap_of(grid, params.submap).pyramid
-    built, rows = time.thread_time() - began, {}
+    built = time.thread_time() - began
+    rows: dict[str, dict[str, float]] = {}
     with Progress('scans', 2 * args.scans, args.json) as progress:
         for name, source in (('its own', building), ('of another building', other)):
             results = []

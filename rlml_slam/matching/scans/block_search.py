@@ -117,7 +117,7 @@ def reachable(
     """
     n, box, left = table.counts[g], table.box[g], -SIDE * (lanes - 1)
     right, top = levels.width + BEFORE, levels.rows + BEFORE
-    offsets = table.offsets[g][:n]
+    offsets: Integers = table.offsets[g][:n]
     if (
         box[0] + shift[0] >= left
         and box[1] + shift[1] >= 0
@@ -172,7 +172,7 @@ def sweep(levels: Levels, lattice: Lattice, table: Table, goal: Goal) -> tuple[I
 @part
 def packed(bound: int, g: int, i: int, j: int) -> int:
     """A block as one number."""
-    return ((np.int64(bound) * ANGLES + g) * SHIFTS + i) * SHIFTS + j
+    return int(((np.int64(bound) * ANGLES + g) * SHIFTS + i) * SHIFTS + j)
 
 
 @part
@@ -304,7 +304,7 @@ def poses(levels: Levels, lattice: Lattice, block: tuple[int, int, int], sums: I
             sums[1] += upper >> 8 & 0xFF
             sums[2] += lower & 0xFF
             sums[3] += lower >> 8 & 0xFF
-    return 2 * lattice.cells.shape[1]
+    return int(2 * lattice.cells.shape[1])
 
 
 @part
