@@ -3,7 +3,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numba
 import numpy as np
 import pytest
 from made_rooms import ROOM, built, path, scan, walls
@@ -132,7 +131,7 @@ def test_levels_bound_the_blocks_below_them(pyramid, side):
     for _ in range(200):
         i, j = rng.integers(0, np.array(cells.shape) - 100)
         extent = 0 if side == 2 else int(rng.integers(30))
-        at = placed(level, i, j, extent)
+        at = search_pyramid.place(level, i, j, extent)
         assert at >= 0
         value = level.data[at] & 15
         block = cells[i : i + side + extent, j : j + side + extent]
@@ -147,7 +146,7 @@ def test_levels_bound_the_blocks_below_them(pyramid, side):
 
 
 def test_points_that_move_too_far_within_a_block_count_as_hits(pyramid):
-    assert placed(pyramid.levels.eight, 80, 80, 100) == -1
+    assert search_pyramid.place(pyramid.levels.eight, 80, 80, 100) == -1
     near = 0.2 * np.random.default_rng(0).standard_normal((40, 2)) + [1.0, 0.0]
     far = np.vstack([near, [[60.0, 0.0], [0.0, -80.0]]])  # of cells that angles move by hundreds
     window, least = (0.5, np.pi), {'second_share': 0.0}
@@ -172,11 +171,6 @@ def brute_force_far(pyramid, points, pose, n, thetas):
                 inside = (q >= 0) & (q < columns) & (r >= 0) & (r < rows)
                 sums[a, i + n, j + n] = grid[r[inside], q[inside]].sum()
     return sums
-
-
-@numba.njit
-def placed(level, i, j, extent):
-    return search_pyramid.place(level, i, j, extent)
 
 
 def test_sums_of_many_points_do_not_overflow(pyramid, points):

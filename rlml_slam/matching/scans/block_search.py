@@ -81,7 +81,7 @@ class Parts(NamedTuple):
     two: Table
 
 
-@kernel
+@part
 def tabulate(level: Level, cells: NDArray[np.int32], span: int) -> Table:
     """The table of a level for groups of ``span`` angles."""
     m, n = cells.shape[0], cells.shape[1]
@@ -134,7 +134,7 @@ def reachable(
     return some[:count]
 
 
-@kernel
+@part
 def sweep(levels: Levels, lattice: Lattice, table: Table, goal: Goal) -> tuple[Integers, int]:
     """Largest blocks that may hold a pose above the threshold, best first; the look-ups made.
 

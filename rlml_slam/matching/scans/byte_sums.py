@@ -5,15 +5,15 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
-from llvmlite import ir
-from numba.extending import intrinsic
+from rlml_slam.compiled import intrinsic
 
 
 def _sum_lanes(
     _typing: Any, array: Any, offsets: Any, _count: Any, _shift: Any, _least: Any, sums: Any
 ) -> Any:
     """Typing and code of sum_lanes: 64 bytes are added at once, 17 times at most."""
+    from llvmlite import ir
+    from numba import types
 
     def generate(context: Any, b: Any, signature: Any, args: Any) -> Any:
         data, at, out = (
@@ -55,8 +55,8 @@ def _sum_lanes(
         limit = b.shuffle_vector(lane, lane, ir.Constant(ir.VectorType(ir.IntType(32), 64), None))
         return b.bitcast(b.icmp_unsigned('>=', total, limit), index)
 
-    number = numba.int64
-    return numba.uint64(array, offsets, number, number, number, sums), generate
+    number = types.int64
+    return types.uint64(array, offsets, number, number, number, sums), generate
 
 
 # sum_lanes(bytes, offsets, count, shift, least, sums): for each of 64 neighbours the sum of

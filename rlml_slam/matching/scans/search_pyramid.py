@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.compiled import part
+from rlml_slam.compiled import formula
 from rlml_slam.matching.scans.submap import Submap
 
 Bytes = NDArray[np.uint8]
@@ -155,7 +155,7 @@ def _dilated(blocks: Bytes, reach: int, axis: int) -> Bytes:
     return np.moveaxis(out, 0, axis)
 
 
-@part
+@formula
 def place(level: Level, i: int, j: int, extent: int) -> int:
     """Where the bound of a block's window from cell (i, j) on is; -1: no window is that large.
 
