@@ -29,6 +29,9 @@ SUDDEN = 3.0  # [sigma] a robot does not start as suddenly as that; it may stop 
 SHORTEST = 0.1  # [s] over which a velocity is known well enough to say so
 MOVED = np.array([0.05, 0.05, 0.05])  # [m, m, rad] by scans, while the odometry stands still
 SAME = np.array([0.02, 0.02, 0.01])  # [m, m, rad] hypotheses that are closer are one
+# frames in a row: a scan within the step of odometry that catches up gets a part of it, which may
+# agree by chance
+CONFIRM = 2
 LONGEST = 5.0  # [s] of a stall; after that, odometry is what it is
 
 
@@ -54,6 +57,7 @@ class MotionHypotheses:
         """The pose was moved: what comes is not compared with what was before."""
         self._trusted: tuple[int, Array, Array] | None = None
         self._last: tuple[int, Array] | None = None  # stamp and pose of the last frame
+        self._agreed = 0  # frames in a row, since it is open, at which odometry agreed
 
     def of(self, observation: Observation, velocity: Array | None) -> list[Hypothesis]:
         """What may have happened since the last frame, the odometry's motion first.
@@ -70,7 +74,8 @@ class MotionHypotheses:
             return single
         since, goes_on = self._since_trusted(observation), se2.exp(velocity * dt)
         stands = not plain.delta.any() and bool((np.abs(goes_on) > MOVED).any())
-        is_sudden = _penalty(plain.delta, velocity, dt) > 0.5
+        # of a burst of stamps, the times say nothing of the speed
+        is_sudden = dt >= SHORTEST and _penalty(plain.delta, velocity, dt) > 0.5
         if plain.known and since is None and not (stands or is_sudden):
             return single
         sigma = ACCELERATION * max(dt, SHORTEST) * dt
@@ -110,8 +115,8 @@ class MotionHypotheses:
     def learn(self, observation: Observation, pose: Array) -> None:
         """Take the pose (3,) of the newest frame; trust the odometry where it agrees.
 
-        One that stands exactly still is not trusted later than the frame at which it began to, and
-        one that was missing or stood still only when what it says is where the scans are.
+        One that stands exactly still while scans move is not trusted, and after that, or after it
+        was missing, only when what it says is where the scans are.
         """
         last, self._last = self._last, (observation.stamp, pose)
         odometry = observation.odom_pose
@@ -121,10 +126,14 @@ class MotionHypotheses:
             stamp, there, then = self._trusted
             dt = (observation.stamp - stamp) * 1e-9
             way = se2.between(then, odometry)
-            is_open = stamp != last[0] or not observation.motion.delta.any()
-            if is_open and dt < LONGEST and not self._agrees(observation, way, dt, there, last[1]):
+            moved = bool((np.abs(se2.between(there, pose)) > MOVED).any())
+            is_open = stamp != last[0] or (moved and not observation.motion.delta.any())
+            agrees = is_open and self._agrees(observation, way, dt, there, last[1])
+            self._agreed = self._agreed + 1 if agrees else 0
+            if is_open and dt < LONGEST and self._agreed < CONFIRM:
                 return
         self._trusted = (observation.stamp, pose, np.asarray(odometry))
+        self._agreed = 0
 
     def _agrees(
         self, observation: Observation, way: Array, dt: float, there: Array, last: Array
@@ -145,9 +154,13 @@ class MotionHypotheses:
 
 
 def _penalty(delta: Array, velocity: Array, dt: float) -> float:
-    """Share to which a motion (3,) in ``dt`` [s] is too sudden: Geman and McClure's loss."""
+    """Share to which a motion (3,) in ``dt`` [s] is too sudden: Geman and McClure's loss.
+
+    Stamps err, by as much as an interval where a driver sends in bursts: twice as fast is not
+    sudden, nor is a motion of less than MOVED.
+    """
     sigma = ACCELERATION * max(dt, SHORTEST) * dt
-    faster = np.maximum(np.abs(delta) - np.abs(velocity) * dt, 0.0)
+    faster = np.maximum(np.abs(delta) - 2.0 * np.abs(velocity) * dt - MOVED, 0.0)
     u2 = float(np.max(faster / sigma)) ** 2
     return u2 / (u2 + SUDDEN**2)
 

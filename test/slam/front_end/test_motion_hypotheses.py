@@ -74,7 +74,8 @@ def test_odometry_that_lost_a_stall_is_right_since_then():
     for _ in range(4):
         drive.go(np.zeros(3))
     np.testing.assert_array_equal(drive.go()[0], STEP)
-    assert len(drive.go()) == 1
+    drive.go()
+    assert len(drive.go()) == 1  # two frames have confirmed it
 
 
 def test_robot_that_stops_has_stopped():
@@ -85,14 +86,6 @@ def test_robot_that_stops_has_stopped():
     drive.hypotheses.learn(drive.observation(np.zeros(3)), drive.pose)
     drive.stamp += round(DT * 1e9)
     assert len(drive.hypotheses.of(drive.observation(np.zeros(3)), np.zeros(3))) == 1
-
-
-def test_step_that_no_robot_makes_is_doubted():
-    drive = Drive()
-    drive.go()
-    found = drive.go(se2.exp(TWIST * 5 * DT), moved=STEP)
-    assert len(found) == 2
-    np.testing.assert_allclose(found[1], STEP, atol=1e-9)
 
 
 def test_pose_that_was_moved_is_not_compared_with_the_one_before():
