@@ -145,6 +145,8 @@ class User(Node):
                 return False
             self._executor.spin_once(timeout_sec=0.05)
             self._children.check(*self._names)
+            if max(self.count_publishers('pose'), self.count_publishers('ground_truth')) > 1:
+                raise RlmlError('another system is in this ROS domain: nothing is measured')
         return True
 
     def ask(self, kind: Any, service: str, request: Any) -> Any:

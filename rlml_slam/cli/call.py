@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import time
 from typing import Any
 
 from rlml_slam.cli.support.service_call import answer_of, asking, message_of
@@ -57,10 +56,7 @@ def run(args: argparse.Namespace) -> int:
         if name != 'LoadMap':
             print(message_of(answer))
         elif answer.result != kind.Response.RESULT_SUCCESS:
-            why = (
-                reason(asker, args.node) or 'the map is refused, and the log of the node says why'
-            )
-            raise InputError(why)
+            raise InputError(f'load_map: {answer.map.header.frame_id}')
         else:
             print(f'{args.argument}: loaded')
     return 0
@@ -75,25 +71,6 @@ def rename(asker: Any, node: str, name: str) -> None:
     answer = answer_of(asker, node, 'set_parameters', SetParameters, {'parameters': given})
     if not answer.results[0].successful:
         raise InputError(answer.results[0].reason)
-
-
-def reason(asker: Any, node: str) -> str:
-    """Why the node refused a request, from its diagnostics; LoadMap's answer has no text."""
-    import rclpy
-    from diagnostic_msgs.msg import DiagnosticArray
-
-    found: list[str] = []
-
-    def look(message: Any) -> None:
-        for status in message.status:
-            if status.name.startswith(node.lstrip('/')):
-                found.extend(v.value for v in status.values if v.key == 'last refused request')
-
-    asker.create_subscription(DiagnosticArray, '/diagnostics', look, 10)
-    end = time.monotonic() + PATIENCE
-    while not found and time.monotonic() < end:
-        rclpy.spin_once(asker, timeout_sec=0.1)
-    return found[-1] if found else ''
 
 
 def value_of(service: str, field: str, argument: str | None) -> str | bool:

@@ -36,7 +36,8 @@ class FrontEndNode(Node):
         prepare(self)
         self.answers = FramePublisher(self, self.params.node)
         self.take: Callable[[SessionFrame], None] | None = None
-        self.control = FrontEndControl(self, self.params, self.answers.begin_session, has_back_end)
+        began = self.answers.begin_session
+        self.control = FrontEndControl(self, self.params, began, self.publish, has_back_end)
         self.sensors = Sensors(self, self.params, STREAMS, self.process, self.control.restart)
         self.health = HealthPublisher(self, self.sensors, problems=self.problems)
 
@@ -57,12 +58,15 @@ class FrontEndNode(Node):
     def process(self, observation: Observation) -> None:
         """One observation: estimate and publish."""
         self.control.carry_out()
-        record = self.control.session.process(observation)
+        self.publish(self.control.session.process(observation))
+        self.front_end.settle()
+
+    def publish(self, record: SessionFrame) -> None:
+        """Give a frame to all who wait for it."""
         self.answers.publish(record)
         if self.take is not None:
             self.take(record)
         self.health.update(record.frame)
-        self.front_end.settle()
 
 
 def main() -> int:

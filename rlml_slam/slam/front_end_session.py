@@ -13,6 +13,7 @@ import numpy as np
 from rlml_slam import se2
 from rlml_slam.estimation.correction import Correction, ReferencePose
 from rlml_slam.maps.saved_map import SavedMap
+from rlml_slam.motion import STILL
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.conversation import (
@@ -48,6 +49,7 @@ class FrontEndSession:
         self.request, self.mode = RESTARTED, 0
         self.map: SavedMap | None = None
         self.last: Frame | None = None
+        self._observation: Observation | None = None  # that of ``last``
         self._number = 0  # of the newest request
         self._lost_since: int | None = None  # stamp of the first of the lost frames
         # stamp -> T_local_base (3,) and its covariance (3, 3)
@@ -56,6 +58,7 @@ class FrontEndSession:
     def process(self, observation: Observation) -> SessionFrame:
         """The frame of one observation."""
         frame = self.last = self.front_end.process(observation)
+        self._observation = observation
         self._recent[frame.stamp] = (frame.T_local_base, frame.cov_local)
         if len(self._recent) > RECENT:
             self._recent.popitem(last=False)
@@ -78,19 +81,23 @@ class FrontEndSession:
         self._begin(pose, cov, GIVEN)
         return pose
 
-    def execute(self, command: FrontEndCommand) -> None:
-        """Carry out a command; what is of another session, or superseded, changes nothing."""
+    def execute(self, command: FrontEndCommand) -> SessionFrame | None:
+        """Carry out a command; what is of another session, or superseded, changes nothing.
+
+        Where a session begins at the newest observation, that is the first of the session: its
+        frame is returned.
+        """
         if isinstance(command, Correct):
             self._correct(command)
         elif isinstance(command, LocalizeIn):
-            if command.number > self.mode:
+            if command.number != self.mode:
                 self._localize_in(command)
         elif self._is_meant(command):
             self._number = command.number
             if isinstance(command, StartSession):
-                self._start(command)
-            else:
-                self._relocate(command)
+                return self._start(command)
+            self._relocate(command)
+        return None
 
     def _is_meant(self, command: StartSession | Relocate) -> bool:
         if command.number <= self._number:
@@ -98,11 +105,15 @@ class FrontEndSession:
         known = command.session == self.session and command.stamp in self._recent
         return command.session == ANY or known
 
-    def _start(self, command: StartSession) -> None:
+    def _start(self, command: StartSession) -> SessionFrame | None:
         stamp = None if command.session == ANY else command.stamp
         pose, cov = self._now(stamp, command.pose, command.cov)
         self._begin(pose, cov, command.number)
         self.front_end.tracks.next_key = command.first_key
+        newest = self._observation
+        if newest is None or newest.stamp != stamp:
+            return None
+        return self.process(dataclasses.replace(newest, motion=STILL))
 
     def _relocate(self, command: Relocate) -> None:
         self.request = command.number
@@ -115,7 +126,8 @@ class FrontEndSession:
 
     def _localize_in(self, command: LocalizeIn) -> None:
         before, self.map, self.mode = self.map, command.map, command.number
-        self._number = max(self._number, command.number)
+        # the first command of a back end, whose numbers may be smaller than those of another run
+        self._number = command.number
         if before is None and self.map is None:
             return  # it makes a map already
         mode = 'mapping' if self.map is None else 'localization'

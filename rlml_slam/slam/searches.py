@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
 from dataclasses import dataclass
 from enum import Enum
 
@@ -30,10 +30,10 @@ class Pending:
 
 
 class Searches:
-    """Numbers come from ``new_number``; ``take`` gives what a number stands for, once."""
+    """``take`` gives what a number stands for, once."""
 
-    def __init__(self, new_number: Callable[[], int]) -> None:
-        self._new_number = new_number
+    def __init__(self) -> None:
+        self._numbers = itertools.count(1)
         self._pending: dict[int, Pending] = {}
 
     def is_pending(self, *purposes: Purpose) -> bool:
@@ -48,7 +48,7 @@ class Searches:
         complete: bool = True,
     ) -> Search | DrawMap:
         """The command for a search in a map; without one, to draw the map in the making first."""
-        number = self._new_number()
+        number = next(self._numbers)
         self._pending[number] = Pending(purpose, record)
         if saved is None:
             return DrawMap(number)

@@ -61,7 +61,7 @@ class System:
 
     def __init__(self, params: Parameters, first_request: int = FIRST_REQUEST) -> None:
         self.requests = Requests(first_request)
-        self.searches = Searches(self.requests.new_number)
+        self.searches = Searches()
         self.recovery = Recovery(params)
         self.map: SavedMap | None = None
         self.entry: MapEntry | None = None

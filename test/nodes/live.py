@@ -18,12 +18,13 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
+from rlml_slam.cli.support.processes import free_domain
 from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.codecs.message_types import rclpy_class
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOM = ROOT / 'bags' / 'room'
-DOMAIN = 10 + os.getpid() % 90
+DOMAIN = free_domain()  # two systems in one domain hear each other
 BEST_EFFORT = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 STREAM_OF = {'/scan': 'scan', '/odom': 'odom', '/imu': 'imu', '/reflectors': 'reflectors'}

@@ -45,9 +45,13 @@ def test_services_answer_in_words_and_refuse_in_words(live, command, tmp_path):
     code, out, err = command('load_map', 'nowhere')
     assert (code, out) == (1, '')
     assert 'load_map: ' in err
-    assert 'nowhere' in err
+    assert 'there is no nowhere.rlml and no nowhere.csv' in err
     code, out, err = command('load_map', '')
     assert (code, out) == (1, '')
+    assert 'load_map: map_url is empty' in err
+    code, out, err = command('load_map', '../hall')
+    assert (code, out) == (1, '')
+    assert "load_map: map '../hall' is not inside of map_directory" in err
     code, out, err = command('save_map')
     assert (code, out) == (1, '')
     assert 'nothing to save' in err

@@ -18,7 +18,7 @@ from nav_msgs.msg import Path
 from rclpy.serialization import deserialize_message
 
 from rlml_slam import se2
-from rlml_slam.errors import MapError
+from rlml_slam.errors import MapError, RlmlError
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Parameters
@@ -315,6 +315,70 @@ def test_map_made_here_stays_whole_while_it_is_localized_in(make, ear, tmp_path)
     mapper.requests.localize(False)
     assert mapper.back_end.keyframes == []
     assert lost(tmp_path) == {}  # it is in a file
+
+
+def state_of(mapper, ear, folder):
+    """Everything that a request may change."""
+    system = mapper.system
+    return (
+        id(mapper.back_end), mapper.back_end.graph.poses.tobytes(), mapper.loaded, system.session,
+        system.mode, id(system.map), system.entry, system.requests.pending, system.T_map_local
+        .tobytes(), dict(system.searches._pending), system.recovery.is_active,
+        {topic: len(sent) for topic, sent in ear.sent.items()}, mapper.archive._written,
+        {path.name: path.read_bytes() for path in folder.iterdir()},
+    )  # fmt: skip
+
+
+def no_space(*_):
+    raise MapError('No space left on device')
+
+
+FAILURES = {
+    'save_map outside of the folder': (lambda r: r.save('../map'), 'not inside of'),
+    'load_map of none': (lambda r: r.load('none'), 'none.rlml: cannot be read'),
+    'load_map of a damaged file': (lambda r: r.load('bad'), 'bad.rlml'),
+    'load_map outside of the folder': (lambda r: r.load('/etc/map'), 'not inside of'),
+    'revoke_closure of no number': (lambda r: r.revoke('x'), 'is not the number'),
+    'revoke_closure of none': (lambda r: r.revoke('7'), 'there is no loop closure 7'),
+}
+
+
+@pytest.mark.parametrize(('request_', 'why'), FAILURES.values(), ids=FAILURES)
+def test_refused_request_leaves_everything_as_it_was(make, ear, tmp_path, request_, why):
+    (tmp_path / 'bad.rlml').write_bytes(b'nonsense' * 20)
+    mapper = make(map_directory=str(tmp_path), journal_period=0.0)
+    drives(mapper, range(30))
+    before = state_of(mapper, ear, tmp_path)
+    with pytest.raises(RlmlError, match=why):
+        request_(mapper.requests)
+    assert state_of(mapper, ear, tmp_path) == before
+
+
+def test_map_that_cannot_be_written_is_still_unsaved(make, ear, tmp_path, monkeypatch):
+    mapper = make(map_directory=str(tmp_path), journal_period=0.0)
+    drives(mapper, range(60))
+    mapper.back_end.reflectors = lambda: posts(5)
+    before = state_of(mapper, ear, tmp_path)
+    monkeypatch.setattr('rlml_slam.ros.back_end.map_archive.map_container.write', no_space)
+    with pytest.raises(MapError, match='No space left'):
+        mapper.requests.save('map')
+    assert state_of(mapper, ear, tmp_path) == before
+
+
+def test_localization_without_a_map_and_a_search_that_finds_nothing_change_nothing(
+    make, ear, tmp_path
+):
+    mapper = make(map_directory=str(tmp_path), journal_period=0.0)
+    before = state_of(mapper, ear, tmp_path)
+    with pytest.raises(MapError, match='there is no map yet'):
+        mapper.requests.localize(True)
+    assert mapper.requests.localize(False) == 'maps already'
+    drives(mapper, range(30))
+    before = state_of(mapper, ear, tmp_path)
+    answer = mapper.requests.relocalize()
+    searched(mapper)
+    assert not answer.result().success
+    assert state_of(mapper, ear, tmp_path) == before
 
 
 # --- a grid that is too large ---------------------------------------------------------------

@@ -166,7 +166,8 @@ SERVICES = (
     Service('back_end', '~/save_map', 'std_srvs/Trigger',
             'write `map_directory`/`map_file_name`: everything as `.rlml`, reflectors and grid'),
     Service('back_end', '~/load_map', 'nav_msgs/LoadMap',
-            'localize in another map of `map_directory`, or while mapping go on with it'),
+            'localize in another map of `map_directory`, or while mapping go on with it; where it '
+            'is refused, `map.header.frame_id` of the answer says why'),
     Service('back_end', '~/reset', 'std_srvs/Trigger',
             'forget the map and begin at `map_start_pose`'),
     Service('back_end', '~/closures', 'std_srvs/Trigger',

@@ -66,7 +66,9 @@ class MapServices:
                 executor.wake()
 
             def finish(job: concurrent.futures.Future[Any]) -> None:
-                failed = job.cancelled() or job.exception() is not None
+                failed = 'the node ends' if job.cancelled() else job.exception()
+                if failed is not None:
+                    refuse(response, f'not done: {failed}')
                 later = None if failed else job.result()
                 if isinstance(later, concurrent.futures.Future):
                     later.add_done_callback(end)
@@ -170,15 +172,25 @@ class MapServices:
             response.message = act()
             response.success = True
         except RlmlError as e:
-            response.success, response.message = False, str(e)
+            refuse(response, str(e))
             self.refused = f'{service}: {e}'
 
 
+def refuse(response: Any, why: str) -> None:
+    """Answer that a request failed, and why.
+
+    The answer of load_map has no text: ``map``, which is empty then, has it as its frame.
+    """
+    if hasattr(response, 'success'):
+        response.success, response.message = False, why
+    elif hasattr(response, 'result'):
+        response.result = LoadMap.Response.RESULT_UNDEFINED_FAILURE
+        response.map.header.frame_id = why
+
+
 def refuse_map(node: Any, response: Any, why: RlmlError) -> None:
-    """Answer load_map where a map cannot be had; its answer has no text: the reason is logged."""
+    """Answer load_map where a map cannot be had."""
     node.get_logger().warning(f'load_map: {why}')
-    response.result = (
-        LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
-        if isinstance(why, NoMapError) or isinstance(why.__cause__, FileNotFoundError)
-        else LoadMap.Response.RESULT_UNDEFINED_FAILURE
-    )
+    refuse(response, str(why))
+    if isinstance(why, NoMapError) or isinstance(why.__cause__, FileNotFoundError):
+        response.result = LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST

@@ -18,7 +18,7 @@ from rlml_slam.errors import InputError
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.decode import FARTHEST, covariances, stamp
 from rlml_slam.ros.codecs.message_types import Make
-from rlml_slam.ros.codecs.point_cloud import bounded, build_cloud, column, read_table
+from rlml_slam.ros.codecs.point_cloud import bounded, build_cloud, read_table
 from rlml_slam.ros.codecs.reflector_clouds import Associated
 from rlml_slam.se2 import Array
 from rlml_slam.slam.conversation import SessionFrame
@@ -42,7 +42,8 @@ RECORD = np.dtype(
         ('iterations', '<i4'), ('wall_ms', '<f8'),
     ]
 )  # fmt: skip
-POINT = np.dtype([('x', '<f4'), ('y', '<f4'), ('z', '<f4')])
+# single precision for RViz; `exact` is what the front end has
+POINT = np.dtype([('x', '<f4'), ('y', '<f4'), ('z', '<f4'), ('exact', '<f8', (2,))])
 _FRAME = ('T_local_base', 'cov_local', 'T_map_base', 'cov_map')
 _FIGURES = ('scan_score', 'scan_used', 'unconfirmed', 'jumped', 'chi2', 'iterations', 'wall_ms')
 _MOTION = ('delta', 'cov', 'known', 'bias_gain', 'bias', 'bias_var')
@@ -127,14 +128,13 @@ def read_record(msg: Any, topic: str = 'rlml/frames') -> Record:
 def build_points(make: Make, time: int, base_frame: str, points: Array) -> Any:
     """PointCloud2 of points (n, 2)."""
     cloud = np.zeros(len(points), dtype=POINT)
-    cloud['x'], cloud['y'] = points[:, 0], points[:, 1]
+    cloud['x'], cloud['y'], cloud['exact'] = points[:, 0], points[:, 1], points
     return build_cloud(make, encode.header(make, time, base_frame), cloud)
 
 
 def read_points(msg: Any, topic: str = 'deskewed_points') -> Array:
     """Points (n, 2)."""
-    cloud = read_table(msg, POINT, topic)
-    points = np.stack([column(cloud, 'x', 0.0), column(cloud, 'y', 0.0)], -1)
+    points: Array = read_table(msg, POINT, topic)['exact'].astype(np.float64)
     bounded(points, f'{topic}: a point', FARTHEST)
     return points
 

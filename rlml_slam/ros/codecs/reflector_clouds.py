@@ -16,16 +16,18 @@ from numpy.typing import NDArray
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.decode import covariances, frame, stamp
 from rlml_slam.ros.codecs.message_types import Make
-from rlml_slam.ros.codecs.point_cloud import bounded, build_cloud, column, read_table
+from rlml_slam.ros.codecs.point_cloud import bounded, build_cloud, read_table
 from rlml_slam.se2 import Array
 from rlml_slam.types import Detections, Frame, Reflectors
 
-# z = 0 for RViz; landmark is the front end's key, id the reflector's own; both -1 for none
+# x, y and z = 0 for RViz, which needs them in single precision; the nodes use `exact`.
+# landmark is the front end's key, id the reflector's own; both -1 for none
 _PLACED = [
-    ('x', '<f4'), ('y', '<f4'), ('z', '<f4'),
-    ('cov_xx', '<f4'), ('cov_xy', '<f4'), ('cov_yy', '<f4'),
-    ('landmark', '<i4'), ('id', '<i4'), ('diameter', '<f4'),
+    ('x', '<f4'), ('y', '<f4'), ('z', '<f4'), ('exact', '<f8', (2,)),
+    ('cov_xx', '<f8'), ('cov_xy', '<f8'), ('cov_yx', '<f8'), ('cov_yy', '<f8'),
+    ('landmark', '<i4'), ('id', '<i4'), ('diameter', '<f8'),
 ]  # fmt: skip
+_COV = {'cov_xx': (0, 0), 'cov_xy': (0, 1), 'cov_yx': (1, 0), 'cov_yy': (1, 1)}
 ASSOCIATED = np.dtype([*_PLACED, ('status', '<i4')])
 MAPPED = np.dtype([*_PLACED, ('sightings', '<i4')])
 
@@ -60,8 +62,9 @@ def _placed(
 ) -> NDArray[np.void]:
     cloud = np.zeros(len(of), dtype=dtype)
     cloud['x'], cloud['y'] = of.points[:, 0], of.points[:, 1]
-    cloud['cov_xx'], cloud['cov_xy'] = of.cov[:, 0, 0], of.cov[:, 0, 1]
-    cloud['cov_yy'] = of.cov[:, 1, 1]
+    cloud['exact'] = of.points
+    for name, (i, j) in _COV.items():
+        cloud[name] = of.cov[:, i, j]
     cloud['landmark'], cloud['id'], cloud['diameter'] = landmarks, of.ids, of.diameters
     return cloud
 
@@ -109,7 +112,6 @@ def _read(msg: Any, dtype: np.dtype[np.void], topic: str) -> NDArray[np.void]:
 def _places(cloud: NDArray[np.void]) -> tuple[Array, Array]:
     """Points (n, 2) and covariances (n, 2, 2)."""
     cov = np.empty((len(cloud), 2, 2))
-    x, y, xx, xy, yy = (column(cloud, n, 0.0) for n in ('x', 'y', 'cov_xx', 'cov_xy', 'cov_yy'))
-    cov[:, 0, 0], cov[:, 1, 1] = xx, yy
-    cov[:, 0, 1] = cov[:, 1, 0] = xy
-    return np.stack([x, y], -1), cov
+    for name, (i, j) in _COV.items():
+        cov[:, i, j] = cloud[name]
+    return cloud['exact'].astype(np.float64), cov

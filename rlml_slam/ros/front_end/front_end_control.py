@@ -22,7 +22,7 @@ from rlml_slam.ros.codecs.reflector_clouds import read_reflector_map
 from rlml_slam.ros.codecs.request_message import read_request
 from rlml_slam.ros.message_guard import LARGE, SMALL, Listener
 from rlml_slam.ros.sensors import ALIVE, LATCHED, LEASE, RELIABLE
-from rlml_slam.slam.conversation import FrontEndCommand, LocalizeIn
+from rlml_slam.slam.conversation import FrontEndCommand, LocalizeIn, SessionFrame
 from rlml_slam.slam.front_end_session import FrontEndSession
 from rlml_slam.types import Reflectors
 
@@ -35,16 +35,24 @@ GRID = 'nav_msgs/msg/OccupancyGrid'
 class FrontEndControl:
     """Converts messages to commands for a FrontEndSession; ``began`` is called at each session.
 
+    ``again`` takes the frame of an observation that begins a session after it was used before.
+
     Commands of a back end in the same process come by ``command`` from any thread, and are carried
     out in the node's; then there are no topics for them.
     """
 
     def __init__(
-        self, node: Any, params: Parameters, began: Callable[[], None], has_back_end: bool
+        self,
+        node: Any,
+        params: Parameters,
+        began: Callable[[], None],
+        again: Callable[[SessionFrame], None],
+        has_back_end: bool,
     ) -> None:
         self._logger = node.get_logger()
         self._map_frame = params.node.map_frame
         self._began = began
+        self._again = again
         self.session = FrontEndSession(params, unique_number)
         self._inbox: deque[FrontEndCommand] = deque()
         self._arrival = node.create_guard_condition(self.carry_out)
@@ -132,13 +140,15 @@ class FrontEndControl:
     def execute(self, command: FrontEndCommand) -> None:
         """Carry out one command."""
         before, mode = self.session.session, self.session.mode
-        self.session.execute(command)
+        record = self.session.execute(command)
         if self.session.mode != mode:
             known = self.session.map
             of = '' if known is None else f' in a map of {len(known.reflectors)} reflectors'
             self._logger.info(f'mode is {"mapping" if known is None else "localization"}{of}')
         if self.session.session != before:
             self._began()
+        if record is not None:
+            self._again(record)
 
 
 def number_of(msg: Any, topic: str) -> int:

@@ -16,7 +16,6 @@ from rlml_slam.maps.map_container import Content
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved_map import SavedMap, require_contents
 from rlml_slam.maps.survey import Survey
-from rlml_slam.motion import STILL
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.synchronization.synchronized_system import SynchronizedSystem
@@ -55,14 +54,12 @@ class Slam(SynchronizedSystem):
         self._loaded: BackEnd | None = None
         self._delay = int(search_delay * 1e9)
         self._late: deque[tuple[int, int, Relocation]] = deque()
-        self._observation: Observation | None = None
         self._newest: Frame | None = None  # what the observation came to in the end
-        front_end = self.session.execute
         self._executes: Mapping[type, Callable[[Any], None]] = {
-            say.StartSession: self._start_session,
-            say.Relocate: front_end,
-            say.Correct: front_end,
-            say.LocalizeIn: front_end,
+            say.StartSession: self._command,
+            say.Relocate: self._command,
+            say.Correct: self._command,
+            say.LocalizeIn: self._command,
             say.MapFrame: self._map_frame,
             say.Search: self._search,
             say.DrawMap: lambda c: self.execute(self.system.on_map_drawn(c.number, self.map())),
@@ -123,7 +120,6 @@ class Slam(SynchronizedSystem):
         frames: list[Frame] = []
         for observation in observations:
             self._deliver_late(observation.stamp)
-            self._observation = observation
             record = self.session.process(observation)
             self.batch_reassociation.add(observation, record.frame)
             self._give(record)
@@ -144,13 +140,10 @@ class Slam(SynchronizedSystem):
             if run is not None:  # a replay writes no log and publishes nothing
                 run(command)
 
-    def _start_session(self, command: say.StartSession) -> None:
-        before, observation = self.session.session, self._observation
-        self.session.execute(command)
-        began = self.session.session != before
-        if began and observation is not None and command.stamp == observation.stamp:
-            # what was found is the first of the session: no scan of a recording is left out
-            self._give(self.session.process(replace(observation, motion=STILL)))
+    def _command(self, command: say.FrontEndCommand) -> None:
+        record = self.session.execute(command)
+        if record is not None:
+            self._give(record)
 
     def _map_frame(self, command: say.MapFrame) -> None:
         update = self._timed_add(command.frame)
