@@ -26,7 +26,7 @@ from rlml_slam.maps import map_container, nav2_map, reflector_file, saved_map
 from rlml_slam.maps.map_container import Content
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved_map import SavedMap
-from rlml_slam.params import Parameters, from_mapping, read_yaml
+from rlml_slam.params import Node, Parameters, from_mapping, read_yaml
 from rlml_slam.recordings.bag_inputs import BagInputs
 from rlml_slam.recordings.bag_replay import replay as run_replay
 from rlml_slam.recordings.products import collect
@@ -35,6 +35,7 @@ from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.synchronization.input_counts import InputCounts
+from rlml_slam.sensing.synchronization.odometry_sources import TF, TOPIC, OdometrySources
 from rlml_slam.slam.offline.slam import Slam as System
 from rlml_slam.slam.store import map_file
 from rlml_slam.types import Detections, Frame, Imu, Odometry, Reflectors, Scan
@@ -83,21 +84,29 @@ class Bag:
         counts = InputCounts()
         with BagReader(self.path) as bag:
             inputs = BagInputs(bag, self.parameters)
-            feed = SensorInput(self.parameters, _Measurements(), counts)
-            feed.extrinsics = inputs.extrinsics
+            feed = SensorInput(inputs.params, _Measurements(inputs.params.node), counts)
+            feed.use_extrinsics(inputs.extrinsics)
             for _, stream, message in inputs:
                 yield from feed.add(stream, message)
             self.skipped = {name: sum(c.values()) for name, c in counts.totals().items()}
 
 
 class _Measurements:
-    """A target of SensorInput that returns what it is given."""
+    """A target of SensorInput that returns what it is given, of odometry what is used."""
+
+    def __init__(self, node: Node) -> None:
+        self._odometry = OdometrySources(node.odom_source, node.tf_buffer_duration)
 
     def set_sensor_pose(self, frame_id: str, T_base_sensor: Array) -> None:
         """The pose of a sensor, which the bag has in ``sensor_poses`` already."""
 
     def add_odometry(self, sample: Odometry) -> list[Measurement]:
-        return [sample]
+        used = self._odometry.use(TOPIC, sample)
+        return [] if used is None else [used]
+
+    def add_transform(self, sample: Odometry) -> list[Measurement]:
+        used = self._odometry.use(TF, sample)
+        return [] if used is None else [used]
 
     def add_imu(self, sample: Imu) -> list[Measurement]:
         return [sample]

@@ -62,6 +62,7 @@ def test_nested_yaml_is_flattened_as_ros_does():
     assert flatten({'a': {'b': {'c': 1}}, 'd': 2}) == {'a.b.c': 1, 'd': 2}
 
 
+DETECTOR = {'odom_topic': 'wheels', 'detector.threshold': 'fixed'}
 SHARED = """
 /**:
   ros__parameters: {use_sim_time: true, odom_topic: wheels, detector.threshold: fixed}
@@ -81,9 +82,12 @@ local_costmap:
 @pytest.mark.parametrize(
     ('of', 'values'),
     [
-        (Parameters, {'odom_topic': 'wheels', 'submap.insertions': 80, 'map_file_name': 'hall'}),
-        (EkfParameters, {'odom_topic': 'wheels'}),
-        (DetectorParameters, {'odom_topic': 'wheels', 'detector.threshold': 'fixed'}),
+        (
+            Parameters,
+            {**DETECTOR, 'submap.insertions': 80, 'map_file_name': 'hall'},
+        ),
+        (EkfParameters, DETECTOR),
+        (DetectorParameters, DETECTOR),
         (SimulatorParameters, {'laser_frame': 'eye'}),
     ],
 )

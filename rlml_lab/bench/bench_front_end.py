@@ -83,7 +83,7 @@ def from_bag(bag: BagReader) -> Iterator[Input]:
     params = Parameters()
     inputs, synchronizer = BagInputs(bag, params), Synchronizer(params)
     feed = SensorInput(params, synchronizer, synchronizer.inputs)
-    feed.extrinsics = inputs.extrinsics
+    feed.use_extrinsics(inputs.extrinsics)
     for _, stream, message in inputs:
         yield partial(feed.add, stream, message)
 

@@ -67,7 +67,7 @@ class _Collector:
         self.messages.append(message)
         return []
 
-    add_odometry = add_imu = add_scan = add_detections = _keep
+    add_odometry = add_transform = add_imu = add_scan = add_detections = _keep
 
 
 def load(name: str, reference: Path | None, params: Parameters, seed: int = 0) -> Recording:
@@ -81,7 +81,7 @@ def load(name: str, reference: Path | None, params: Parameters, seed: int = 0) -
     with BagReader(name) as bag:
         inputs, out = BagInputs(bag, params), _Collector()
         feed = SensorInput(params, out, InputCounts())
-        feed.extrinsics = inputs.extrinsics
+        feed.use_extrinsics(inputs.extrinsics)
         for _, stream, message in inputs:
             feed.add(stream, message)
         own = inputs.truth()

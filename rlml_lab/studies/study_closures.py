@@ -94,7 +94,7 @@ def drive(bag_path: Path, scale: float, turn: float, quiet: bool) -> Slam:
     with BagReader(bag_path) as bag, Progress('replay', 1.0, quiet) as progress:
         inputs = BagInputs(bag, parameters)
         feed = SensorInput(parameters, slam, slam.synchronizer.inputs)
-        feed.extrinsics = inputs.extrinsics
+        feed.use_extrinsics(inputs.extrinsics)
         for k, (time, stream, message) in enumerate(inputs):
             feed.add(stream, message)
             if k % 1000 == 0:

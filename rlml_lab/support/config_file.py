@@ -29,16 +29,17 @@ FILES: dict[str, tuple[type[Any], str]] = {
 # what a node declares, because it shares the group, but does not read: names and groups
 UNREAD: dict[str, tuple[str, ...]] = {
     'ekf_slam.yaml': (
-        'continue_map', 'restore_pose', 'transform_publish_period',
+        'continue_map', 'restore_pose',
         'scan_match', 'loop_closure', 'relocalization', 'solver',
     ),
     'deformable_slam.yaml': ('motion.scale_error_sigma', 'motion.scale_error_time'),
     'reflector_detector.yaml': (
         'motion.scale_error_sigma', 'motion.scale_error_time',
-        'map_frame', 'odom_frame', 'local_frame', 'use_scan', 'use_reflectors',
+        'local_frame', 'use_scan', 'use_reflectors',
         'reflector_poses_topic', 'reflector_markers_topic', 'reflector_beams_topic',
         'landmarks_topic', 'mode', 'map_directory', 'map_file_name', 'map_start_pose',
         'restore_pose', 'continue_map', 'transform_publish_period', 'map_update_interval',
+        'detect_reflectors', 'provide_odom_frame', 'tf_broadcast', 'transform_tolerance', 'shadow',
     ),
 }  # fmt: skip
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import math
 from pathlib import Path
@@ -13,16 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from rlml_slam.cli.doctor_evidence import KEPT, Evidence
+from rlml_slam.cli.support.doctor_evidence import KEPT, Evidence
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.errors import BagError, InputError
 from rlml_slam.maps.atomic_file import write_atomically
-from rlml_slam.params import Detector, DetectorParameters, from_mapping, read_yaml
+from rlml_slam.params import DetectorParameters, from_mapping, read_yaml
 from rlml_slam.ros.bags.bag import BagReader, choose_topics
 from rlml_slam.ros.codecs import decode
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.reflectors.background_intensity import VENDOR_BIT
+from rlml_slam.sensing.reflectors.reflector_calibration import calibrated
 from rlml_slam.sensing.reflectors.reflector_detector import detect, threshold
+from rlml_slam.sensing.reflectors.scan_reflectors import in_words
 from rlml_slam.types import Scan
 
 MOST_SCANS = 500  # looked at, spread over the bag
@@ -54,8 +57,8 @@ def run(args: argparse.Namespace) -> int:
         'detector.threshold': 'automatic',
     }
     given: DetectorParameters = from_mapping(values, DetectorParameters)
-    evidence = gather(args.bag, args.topic, given, args.json)
-    figures = examine(evidence, given.detector)
+    evidence = gather(args.bag, args.topic, given, args.json, learns=args.config is None)
+    figures = examine(evidence)
     if args.out is not None:
         from rlml_slam.cli.doctor_picture import picture
 
@@ -64,14 +67,51 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def gather(path: Path, topic: str, given: DetectorParameters, quiet: bool) -> Evidence:
-    """The scans of a bag, spread over it, and what the automatic threshold finds in them."""
+def gather(
+    path: Path, topic: str, given: DetectorParameters, quiet: bool, learns: bool = True
+) -> Evidence:
+    """The scans of a bag, spread over it, and what the automatic threshold finds in them.
+
+    With ``learns``, size and threshold are those that the scans show, as far as they do.
+    """
+    seen = scans_of(path, topic, given, quiet)
+    bright = [s for s in seen if len(s.intensities) == len(s.ranges) and len(s.ranges)]
+    detector, floor, found_by = given.detector, None, ''
+    if learns:
+        calibration = calibrated(bright, detector)
+        if calibration is not None:
+            detector, floor = calibration.detector, calibration.floor
+            found_by = in_words(calibration)
     counts: list[int] = []
-    beams, levels, spots, widths = [], [], [], []
-    is_spot = []
-    last: Scan | None = None
+    beams, levels, spots, widths, is_spot = [], [], [], [], []
+    for scan in bright:
+        found = detect(scan, detector, floor)
+        level = threshold(scan, detector)
+        counts.append(len(found))
+        on = _on_spots(scan, found.beams, found.widths, np.hypot(*found.points.T))
+        with np.errstate(invalid='ignore'):
+            valid = (scan.ranges >= scan.range_min) & (scan.ranges <= scan.range_max)
+        beams.append(np.stack([scan.ranges, scan.intensities], -1)[valid])
+        is_spot.append(on[valid])
+        levels.append(level[valid] / detector.contrast)
+        r = np.hypot(found.points[:, 0], found.points[:, 1])
+        spots.append(np.stack([r, found.intensities], -1))
+        widths.append(found.widths)
+    return Evidence(
+        seen[-1], np.array(counts, dtype=np.float64),
+        np.concatenate([*beams, np.zeros((0, 2))]).astype(np.float64),
+        np.concatenate([*is_spot, np.zeros(0, dtype=bool)]),
+        np.concatenate([*levels, np.zeros(0)]),
+        np.concatenate([*spots, np.zeros((0, 2))]), np.concatenate([*widths, np.zeros(0)]),
+        found_by,
+    )  # fmt: skip
+
+
+def scans_of(path: Path, topic: str, given: DetectorParameters, quiet: bool) -> list[Scan]:
+    """At most MOST_SCANS of the scans of a bag, spread over it."""
+    seen: list[Scan] = []
     with BagReader(path) as bag:
-        name = topic or choose_topics(bag.topics, given.node).get('scan', '')
+        name = topic or choose_topics(bag.topics, given.node, ('imu', 'odom')).get('scan', '')
         if name not in bag.topics or 'LaserScan' not in bag.topics[name].msgtype:
             raise BagError(f'{path}: no LaserScan topic {name or given.node.scan_topic!r}')
         total = bag.count([name])
@@ -80,35 +120,12 @@ def gather(path: Path, topic: str, given: DetectorParameters, quiet: bool) -> Ev
             for k, (_, _, message) in enumerate(bag.messages([name])):
                 if k % stride:
                     continue
-                try:
-                    scan = decode.scan(message, name)
-                except InputError:
-                    continue
-                last = scan
+                with contextlib.suppress(InputError):
+                    seen.append(decode.scan(message, name))
                 progress.update(k + 1, '')
-                if len(scan.intensities) != len(scan.ranges) or not len(scan.ranges):
-                    continue
-                found = detect(scan, given.detector)
-                level = threshold(scan, given.detector)
-                counts.append(len(found))
-                on = _on_spots(scan, found.beams, found.widths, np.hypot(*found.points.T))
-                with np.errstate(invalid='ignore'):
-                    seen = (scan.ranges >= scan.range_min) & (scan.ranges <= scan.range_max)
-                beams.append(np.stack([scan.ranges, scan.intensities], -1)[seen])
-                is_spot.append(on[seen])
-                levels.append(level[seen])
-                r = np.hypot(found.points[:, 0], found.points[:, 1])
-                spots.append(np.stack([r, found.intensities], -1))
-                widths.append(found.widths)
-    if last is None:
+    if not seen:
         raise BagError(f'{path}: {name} has no scan that can be read')
-    return Evidence(
-        last, np.array(counts, dtype=np.float64),
-        np.concatenate([*beams, np.zeros((0, 2))]).astype(np.float64),
-        np.concatenate([*is_spot, np.zeros(0, dtype=bool)]),
-        np.concatenate([*levels, np.zeros(0)]),
-        np.concatenate([*spots, np.zeros((0, 2))]), np.concatenate([*widths, np.zeros(0)]),
-    )  # fmt: skip
+    return seen
 
 
 def _on_spots(scan: Scan, middles: Array, widths: Array, ranges: Array) -> NDArray[np.bool_]:
@@ -121,7 +138,7 @@ def _on_spots(scan: Scan, middles: Array, widths: Array, ranges: Array) -> NDArr
     return on
 
 
-def examine(e: Evidence, p: Detector) -> dict[str, Any]:
+def examine(e: Evidence) -> dict[str, Any]:
     """The figures: the sensor, its intensities, its reflectors, and the parameters proposed."""
     s = e.scan
     figures: dict[str, Any] = {
@@ -144,6 +161,7 @@ def examine(e: Evidence, p: Detector) -> dict[str, Any]:
         'reflectors_mean': float(e.counts.mean()),
         'reflectors_min': int(e.counts.min()),
         'reflectors_max': int(e.counts.max()),
+        'found_by': e.found_by,
     }
     if marked > 0.0:
         figures['proposed'] = {'detector.threshold': 'bit'}
@@ -156,8 +174,8 @@ def examine(e: Evidence, p: Detector) -> dict[str, Any]:
         )
         figures['brightness_of_reflectors'] = float(np.median(e.spots[:, 1]))
         figures['range_of_reflectors_m'] = [float(v) for v in np.quantile(e.spots[:, 0], [0, 1])]
-        a, k, floor, margin = propose(e, p)
-        figures['margin'] = margin
+        a, k, floor, margin = propose(e)
+        figures['margin'] = margin if math.isfinite(margin) else None
         figures['proposed'] = {
             'detector.threshold': 'curve', 'detector.curve_gain': a, 'detector.curve_decay': k,
             'detector.intensity_floor': floor,
@@ -165,28 +183,30 @@ def examine(e: Evidence, p: Detector) -> dict[str, Any]:
     return figures
 
 
-def propose(e: Evidence, p: Detector) -> tuple[float, float, float, float]:
+def propose(e: Evidence) -> tuple[float, float, float, float]:
     """a, k and floor of a threshold halfway, in ratio, between reflectors and all else.
 
     Per octave of range: reflectors by the lowest tenth of their brightest beams, all else by the
-    automatic threshold over its contrast. The fourth is the smallest ratio of the two.
+    automatic threshold over its contrast. The fourth is the smallest ratio of the two, infinite
+    where all else has no intensity.
     """
-    r, others = e.beams[~e.is_spot, 0], e.levels[~e.is_spot] / p.contrast
+    r, others = e.beams[~e.is_spot, 0], e.levels[~e.is_spot]
     octave, of_spot = np.floor(np.log2(np.maximum(r, 1e-3))), np.floor(np.log2(e.spots[:, 0]))
     at, middle, ratios, alone = [], [], [], []
     for o in np.unique(octave):
         here, there = others[octave == o], e.spots[of_spot == o]
-        low = max(float(np.median(here)), 1e-9)
+        low = float(np.median(here))
         if len(there) < min(FEW, len(e.spots)):
             alone.append((float(np.median(r[octave == o])), low))
             continue
         high = float(np.quantile(there[:, 1], 0.1))
         at.append(float(np.median(there[:, 0])))
-        middle.append(math.sqrt(low * high))
-        ratios.append(high / low)
-    if ratios:  # where there is no reflector, as far above the rest as elsewhere
+        middle.append(math.sqrt(low * high) if low > 0.0 else 0.5 * high)
+        ratios.append(high / low if low > 0.0 else math.inf)
+    least = min(ratios, default=math.nan)
+    if math.isfinite(least):  # where there is no reflector, as far above the rest as elsewhere
         at += [x for x, _ in alone]
-        middle += [low * math.sqrt(min(ratios)) for _, low in alone]
+        middle += [low * math.sqrt(least) for _, low in alone]
     if not at:
         at = [float(np.median(e.spots[:, 0]))]
         middle = [0.5 * float(np.quantile(e.spots[:, 1], 0.1))]
@@ -236,6 +256,8 @@ def words(f: dict[str, Any]) -> list[str]:
             f'{f["reflectors_mean"]:.1f} reflectors are seen per scan ({f["reflectors_min"]} to '
             f'{f["reflectors_max"]}).'
         )
+    if f['found_by']:
+        out.append(f'They are {f["found_by"]}.')
     if 'width_median_m' in f:
         near, far = f['range_of_reflectors_m']
         width = f['width_median_m']
@@ -244,7 +266,9 @@ def words(f: dict[str, Any]) -> list[str]:
             f'They stand {near:.1f} to {far:.1f} m away{look}; set detector.diameter or '
             'detector.flat_width to what they measure.'
         )
-        if f['margin'] < 2.0:
+        if f['margin'] is None:
+            out.append('All else has no intensity.')
+        elif f['margin'] < 2.0:
             out.append(
                 f'They are only {f["margin"]:.1f} times as bright as the rest: expect mistakes.'
             )

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from rlml_slam.cli.doctor_evidence import KEPT, Evidence
+from rlml_slam.cli.support.doctor_evidence import KEPT, Evidence
 from rlml_slam.report.pictures import FAINT, INK, REFLECTOR, SOFT, png
 
 

@@ -56,8 +56,9 @@ def source(
         stamps = recorder.frames.stamps
         return 1e-9 * (stamps[-1] - stamps[0]) / duration if stamps else 0.0
 
-    # nodes listen to the topics that replay takes
+    # nodes listen to the topics that replay takes, and to its frames
     system: dict[str, Any] = {STREAMS[s][0]: topic for s, topic in inputs.topics.items()}
+    system |= {f: getattr(inputs.params.node, f) for f in ('odom_frame', 'base_frame')}
     sensor = next(s for s in PLACED if s in inputs.topics)
     system |= sensor_place(bag, inputs, inputs.topics[sensor])
     return Source(

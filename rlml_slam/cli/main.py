@@ -82,6 +82,9 @@ COMMANDS: Table = {
             ),
         },
     ),
+    'compare': Command(
+        'rlml_slam.cli.compare', 'from a bag of both, how far two localizations were apart'
+    ),
     'closures': Command(
         'rlml_slam.cli.closures', 'loop closures of a replay or of a running back end; revoke one'
     ),

@@ -21,9 +21,11 @@ from rlml_slam.ros.bags.bag import BagWriter
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_bag
 from rlml_slam.ros.systems.simulator_messages import TOPICS, TRUE_REFLECTORS, SimulatedMessages
+from rlml_slam.ros.tf import TF_MESSAGE
 from rlml_slam.simulation.robot import SECOND
 from rlml_slam.simulation.simulation import START, Simulation
 from rlml_slam.simulation.world_file import load_world, world_names
+from rlml_slam.types import Odometry
 
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
@@ -50,6 +52,11 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         metavar='NAME=VALUE',
         help='one parameter, such as laser.beams=360 or markers.ids=true; may be repeated',
     )
+    parser.add_argument(
+        '--tf-only', action='store_true',
+        help='as most robots record: of the sensors only the scans, odometry as odom to base_link '
+        'on /tf, no reflectors',
+    )  # fmt: skip
     parser.add_argument('--json', action='store_true', help='print the summary as JSON')
     parser.set_defaults(run=run)
     return parser
@@ -84,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
     """Write the bag and say what is in it."""
     parameters = parameters_of(args)
     simulation = Simulation(load_world(parameters.node.world), parameters)
-    counts = write_bag(simulation, args.bag, args.format)
+    counts = write_bag(simulation, args.bag, args.format, args.tf_only)
     size = sum(f.stat().st_size for f in args.bag.iterdir())
     summary = {
         'bag': str(args.bag),
@@ -102,22 +109,34 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def write_bag(simulation: Simulation, path: Path, storage: Any = 'mcap') -> dict[str, int]:
-    """Write the whole drive; the number of messages of each topic."""
+def write_bag(
+    simulation: Simulation, path: Path, storage: Any = 'mcap', tf_only: bool = False
+) -> dict[str, int]:
+    """Write the whole drive; the number of messages of each topic.
+
+    With ``tf_only`` odometry is on /tf, and there are neither IMU nor detections.
+    """
     convert = SimulatedMessages(make_bag, simulation.parameters)
-    counts: Counter[str] = Counter(dict.fromkeys(TOPICS, 0))
+    topics = {topic: kind for topic, (kind, _) in TOPICS.items()}
+    if tf_only:
+        topics = {t: topics[t] for t in ('scan', 'ground_truth')} | {'tf': TF_MESSAGE}
+    counts: Counter[str] = Counter(dict.fromkeys(topics, 0))
     with BagWriter(path, storage) as bag:
-        bag.add_topic('/tf_static', 'tf2_msgs/msg/TFMessage', latched=True)
+        bag.add_topic('/tf_static', TF_MESSAGE, latched=True)
         bag.add_topic(f'/{TRUE_REFLECTORS}', 'sensor_msgs/msg/PointCloud2', latched=True)
-        for topic, (msgtype, _) in TOPICS.items():
-            bag.add_topic(f'/{topic}', msgtype)
+        for topic, kind in topics.items():
+            bag.add_topic(f'/{topic}', kind)
         static = encode.tf_message(make_bag, [convert.laser_transform()])
         bag.write('/tf_static', static, START)
         bag.write(f'/{TRUE_REFLECTORS}', convert.true_reflectors(simulation), START)
         for event in with_progress(simulation):
-            topic, message = convert(event.message)
-            bag.write(f'/{topic}', message, event.time)
-            counts[topic] += 1
+            if tf_only and isinstance(event.message, Odometry):
+                topic, message = 'tf', convert.odom_transform(event.message)
+            else:
+                topic, message = convert(event.message)
+            if topic in topics:
+                bag.write(f'/{topic}', message, event.time)
+                counts[topic] += 1
     return dict(counts)
 
 

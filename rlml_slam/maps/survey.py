@@ -3,17 +3,17 @@
 
 By the suffix of the file's name:
 
-    .csv    a header with ``x`` and ``y`` [m], and if need be ``id`` and ``diameter`` [m]; as
-            ``x_m`` and so on, the reflectors of a map have them
+    .csv    columns ``x`` and ``y`` [m], and if need be ``id`` and ``diameter`` [m], between
+            commas, semicolons, tabs or blanks, by the names of COLUMNS or without a header
     .json   a list of objects with the same names
     .imk    layout of a SICK NAV scanner: ``globID x y type subtype size layer…`` [mm] per line
 """
 
 from __future__ import annotations
 
-import csv
 import json
 import math
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,6 +27,13 @@ from rlml_slam.types import ANONYMOUS
 
 MM = 1e-3
 FARTHEST = 1e7  # [m]
+# what a survey's column may be called, in small letters and without the unit [m]
+COLUMNS = {
+    'id': ('id', 'nr', 'no', 'number', 'global_id', 'globalid'),
+    'x': ('x', 'east', 'easting', 'e', 'pos_x', 'x_map', 'position_x'),
+    'y': ('y', 'north', 'northing', 'n', 'pos_y', 'y_map', 'position_y'),
+    'diameter': ('diameter', 'd', 'size', 'width'),
+}
 IMK_FIELDS = 6  # before the layers
 
 
@@ -60,7 +67,7 @@ def load(path: str | Path) -> Survey:
     try:
         for where, row in reader(text):
             rows.append(_checked(where, row))
-    except (ValueError, TypeError, KeyError, RecursionError, csv.Error) as e:
+    except (ValueError, TypeError, KeyError, RecursionError) as e:
         raise FileFormatError(f'{path}: {e}') from e
     if not rows:
         raise FileFormatError(f'{path}: no reflector in it')
@@ -90,8 +97,55 @@ def _checked(where: str, row: Mapping[str, Any]) -> tuple[float, float, float, f
 
 
 def _csv(text: str) -> Iterable[tuple[str, Mapping[str, Any]]]:
-    for number, row in enumerate(csv.DictReader(text.splitlines()), 2):
-        yield f'line {number}', {str(name).removesuffix('_m'): row[name] for name in row}
+    lines = [
+        (number, line.strip().lstrip('\ufeff'))
+        for number, line in enumerate(text.splitlines(), 1)
+        if line.strip() and not line.lstrip().startswith('#')
+    ]
+    if not lines:
+        return
+    separator = next((s for s in (';', '\t', ',') if s in lines[0][1]), None)
+    rows = [
+        (number, [word.strip().strip('"') for word in line.split(separator)])
+        for number, line in lines
+    ]
+    if separator in (';', '\t'):  # then the comma may be that of decimals
+        rows = [(number, [word.replace(',', '.') for word in words]) for number, words in rows]
+    names = [_column(word) for word in rows[0][1]]
+    if _is_number(rows[0][1][-1]):
+        names = _unnamed([words for _, words in rows])
+    elif not {'x', 'y'} <= set(names):
+        read = ', '.join(rows.pop(0)[1])
+        raise ValueError(f'no columns of x and y; the header has {read}')
+    else:
+        rows = rows[1:]
+    for number, words in rows:
+        yield f'line {number}', dict(zip(names, words, strict=False))
+
+
+def _unnamed(rows: list[list[str]]) -> list[str]:
+    """What the columns of a file without a header are: x y, id x y, or a name x y; maybe more."""
+    first = [words[0] for words in rows]
+    if len(rows[0]) < 3:
+        return ['x', 'y']
+    if all(word.lstrip('-').isdecimal() for word in first) and len(set(first)) == len(first):
+        return ['id', 'x', 'y', 'diameter']
+    return ['x', 'y'] if _is_number(first[0]) else ['name', 'x', 'y', 'diameter']
+
+
+def _column(name: str) -> str:
+    """What a column is, by its name, with its unit or without; the name itself otherwise."""
+    plain = re.sub(r'[\s_\-]*[\[(]?\bm(eter|etre)?s?\b[\])]?$|_m$', '', name.strip().lower())
+    plain = plain.strip(' _-')
+    return next((column for column, names in COLUMNS.items() if plain in names), plain)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _json(text: str) -> Iterable[tuple[str, Mapping[str, Any]]]:

@@ -51,7 +51,7 @@ class BackEndNode(Node):
         self.map_services = MapServices(self, self.params, self.mapper, self.requests)
         if command is None:
             self._subscribe()
-        timer = self._every(n.transform_publish_period, self.mapper.send_transform)
+        timer = self._every(n.transform_publish_period or 0.1, self.mapper.send_transform)
         checks['transform_publish_period'] = pace(timer)
         self._every(SETTLE_PERIOD, self.mapper.settle)
 

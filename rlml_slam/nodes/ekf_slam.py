@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
 from rlml_slam.ekf.estimator import Estimator
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import EkfParameters
+from rlml_slam.ros.back_end.map_transform import MapTransform
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.declare import declare
 from rlml_slam.ros.diagnostics import HealthPublisher
@@ -20,12 +23,10 @@ from rlml_slam.ros.front_end.frame_publisher import FramePublisher
 from rlml_slam.ros.kernels import prepare
 from rlml_slam.ros.map_publisher import TOPICS, MapPublisher
 from rlml_slam.ros.message_guard import Listener
-from rlml_slam.ros.odom_frame import OdomFrame
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensor_input import STREAMS
 from rlml_slam.ros.sensors import RELIABLE, Sensors
 from rlml_slam.ros.systems.ekf_services import EkfServices
-from rlml_slam.ros.tf import TransformPublisher
 from rlml_slam.se2 import Array
 from rlml_slam.slam.conversation import ANY, SessionFrame
 from rlml_slam.types import Observation
@@ -43,8 +44,10 @@ class EkfSlamNode(Node):
         prepare(self)
         self.answers = FramePublisher(self, n)
         self.products = MapPublisher(self, n, TOPICS)
-        self.tf = TransformPublisher(self)
-        self.odom = OdomFrame()  # in the map, which is the filter's local frame
+        self.tf = MapTransform(self, n)
+        if n.transform_publish_period > 0.0:
+            steady = Clock(clock_type=ClockType.STEADY_TIME)
+            self.create_timer(n.transform_publish_period, self.tf.repeat, clock=steady)
         self.sensors = Sensors(self, self.params, STREAMS, self.process, self.restart)
         self.health = HealthPublisher(self, self.sensors)
         Listener(self, PoseWithCovarianceStamped, 'initialpose', self.start_at, RELIABLE)
@@ -52,12 +55,10 @@ class EkfSlamNode(Node):
 
     def process(self, observation: Observation) -> None:
         """One observation: estimate, publish, and map to odom."""
-        frame, n = self.estimator.process(observation), self.params.node
+        frame = self.estimator.process(observation)
         self.answers.publish(SessionFrame(ANY, frame))
         self.health.update(frame)
-        self.odom.follow(frame)
-        if self.odom.newest is not None:
-            self.tf.publish(frame.stamp, (n.map_frame, n.odom_frame), self.odom.newest[1])
+        self.tf.follow(frame)
         if self.products.is_due(frame.stamp):
             self.products.publish(self.estimator, None, frame.stamp)
 
@@ -79,7 +80,7 @@ class EkfSlamNode(Node):
         if saved is not None:
             self.estimator.use_map(saved.reflectors)
         self.answers.begin_session()
-        self.odom.restart()
+        self.tf.restart()
         self.products.restart()
 
 

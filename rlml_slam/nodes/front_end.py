@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from rclpy.node import Node
@@ -63,6 +64,7 @@ class FrontEndNode(Node):
 
     def publish(self, record: SessionFrame) -> None:
         """Give a frame to all who wait for it."""
+        record = replace(record, frame=self.answers.with_odometry(record.frame))
         self.answers.publish(record)
         if self.take is not None:
             self.take(record)

@@ -31,7 +31,7 @@ class ReflectorDetectorNode(Node):
     def __init__(self, **options: Any) -> None:
         super().__init__('reflector_detector', **options)
         self.params: DetectorParameters = declare(self, DetectorParameters)
-        n = replace(self.params.node, use_scan=True)
+        n = replace(self.params.node, use_scan=True, detect_reflectors='off')
         self._publisher = self.create_publisher(
             rclpy_class('sensor_msgs/msg/PointCloud2'), n.reflectors_topic, SENSOR
         )

@@ -25,6 +25,15 @@ class Node(Group, prefix=''):
         ('',), 'LaserScan topics of several lidars; replaces scan_topic'
     )
     odom_topic: str = param('odom', 'Odometry topic')
+    odom_source: str = param(
+        'auto',
+        'where odometry is read: the transform odom_frame to base_frame on /tf, odom_topic, or '
+        'the first of the two that is there',
+        choices=('auto', 'tf', 'topic'),
+    )
+    provide_odom_frame: bool = param(
+        False, 'without odometry: publish odom_frame to base_frame on /tf, from the scans'
+    )
     imu_topic: str = param('imu', 'Imu topic')
     reflectors_topic: str = param('reflectors', 'PointCloud2 topic of reflector detections')
     reflector_poses_topic: str = param(
@@ -55,6 +64,12 @@ class Node(Group, prefix=''):
     )
     use_scan: bool = param(True, 'match scans against the submap')
     use_reflectors: bool = param(True, 'use reflector detections')
+    detect_reflectors: str = param(
+        'auto',
+        'detect reflectors in the intensities of the scans: where no topic brings them and '
+        'something is far brighter than all that is diffuse; always, by detector.*; never',
+        choices=('auto', 'on', 'off'),
+    )
     mode: str = param(
         'mapping', 'build a map, or localize in a saved one', choices=('mapping', 'localization')
     )
@@ -98,15 +113,30 @@ class Node(Group, prefix=''):
     laser_upside_down: bool = param(
         False, 'the laser is mounted upside down at laser_pose, if /tf_static does not have it'
     )
+    tf_broadcast: bool = param(True, 'publish map_frame to odom_frame on /tf; as AMCL')
     transform_publish_period: float = param(
         0.02,
-        'shortest time between two transforms map to odom on /tf',
+        'period at which map_frame to odom_frame is repeated on /tf; 0: it is never published, as '
+        'with slam_toolbox',
         's',
-        0.001,
+        0.0,
         10.0,
         live=True,
     )
-    transform_timeout: float = param(
+    transform_tolerance: float = param(
+        0.5,
+        'time by which map_frame to odom_frame is dated ahead on /tf, as AMCL does; 0: it has the '
+        'stamp of its scan',
+        's',
+        0.0,
+        10.0,
+    )
+    shadow: bool = param(
+        False,
+        'run beside another localization: nothing on /tf, and every topic that others may have is '
+        'below shadow/',
+    )
+    odom_timeout: float = param(
         0.2, 'longest time that a scan waits for the odometry at its stamp', 's', 0.0, 10.0
     )
     map_update_interval: float = param(

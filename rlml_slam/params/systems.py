@@ -23,6 +23,7 @@ class Parameters:
     node: Node = field(default=Node())
     motion: MotionNoise = field(default=MotionNoise())
     reflector: Reflector = field(default=Reflector())
+    detector: Detector = field(default=Detector())
     submap: Submap = field(default=Submap())
     scan_match: ScanMatch = field(default=ScanMatch())
     health: HealthLimits = field(default=HealthLimits())

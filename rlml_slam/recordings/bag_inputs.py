@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,14 +15,15 @@ from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.errors import BagError, InputError
 from rlml_slam.evaluation.run_record import Truth
 from rlml_slam.params import Parameters
-from rlml_slam.ros.bags.bag import BagReader, choose_topics
+from rlml_slam.recordings.products import sources
+from rlml_slam.ros.bags.bag import TRUTH, BagReader, choose_topics
 from rlml_slam.ros.codecs import decode
-from rlml_slam.ros.sensor_input import topics_of
+from rlml_slam.ros.sensor_input import TF, topics_of
 from rlml_slam.ros.systems.simulator_messages import TRUE_REFLECTORS
 from rlml_slam.ros.tf import Extrinsics
+from rlml_slam.ros.tf_odometry import TfOdometry
 from rlml_slam.se2 import Array
 
-TRUTH = 'ground_truth'
 _TF_SAMPLE = 500  # messages of /tf that are searched for a sensor that /tf_static does not place
 
 
@@ -29,22 +31,52 @@ class BagInputs:
     """Iterate for (log time [ns], stream of ros/sensor_input.py, message) in log order.
 
     ``topics`` by stream, as ``params`` ask for them, and ``more_scans`` those of further lidars;
-    ``extrinsics`` knows the static transforms of the whole bag.
+    ``tf`` is the topic of transforms, '' without one; ``extrinsics`` knows the static transforms
+    of the whole bag. ``params`` have the frames that the bag has, where it has others.
     """
 
     def __init__(self, bag: BagReader, params: Parameters) -> None:
         self._bag = bag
-        self.params = params
-        self.topics = choose_topics(bag.topics, params.node)
-        self.more_scans = [self._scans(t) for t in topics_of(params.node, 'scan')[1:]]
+        self.tf = self._transforms('tf')
         self.extrinsics = Extrinsics()
-        self._read_tf()
+        self._read_tf(_TF_SAMPLE)
+        self.params = with_frames_of(self.extrinsics, params)
+        n = self.params.node
+        self.has_odometry_on_tf = bool(self._odometry().path)
+        if self.tf and not self.has_odometry_on_tf:  # it may begin late
+            self._read_tf(None)
+            self.params = with_frames_of(self.extrinsics, params)
+            n, self.has_odometry_on_tf = self.params.node, bool(self._odometry().path)
+        self.has_odometry_on_tf &= n.use_odom and n.odom_source != 'topic'
+        without = ('imu', 'odom') if self.has_odometry_on_tf else ('imu',)
+        self.topics = choose_topics(bag.topics, n, without)
+        self.more_scans = [self._scans(t) for t in topics_of(n, 'scan')[1:]]
 
     def __iter__(self) -> Iterator[tuple[int, str, Any]]:
         stream_of = {topic: stream for stream, topic in self.topics.items()}
         stream_of |= dict.fromkeys(self.more_scans, 'scan')
+        if self.has_odometry_on_tf:
+            stream_of[self.tf] = TF
         for time, topic, message in self._bag.messages(stream_of):
             yield time, stream_of[topic], message
+
+    def sources(self) -> dict[str, str]:
+        """Where each counted stream comes from, in words."""
+        n, out = self.params.node, sources(self.topics, self.more_scans)
+        if self.has_odometry_on_tf:
+            other = f'; compared with {out["odom"]}' if 'odom' in out else ''
+            out['odom'] = f'{self.tf}, {n.odom_frame} to {n.base_frame}{other}'
+        return out
+
+    def _transforms(self, name: str) -> str:
+        """The topic of transforms of that name, or the only one in a namespace; '' if none."""
+        fitting = [
+            t.name for t in self._bag.topics.values()
+            if t.name.rsplit('/')[-1] == name and t.msgtype.lower().endswith('tfmessage')
+        ]  # fmt: skip
+        if f'/{name}' in fitting:
+            return f'/{name}'
+        return fitting[0] if len(fitting) == 1 else ''
 
     def _scans(self, name: str) -> str:
         topic = _named(self._bag, name.strip('/'))
@@ -62,11 +94,20 @@ class BagInputs:
         except BagError:
             return  # reading the inputs meets the damage again and reports it
 
-    def _read_tf(self) -> None:
+    def _odometry(self) -> TfOdometry:
+        n = self.params.node
+        frames = (n.odom_frame, n.base_frame, n.map_frame)
+        return TfOdometry(self.extrinsics, *map(decode.frame, frames))
+
+    def _read_tf(self, most: int | None) -> None:
         """Static transforms wherever they are in the bag, and those that /tf begins with."""
-        for topic, most in (('/tf', _TF_SAMPLE), ('/tf_static', None)):
-            for message in self._all(topic, most):
+        known: set[str] = set()
+        for topic, count in ((self.tf, most), (self._transforms('tf_static'), None)):
+            for message in self._all(topic, count):
                 for transform in message.transforms:  # each by itself, as live
+                    if topic == self.tf and transform.child_frame_id in known:
+                        continue
+                    known.add(transform.child_frame_id)
                     with contextlib.suppress(InputError):
                         self.extrinsics.add(decode.transforms(transform, topic))
 
@@ -105,3 +146,31 @@ def _true_pose(message: Any) -> Array:
     if not hasattr(message, 'pose'):
         raise InputError(f'{TRUTH}: a message of this type has no pose')
     return decode.planar_pose(getattr(message.pose, 'pose', message.pose), f'{TRUTH}: pose')
+
+
+def with_frames_of(tree: Extrinsics, params: Parameters) -> Parameters:
+    """The parameters with the frames of the base and of odometry that a recording has.
+
+    Where a name is not in its transforms, the only frame of that name in a namespace is taken;
+    for the base also the only one that sits in odom, for odom the only one above the base that
+    has the word in its name.
+    """
+    n = params.node
+    known = {*tree.frames(), *filter(None, map(tree.parent, tree.frames()))}
+    odom = _found(known, decode.frame(n.odom_frame))
+    below = [f for f in tree.frames() if odom and tree.parent(f) == odom]
+    base = _found(known, decode.frame(n.base_frame)) or (below[0] if len(below) == 1 else '')
+    above = [f for f in known if 'odom' in f.lower() and base and tree.path(f, base)]
+    odom = odom or (above[0] if len(above) == 1 else '')
+    return replace(
+        params,
+        node=replace(n, odom_frame=odom or n.odom_frame, base_frame=base or n.base_frame),
+    )
+
+
+def _found(known: Collection[str], name: str) -> str:
+    """The frame of that name, or the only one in a namespace; '' if there is none."""
+    if name in known:
+        return name
+    fitting = [f for f in known if f.endswith(f'/{name}')]
+    return fitting[0] if len(fitting) == 1 else ''

@@ -18,7 +18,7 @@ from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.maps.survey import Survey
 from rlml_slam.params import EkfParameters, Parameters
 from rlml_slam.recordings.bag_inputs import BagInputs
-from rlml_slam.recordings.products import collect, fates, sources, survey_figures
+from rlml_slam.recordings.products import collect, fates, survey_figures
 from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.slam.offline.slam import Slam
@@ -52,8 +52,8 @@ def replay(
     """
     warm_up.compile_loaded()
     with BagReader(path) as bag:
-        params = patient(params)
-        inputs = BagInputs(bag, params)
+        inputs = BagInputs(bag, patient(params))
+        params = inputs.params
         slam = SYSTEMS[system][1](params)
         if known is not None:
             if not isinstance(slam, Slam):
@@ -90,7 +90,11 @@ def replay(
             result.stored = map_file.content_of(slam.back_end, params, result.grid)
             result.extra = survey_figures(slam.back_end)
         result.inputs = fates(slam.counts, bag.skipped, inputs.topics)
-        result.topics = sources(inputs.topics, inputs.more_scans)
+        result.topics = inputs.sources()
+        detected = str(slam.synchronizer.reflectors)
+        if detected and 'reflectors' not in result.topics:
+            result.topics['reflectors'] = f'intensities of the scans: {detected}'
+            result.inputs['reflectors'] = {'used': slam.synchronizer.reflectors.num_scans}
     result.wall_s = wall
     ended = f'{problem}; the results hold what came before' if problem else ''
     result.problem = '; '.join(filter(None, (ended, result.problem)))
@@ -100,8 +104,8 @@ def replay(
 def patient(params: Parameters) -> Parameters:
     """Nobody waits for the pose: a pause of the odometry that can be bridged is waited for."""
     n = params.node
-    longest = max(n.transform_timeout, params.motion.max_gap)
-    return replace(params, node=replace(n, transform_timeout=longest))
+    longest = max(n.odom_timeout, params.motion.max_gap)
+    return replace(params, node=replace(n, odom_timeout=longest))
 
 
 def _drive(
@@ -114,7 +118,7 @@ def _drive(
 ) -> None:
     """Feed all inputs, the same way as the live nodes do."""
     feed = SensorInput(params, slam, slam.synchronizer.inputs)
-    feed.extrinsics = inputs.extrinsics
+    feed.use_extrinsics(inputs.extrinsics)
     began, (start, end) = time.perf_counter(), span
     for k, (log_time, stream, message) in enumerate(inputs):
         log.add(feed.add(stream, message))

@@ -31,6 +31,7 @@ from rlml_slam.params import (
     declarations,
     from_mapping,
 )
+from rlml_slam.ros.shadow import enter_shadow
 
 Check = Callable[[Any], object]
 
@@ -44,7 +45,8 @@ def declare(
     new value before it is taken, and raises RlmlError against it.
 
     Raises ParameterError for a value that its field refuses. A name that no node of this package
-    knows is warned about: one YAML file may serve them all.
+    knows is warned about: one YAML file may serve them all. With the parameter ``shadow``, the
+    node enters shadow mode.
     """
     given = {name: p.value for name, p in node._parameter_overrides.items()}
     known = {d.name: d for d in declarations(of)}
@@ -63,6 +65,7 @@ def declare(
             node.get_logger(), parameters, known, given, {} if checks is None else checks
         )
     )
+    enter_shadow(node, getattr(parameters.node, 'shadow', False))
     return parameters
 
 
@@ -95,7 +98,7 @@ def _change(
 
 def pace(timer: Any) -> Check:
     """What gives a timer another period [s]."""
-    return lambda seconds: setattr(timer, 'timer_period_ns', int(seconds * 1e9))
+    return lambda seconds: setattr(timer, 'timer_period_ns', int((seconds or 0.1) * 1e9))
 
 
 def _ros_value(value: Any) -> Any:

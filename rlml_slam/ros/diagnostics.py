@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""/diagnostics once a second: health with its reasons, and what became of the inputs."""
+"""Health with its reasons with every frame; once a second also what became of the inputs."""
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
@@ -13,14 +14,19 @@ from rclpy.clock_type import ClockType
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
 from rlml_slam.ros.message_guard import guard_of
-from rlml_slam.ros.sensors import Sensors
+from rlml_slam.ros.sensors import LATCHED, Sensors, input_figures
 from rlml_slam.types import Frame, Health, Level, Status
 
 PERIOD = 1.0  # [s] of a clock that goes on without any input
+WATCH = 0.1  # [s] between two looks whether the input has fallen silent
 
 
 class HealthPublisher:
-    """Publishes the health of the newest frame; without new frames, that they are missing."""
+    """Publishes the health of the newest frame; without new frames, that they are missing.
+
+    It is on ~/health with every frame and at once when it changes, and on /diagnostics with all
+    figures every PERIOD.
+    """
 
     def __init__(
         self,
@@ -41,8 +47,17 @@ class HealthPublisher:
         self._publisher = node.create_publisher(
             rclpy_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', 10
         )
+        self._health = node.create_publisher(
+            rclpy_class('diagnostic_msgs/msg/DiagnosticStatus'), '~/health', LATCHED
+        )
+        self._heard = time.monotonic()
+        self._is_silent = False
+        self._found: tuple[str, ...] = ()
         # steady: with simulated time, silence of /clock must be reported as well
-        node.create_timer(PERIOD, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_timer(PERIOD, self.publish, clock=steady)
+        node.create_timer(WATCH, self.watch, clock=steady)
+        self._publish_health()
 
     @property
     def newest(self) -> int:
@@ -54,19 +69,28 @@ class HealthPublisher:
         self._frame = frame
         self._frames += 1
         self._statuses.update(frame.statuses.tolist())
+        self._heard, self._is_silent = time.monotonic(), False
+        self._publish_health()
 
-    def _inputs(self) -> dict[str, object]:
-        if self._sensors is None:
-            return {}
-        inputs = self._sensors.synchronizer.inputs
-        figures: dict[str, object] = {
-            f'{stream} {what}': n
-            for stream, counts in inputs.totals().items()
-            for what, n in counts.items()
-        }
-        if inputs.last_error:
-            figures['last refused input'] = inputs.last_error
-        return figures
+    def watch(self) -> None:
+        """Say at once that the input has fallen silent."""
+        if not self._is_silent and time.monotonic() - self._heard > PERIOD:
+            self._is_silent = True
+            self._publish_health()
+
+    def health(self) -> Health:
+        """The health as it is now."""
+        if self._frame is None:
+            return with_problems(Health(Level.DEGRADED, ('no input yet',)), self._found)
+        # who is lost stays lost in silence
+        silence = ('no new scan or reflectors',) if self._is_silent else ()
+        return with_problems(with_problems(self._frame.health, silence), self._found)
+
+    def _publish_health(self) -> None:
+        stamp = {'stamp': f'{self.newest // 10**9}.{self.newest % 10**9:09d}'}
+        self._health.publish(
+            encode.diagnostic_status(make_rclpy, self._name, self.health(), stamp)
+        )
 
     def summary(self) -> str:
         """What there was, in a line for the end of a run."""
@@ -77,23 +101,27 @@ class HealthPublisher:
     def publish(self) -> None:
         """Send the status."""
         figures: dict[str, object] = {
-            'frames': self._frames, **self._inputs(), **self._guard.figures(),
+            'frames': self._frames,
+            **({} if self._sensors is None else input_figures(self._sensors.synchronizer)),
+            **self._guard.figures(),
         }  # fmt: skip
         if self._statuses:
             figures |= {f'detections {s.name.lower()}': self._statuses[s] for s in Status}
-        health, stamp = Health(Level.DEGRADED, ('no input yet',)), 0
         if self._frame is not None:
-            health, stamp = self._frame.health, self._frame.stamp
             figures['wall time of the last frame [ms]'] = f'{self._frame.wall_ms:.2f}'
-            if self._frames == self._reported:
-                level = max(health.level, Level.DEGRADED)  # who is lost stays lost in silence
-                health = Health(level, (*health.reasons, 'no new scan or reflectors'))
+            self._is_silent = self._is_silent or self._frames == self._reported
         self._reported = self._frames
-        problems = self._problems()
-        if problems:
-            level = max(health.level, Level.DEGRADED)
-            health = Health(level, (*health.reasons, *problems))
+        self._found = self._problems()
+        health = self.health()
         message = encode.diagnostics(
-            make_rclpy, stamp, self._name, health, {**figures, **self._figures()}
+            make_rclpy, self.newest, self._name, health, {**figures, **self._figures()}
         )
         self._publisher.publish(message)
+        self._publish_health()
+
+
+def with_problems(health: Health, problems: tuple[str, ...]) -> Health:
+    """The health, DEGRADED at least where there are problems."""
+    if not problems:
+        return health
+    return Health(max(health.level, Level.DEGRADED), (*health.reasons, *problems))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pose of the odometry frame in the local frame, for /tf."""
+"""Pose of the odometry frame in the map, for /tf."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from rlml_slam.types import Frame
 
 
 class OdomFrame:
-    """Follows the frames; ``newest`` is the stamp [ns] of the last one and T_local_odom (3,).
+    """Follows the frames; ``newest`` is the stamp [ns] of the last one and T_map_odom (3,).
 
-    It is None before the first frame with odometry.
+    It is None before the first frame with odometry. With the odometry of the frame, which is that
+    on /tf where it is there, it gives the pose in the map that the front end published.
     """
 
     def __init__(self) -> None:
@@ -37,5 +38,5 @@ class OdomFrame:
         else:  # without any odometry, odom is the local frame
             T_odom_base = frame.T_local_base
         self.T_odom_base = T_odom_base
-        T_local_odom = se2.compose(frame.T_local_base, se2.inverse(T_odom_base))
-        self.newest = (frame.stamp, T_local_odom)
+        T_map_odom = se2.compose(frame.T_map_base, se2.inverse(T_odom_base))
+        self.newest = (frame.stamp, T_map_odom)

@@ -6,12 +6,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Generic, Protocol, TypeVar
 
+from rlml_slam import se2
 from rlml_slam.errors import InputError
 from rlml_slam.params import Node, Parameters
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.codecs.decode import frame
 from rlml_slam.ros.codecs.device_reflectors import as_poses, is_device
 from rlml_slam.ros.tf import Extrinsics
+from rlml_slam.ros.tf_odometry import TfOdometry
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.mirror import mirrored_detections, mirrored_scan
 from rlml_slam.sensing.synchronization.input_counts import InputCounts
@@ -38,6 +40,7 @@ USED_BY = {
     'scan': 'use_scan', 'odom': 'use_odom', 'imu': 'use_imu',
     **dict.fromkeys(DETECTIONS, 'use_reflectors'),
 }  # fmt: skip
+TF = 'tf'  # the stream of /tf, which every node and every bag has besides
 PLACED = ('scan', *DETECTIONS)  # streams whose sensor has to have a place
 
 
@@ -61,6 +64,9 @@ class Target(Protocol[Out]):
     def add_odometry(self, sample: Odometry) -> list[Out]:
         """One wheel odometry sample."""
 
+    def add_transform(self, sample: Odometry) -> list[Out]:
+        """The pose of base in odom as it is on /tf."""
+
     def add_imu(self, sample: Imu) -> list[Out]:
         """One IMU sample."""
 
@@ -74,20 +80,29 @@ class Target(Protocol[Out]):
 class SensorInput(Generic[Out]):
     """Converts the messages of the streams (keys of STREAMS) and hands them to a target.
 
-    ``extrinsics`` is filled by the caller from /tf_static; a sensor that it does not know gets
-    the parameters ``laser_pose`` and ``laser_upside_down``. A message that cannot be believed is
-    counted in ``inputs``; only a clock that jumped back raises InputError.
+    ``extrinsics`` is filled by the caller from /tf_static, and here from /tf; a sensor that it
+    does not know gets the parameters ``laser_pose`` and ``laser_upside_down``. A message that
+    cannot be believed is counted in ``inputs``; only a clock that jumped back raises InputError.
     """
 
     def __init__(self, params: Parameters, target: Target[Out], inputs: InputCounts) -> None:
         self._p = params
         self._target = target
         self._inputs = inputs
-        self.extrinsics = Extrinsics()
+        self.use_extrinsics(Extrinsics())
         self._placed = {params.node.base_frame}
+        self.odom_frames = ('', '')  # of the topic's newest message
+
+    def use_extrinsics(self, tree: Extrinsics) -> None:
+        """Take over the transforms that are known."""
+        n = self._p.node
+        self.extrinsics = tree
+        self.tf = TfOdometry(tree, frame(n.odom_frame), frame(n.base_frame), frame(n.map_frame))
 
     def add(self, stream: str, msg: Any) -> list[Out]:
         """One message of a stream; what became ready by it."""
+        if stream == TF:
+            return [out for t in msg.transforms for out in self._add_transform(t)]
         try:
             if is_device(msg):
                 msg = as_poses(msg, self._p.node.max_beams)
@@ -104,6 +119,15 @@ class SensorInput(Generic[Out]):
         if isinstance(sample, Imu):
             return self._target.add_imu(sample)
         return self._target.add_odometry(sample)
+
+    def _add_transform(self, msg: Any) -> list[Out]:
+        """One transform by itself: a bad one costs none of the others of its message."""
+        try:
+            poses = self.tf.add(msg)
+        except InputError as e:
+            self._inputs.count(TF, 'invalid', str(e))
+            return []
+        return [out for pose in poses for out in self._target.add_transform(pose)]
 
     def is_placed(self, msg: Any) -> bool:
         """Whether the place of the message's sensor is known; InputError if it is not planar."""
@@ -133,10 +157,45 @@ class SensorInput(Generic[Out]):
             scan = decode.scan(msg)
             return mirrored_scan(scan) if self.hangs(scan.frame_id) else scan
         if stream == 'odom':
-            return decode.odometry(msg)
+            return self._odometry(msg)
         if stream == 'imu':
             up = self.extrinsics.up(self._p.node.base_frame, frame(msg.header.frame_id))
             return decode.imu(msg, up=up)
         read = decode.detections_of_poses if hasattr(msg, 'poses') else decode.detections
         seen = read(msg, self._p.reflector)
         return mirrored_detections(seen) if self.hangs(seen.frame_id) else seen
+
+    def _odometry(self, msg: Any) -> Odometry:
+        """The topic's pose, of base: by way of the static transforms where it has another child.
+
+        A pose in the map is no odometry, and one in the local frame is our own output.
+        """
+        n, sample = self._p.node, decode.odometry(msg)
+        parent, child = frame(msg.header.frame_id), frame(msg.child_frame_id)
+        self.odom_frames = parent, child
+        if parent in (n.map_frame, n.local_frame) and parent != n.odom_frame:
+            raise InputError(
+                f'odom: header.frame_id is {parent!r}, which is no frame of odometry: set '
+                f'odom_topic to a topic in {n.odom_frame!r}'
+            )
+        if child in ('', n.base_frame):
+            return sample
+        T_child_base = self.extrinsics.pose(child, n.base_frame)
+        if T_child_base is None:
+            return sample
+        return Odometry(sample.stamp, se2.compose(sample.pose, T_child_base))
+
+    def odometry_problems(self) -> tuple[str, ...]:
+        """What is wrong with the frames of the odometry that is used, in words."""
+        n, (parent, child) = self._p.node, self.odom_frames
+        if not n.use_odom or self.tf.path:
+            return ()
+        out = []
+        if n.odom_source == 'tf' and not n.provide_odom_frame:
+            out.append(f'/tf has no transform from {n.odom_frame} to {n.base_frame}')
+        if parent not in ('', n.odom_frame):
+            out.append(f'odometry is in the frame {parent}, odom_frame is {n.odom_frame}')
+        base = frame(n.base_frame)
+        if child not in ('', base) and self.extrinsics.pose(child, base) is None:
+            out.append(f'odometry is of {child}, and no transform leads to {base}')
+        return tuple(out)

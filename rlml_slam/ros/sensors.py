@@ -23,12 +23,13 @@ from rlml_slam.ros.message_guard import SMALL, Listener, guard_of
 from rlml_slam.ros.sensor_input import (
     PLACED,
     STREAMS,
+    TF,
     USED_BY,
     SensorInput,
     counted_as,
     topics_of,
 )
-from rlml_slam.ros.tf import Extrinsics, subscribe_static
+from rlml_slam.ros.tf import TF_MESSAGE, Extrinsics, subscribe_static
 from rlml_slam.sensing.synchronization.synchronizer import Synchronizer
 from rlml_slam.types import Detections, Observation
 from rlml_slam.version import __version__
@@ -99,7 +100,9 @@ class Sensors:
             # without scan matching, a scan still asks for a pose at its stamp
             if getattr(params.node, USED_BY[stream]) or stream == 'scan':
                 for topic in topics_of(params.node, stream):
-                    self._subscribe(node, stream, topic)
+                    self._listen(node, stream, topic, STREAMS[stream][1])
+        if self._has_tf and not params.node.provide_odom_frame:  # else it is our own
+            self._listen(node, TF, '/tf', TF_MESSAGE)
         inputs = ', '.join(f'{s} on {q.topic_name}' for s, q in self._queues)
         self._logger.info(f'rlml_slam {__version__}, {params.node.mode}: waits for {inputs}')
         self._came: set[str] = set()
@@ -107,20 +110,20 @@ class Sensors:
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(0.25 * SILENCE, self.flush_if_silent, clock=steady)
 
-    def _subscribe(self, node: Any, stream: str, topic: str) -> None:
+    def _listen(self, node: Any, stream: str, topic: str, kind: str) -> None:
         index = len(self._queues)
-        qos = MOTION if stream in ('odom', 'imu') else SENSOR
-        kind, use = rclpy_class(STREAMS[stream][1]), lambda msg: self.receive(index, msg)
-        if kind is None:
+        found, use = rclpy_class(kind), lambda msg: self.receive(index, msg)
+        if found is None:
             return  # of a package that is not installed
         self._topics[stream] += 1
-        listener = Listener(node, kind, topic, use, qos, largest(self._p.node, stream))
+        qos = MOTION if stream in ('odom', 'imu', TF) else SENSOR
+        listener = Listener(node, found, topic, use, qos, largest(self._p.node, stream))
         self._queues.append((stream, listener))
 
     def _begin(self, extrinsics: Extrinsics) -> None:
         self.synchronizer = Synchronizer(self._p)
         self._feed = SensorInput(self._p, self.synchronizer, self.synchronizer.inputs)
-        self._feed.extrinsics = extrinsics
+        self._feed.use_extrinsics(extrinsics)
 
     @property
     def extrinsics(self) -> Extrinsics:
@@ -149,7 +152,7 @@ class Sensors:
         count = 0
         ordered = (queues[k] for k in range(len(self._queues)))
         self._missing = [k for k in self._missing if not queues[k]]
-        for item in heapq.merge(*ordered, key=lambda item: _stamp(item[1])):
+        for item in heapq.merge(*ordered, key=lambda item: _stamp(item[1], self._feed.tf.path)):
             self.add(*item)
             count += 1
         return count
@@ -170,15 +173,19 @@ class Sensors:
             if stream in ('odom', 'imu') and len(found) > 1:
                 names = sorted(f'{i.node_namespace.rstrip("/")}/{i.node_name}' for i in found)
                 out.append(f'{stream} has {len(found)} publishers: {", ".join(names)}')
-        return tuple(out)
+        return (*out, *self._feed.odometry_problems())
 
     def _tell_of_missing(self) -> None:
         """Say once which scans and odometry have never come, PATIENCE after the start."""
         if self._missing and time.monotonic() - self._began > PATIENCE:
             missing = [
-                f'{self._queues[k][0]} on {self._queues[k][1].topic_name}' for k in self._missing
+                f'{self._queues[k][0]} on {self._queues[k][1].topic_name}'
+                for k in self._missing
+                if self._queues[k][0] != 'odom' or not self._feed.tf.path
             ]
-            self._logger.warning(f'waiting for {", ".join(missing)}{self._others(self._missing)}')
+            if missing:
+                others = self._others(self._missing)
+                self._logger.warning(f'waiting for {", ".join(missing)}{others}')
             self._missing = []
 
     def _others(self, missing: list[int]) -> str:
@@ -199,6 +206,10 @@ class Sensors:
             if stream not in self._told:
                 self._told.add(stream)
                 self._logger.warning(f'{stream}: not used: {error}')
+        comparison = self.synchronizer.odometry.comparison
+        if comparison.differ and TF not in self._told:
+            self._told.add(TF)
+            self._logger.warning(f'the odometry topic and /tf differ: {comparison}')
 
     def _taken(self, index: int) -> list[tuple[str, Any]]:
         """Everything in a queue, in order of arrival."""
@@ -310,5 +321,31 @@ def largest(params: Node, stream: str) -> int:
     return SMALL + most * BYTES.get(stream, 0)
 
 
-def _stamp(msg: Any) -> int:
+def input_figures(synchronizer: Synchronizer) -> dict[str, object]:
+    """Figures for /diagnostics: what became of the inputs, and where odometry comes from."""
+    inputs, odometry = synchronizer.inputs, synchronizer.odometry
+    out: dict[str, object] = {
+        f'{stream} {what}': n
+        for stream, counts in inputs.totals().items()
+        for what, n in counts.items()
+    }
+    if inputs.last_error:
+        out['last refused input'] = inputs.last_error
+    if odometry.source:
+        out['odometry is read from'] = '/tf' if odometry.source == TF else 'its topic'
+    apart = str(odometry.comparison)
+    if apart:
+        out['odometry topic against /tf'] = apart
+    detected = str(synchronizer.reflectors)
+    if detected:
+        out['reflectors in the intensities of scans'] = detected
+    return out
+
+
+def _stamp(msg: Any, path: tuple[str, ...] = ()) -> int:
+    """The stamp of a message; of one of /tf that of its odometry, 0 without any."""
+    if hasattr(msg, 'transforms'):
+        msg = next((t for t in msg.transforms if frame(t.child_frame_id) in path), None)
+        if msg is None:
+            return 0
     return int(msg.header.stamp.sec) * 1_000_000_000 + int(msg.header.stamp.nanosec)

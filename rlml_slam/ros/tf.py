@@ -32,14 +32,51 @@ class Extrinsics:
     def __init__(self) -> None:
         self._parent: dict[str, Transform] = {}
         self._found: dict[tuple[str, str], tuple[Array, Array] | None] = {}  # until it changes
+        self.version = 0  # of which frames sit in which
 
     def add(self, transforms: Iterable[Transform]) -> None:
         """Take over transforms; a later one of the same child replaces the earlier."""
         for t in transforms:
-            if t.child not in self._parent and len(self._parent) >= MAX_FRAMES:
-                raise InputError(f'/tf_static: more than {MAX_FRAMES} frames')
-            self._parent[t.child] = t
+            self.move(t)
         self._found = {}
+
+    def move(self, t: Transform) -> None:
+        """Take over a transform that may change all the time.
+
+        What was found of a frame stays as it was, unless the frame is a new one.
+        """
+        before = self._parent.get(t.child)
+        if before is None and len(self._parent) >= MAX_FRAMES:
+            raise InputError(f'/tf_static: more than {MAX_FRAMES} frames')
+        self._parent[t.child] = t
+        if before is None or before.parent != t.parent:
+            self._found = {}
+            self.version += 1
+
+    def step(self, frame: str) -> Transform | None:
+        """The transform by which a frame sits in its parent, None if it is not known."""
+        return self._parent.get(frame)
+
+    def parent(self, frame: str) -> str | None:
+        """The frame that a frame sits in, None if it is not known."""
+        t = self._parent.get(frame)
+        return None if t is None else t.parent
+
+    def frames(self) -> tuple[str, ...]:
+        """All frames that sit in another one."""
+        return tuple(self._parent)
+
+    def path(self, a: str, b: str) -> tuple[str, ...] | None:
+        """The children of the transforms that connect two frames, from ``a`` on; None if none."""
+        up_a, up_b = list(self._ancestors(a)), list(self._ancestors(b))
+        shared = next((f for f in up_b if f in up_a), None)
+        if shared is None:
+            return None
+        return (*up_a[: up_a.index(shared)], *reversed(up_b[: up_b.index(shared)]))
+
+    def between(self, a: str, b: str) -> tuple[Array, Array] | None:
+        """R (3, 3) and t (3,) of T_a_b as the transforms are now, None if nothing connects."""
+        return self._find(a, b)
 
     def pose(self, base: str, frame: str) -> Array | None:
         """Planar T_base_frame (3,), None if the tree does not connect the two.
@@ -106,17 +143,17 @@ class Extrinsics:
 
 
 class TransformPublisher:
-    """Publishes one transform on /tf, or on ``~/map_to_odom`` where there is no tf2_msgs."""
+    """Publishes one transform on /tf, or on a topic of its own where there is no tf2_msgs."""
 
-    def __init__(self, node: Any) -> None:
+    def __init__(self, node: Any, otherwise: str = '~/map_to_odom') -> None:
         self._has_tf = rclpy_class(TF_MESSAGE) is not None
         if self._has_tf:
             self._publisher = node.create_publisher(rclpy_class(TF_MESSAGE), '/tf', 100)
         else:
             kind = rclpy_class('geometry_msgs/msg/TransformStamped')
-            self._publisher = node.create_publisher(kind, '~/map_to_odom', 100)
+            self._publisher = node.create_publisher(kind, otherwise, 100)
             node.get_logger().warning(
-                f'tf2_msgs is not installed: map to odom is on {self._publisher.topic_name} '
+                f'tf2_msgs is not installed: a transform is on {self._publisher.topic_name} '
                 'instead of /tf'
             )
 

@@ -44,6 +44,26 @@ def test_reflectors_of_a_map_are_a_survey(tmp_path):
     np.testing.assert_allclose(found.diameters, diameters)
 
 
+@pytest.mark.parametrize(
+    ('text', 'ids'),
+    [
+        ('id,x_m,y_m\n7,1.5,-2.25\n9,10,4\n', [7, 9]),
+        ('X;Y\n1,5;-2,25\n10;4\n', [-1, -1]),
+        ('nr;easting;northing\n7;1.5;-2.25\n9;10;4\n', [7, 9]),
+        ('East [m],North [m],height\n1.5,-2.25,3\n10,4,3\n', [-1, -1]),
+        ('# of today\n1.5 -2.25\n10 4\n', [-1, -1]),
+        ('7,1.5,-2.25\n9,10,4\n', [7, 9]),
+        ('P7\t1.5\t-2.25\nP9\t10\t4\n', [-1, -1]),
+        ('1.5,-2.25,0.5\n10,4,0.5\n', [-1, -1]),
+    ],
+)
+def test_surveys_with_usual_columns_are_read(tmp_path, text, ids):
+    (tmp_path / 'a.csv').write_text(text)
+    found = survey.load(tmp_path / 'a.csv')
+    np.testing.assert_allclose(found.points, [[1.5, -2.25], [10.0, 4.0]])
+    np.testing.assert_array_equal(found.ids, ids)
+
+
 def test_id_and_diameter_may_be_missing(tmp_path):
     (tmp_path / 'a.csv').write_text('x,y\n1,2\n')
     found = survey.load(tmp_path / 'a.csv')
@@ -54,7 +74,7 @@ def test_id_and_diameter_may_be_missing(tmp_path):
 @pytest.mark.parametrize(
     ('name', 'text', 'why'),
     [
-        ('a.csv', 'x,z\n1,2\n', 'line 2: y is missing'),
+        ('a.csv', 'x,z\n1,2\n', 'no columns of x and y; the header has x, z'),
         ('a.csv', 'x,y\n1,nan\n', 'line 2: the place is not finite'),
         ('a.csv', 'x,y\n1,far\n', 'line 2: could not convert'),
         ('a.csv', 'x,y\n', 'no reflector'),

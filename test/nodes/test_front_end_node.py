@@ -48,7 +48,7 @@ def stamps(sent, stream):
 def node(live):
     for topic, kind in (
         ('pose', 'geometry_msgs/msg/PoseWithCovarianceStamped'),
-        ('odometry/filtered', 'nav_msgs/msg/Odometry'),
+        ('/front_end/odometry', 'nav_msgs/msg/Odometry'),
         ('reflectors/associated', 'sensor_msgs/msg/PointCloud2'),
         ('reflectors/statuses', 'visualization_msgs/msg/MarkerArray'),
         ('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray'),
@@ -72,13 +72,13 @@ def test_each_scan_gets_a_pose_with_its_own_stamp(live, node):
     assert got == want[: len(got)]
     # the last scan may still wait for odometry
     assert len(want) - 1 <= len(got) <= len(want)
-    assert [decode.stamp(m, '') for m in live.heard['odometry/filtered']] == got
+    assert [decode.stamp(m, '') for m in live.heard['/front_end/odometry']] == got
 
 
 def test_local_pose_moves_on_without_jumps_and_with_its_twist(live, node):
     feed(node, 6.0)
     live.drain()
-    local = live.heard['odometry/filtered']
+    local = live.heard['/front_end/odometry']
     assert {m.header.frame_id for m in local} == {'rlml_local'}
     assert {m.child_frame_id for m in local} == {'base_link'}
     poses = np.array([decode.planar_pose(m.pose.pose, '') for m in local])
@@ -175,7 +175,7 @@ def test_initialpose_without_stamp_is_of_now_and_of_another_frame_is_none(live, 
 def test_initialpose_of_an_earlier_frame_is_moved_on_to_now(live, node):
     feed(node, 2.0)
     live.drain()
-    then = live.heard['odometry/filtered'][-5]
+    then = live.heard['/front_end/odometry'][-5]
     moved = se2.between(decode.planar_pose(then.pose.pose, ''), node.last.T_local_base)
     assert moved[0] > 0.1
     start, stamp = np.array([5.0, 6.0, 1.0]), decode.stamp(then, '')
@@ -487,7 +487,7 @@ def test_several_lidars_answer_each_on_their_own(live):
     poses = live_frames(live)
     assert len(poses) == counts['used']
     np.testing.assert_allclose(node.last.observation.origin, [0.2, 0.0], atol=1e-9)
-    speeds = [m.twist.twist.linear.x for m in live.heard['odometry/filtered']]
+    speeds = [m.twist.twist.linear.x for m in live.heard['/front_end/odometry']]
     assert np.max(np.abs(speeds), initial=0.0) < 2.0
 
 

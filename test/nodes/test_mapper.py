@@ -34,6 +34,7 @@ from rlml_slam.types import Detections, Frame, Health, Level, Motion, Observatio
 
 SECOND = 1_000_000_000
 ODOMETRY = np.array([100.0, 50.0, 1.0])
+STILL = np.zeros(3)
 
 
 class Publisher:
@@ -50,6 +51,10 @@ class Ear:
     def __init__(self):
         self.sent = defaultdict(list)
         self.warnings = []
+        self.now = SECOND
+
+    def get_clock(self):
+        return SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=self.now))
 
     def create_publisher(self, kind, topic, depth):
         return Publisher(topic, self.sent)
@@ -86,20 +91,22 @@ def make(ear, monkeypatch, tmp_path_factory):
 
 @pytest.fixture
 def mapper(make, ear, monkeypatch):
-    mapper = make()
+    mapper = make(transform_tolerance=0.0)  # each transform once, with the stamp of its frame
     transforms = ear.sent['transforms']
-    monkeypatch.setattr(mapper._tf, 'publish', lambda *sent: transforms.append(sent))
+    monkeypatch.setattr(
+        mapper.transform._publisher, 'publish', lambda *sent: transforms.append(sent)
+    )
     mapper.transforms = transforms
     return mapper
 
 
-def add(mapper, k, pose=(0.0, 0.0, 0.0), odometry=ODOMETRY, session=1, **more):
-    """The k-th frame of a robot without sensors; its stamp."""
+def add(mapper, k, pose=(0.0, 0.0, 0.0), odometry=ODOMETRY, session=1, local=STILL, **more):
+    """The k-th frame of a robot without sensors, whose local frame is at ``local``; its stamp."""
     stamp, cov = (k + 1) * SECOND // 10, 1e-4 * np.eye(3)
     observation = Observation(stamp, Motion(np.zeros(3), 1e-6 * np.eye(3)), odom_pose=odometry)
     T = np.array(pose)
     none = np.zeros(0, dtype=np.int64)
-    frame = Frame(stamp, observation, T, cov, T, cov, none, none)
+    frame = Frame(stamp, observation, T, cov, se2.compose(local, T), cov, none, none)
     mapper.add(SessionFrame(session, frame, mode=mode_of(mapper), **more))
     return stamp
 
@@ -145,31 +152,23 @@ def test_without_any_odometry_odom_is_the_local_frame(mapper):
 
 
 def test_map_to_odom_waits_for_no_job_of_the_worker(mapper):
-    """It goes on with every frame, by the correction there is, and takes over the next one."""
+    """It goes on with every frame, by the correction that the frame has."""
     give(mapper, 0)
     busy = Event()
     mapper.worker.submit(busy.wait)
-    for k in (1, 2):
-        stamp = add(mapper, k, pose=(0.1 * k, 0.0, 0.0))
-        mapper.send_transform()
+    for k, local in ((1, STILL), (2, np.array([1.0, 0.0, 0.0]))):
+        stamp = add(mapper, k, pose=(0.1 * k, 0.0, 0.0), local=local)
         assert mapper.transforms[-1][0] == stamp
-    *_, T = mapper.transforms[-1]
-    np.testing.assert_allclose(se2.compose(T, ODOMETRY), [0.2, 0.0, 0.0], atol=1e-12)
-    mapper.worker.submit(lambda: setattr(mapper.system, 'T_map_local', np.array([1.0, 0, 0])))
+        *_, T = mapper.transforms[-1]
+        want = [0.1 * k + local[0], 0.0, 0.0]
+        np.testing.assert_allclose(se2.compose(T, ODOMETRY), want, atol=1e-12)
     busy.set()
-    give(mapper, 3, pose=(0.3, 0.0, 0.0))
-    *_, T = mapper.transforms[-1]
-    np.testing.assert_allclose(se2.compose(T, ODOMETRY), [1.3, 0.0, 0.0], atol=1e-12)
 
 
 def test_correction_of_one_session_is_not_of_the_next(mapper):
-    give(mapper, 0)
+    give(mapper, 0, local=np.array([1.0, 0.0, 0.0]))
     mapper.system.T_map_local = np.array([1.0, 0.0, 0.0])
-    busy = Event()
-    mapper.worker.submit(busy.wait)
     add(mapper, 1, pose=(0.5, 0.0, 0.0), session=2)
-    mapper.send_transform()
-    busy.set()
     *_, T = mapper.transforms[-1]
     np.testing.assert_allclose(se2.compose(T, ODOMETRY), [0.5, 0.0, 0.0], atol=1e-12)
 
@@ -178,12 +177,26 @@ def test_correction_that_moves_the_robot_is_told(mapper, ear):
     give(mapper, 0)
     give(mapper, 1)
     assert ear.sent['jumps'] == []
-    mapper.system.T_map_local = np.array([0.3, 0.0, 0.0])
-    stamp = give(mapper, 2)
+    stamp = give(mapper, 2, local=np.array([0.3, 0.0, 0.0]))
     (jump,) = ear.sent['jumps']
     assert jump.header.frame_id == 'base_link'
     assert jump.header.stamp.sec * SECOND + jump.header.stamp.nanosec == stamp
     assert jump.pose.pose.position.x == pytest.approx(0.3, abs=1e-9)
+
+
+def test_transform_is_dated_ahead_and_repeated_for_a_second(make, ear, monkeypatch):
+    mapper = make(transform_tolerance=0.5)
+    sent = []
+    monkeypatch.setattr(mapper.transform._publisher, 'publish', lambda *t: sent.append(t[0]))
+    stamp = add(mapper, 0)
+    assert sent == [stamp, stamp + SECOND // 2 - 1]
+    ear.now += SECOND // 5
+    mapper.send_transform()
+    mapper.send_transform()  # no date twice
+    assert sent[2:] == [stamp + 7 * SECOND // 10 - 1]
+    ear.now += SECOND
+    mapper.send_transform()  # the laser has failed: nobody may go on with that pose
+    assert len(sent) == 3
 
 
 def test_pause_stops_the_map_but_not_map_to_odom(mapper):

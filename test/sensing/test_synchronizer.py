@@ -167,7 +167,7 @@ def test_lone_scan_waits_for_its_detections_only_if_they_use_to_come():
 
 
 def test_nothing_waits_longer_than_the_timeout():
-    synchronizer, t = running(transform_timeout=0.2)
+    synchronizer, t = running(odom_timeout=0.2)
     # odometry has stopped; only scans arrive
     out = feed(synchronizer, [scan(t + k * 100 * MS) for k in range(1, 8)])
     assert [o.stamp for o in out] == [t + k * 100 * MS for k in range(1, 5)]

@@ -51,7 +51,7 @@ def test_delay_of_the_measurement_moves_the_end():
 
 
 def test_nothing_waits_longer_than_the_timeout():
-    waiting, stamps = queue(T + 200 * MS, transform_timeout=0.2)
+    waiting, stamps = queue(T + 200 * MS, odom_timeout=0.2)
     waiting.add('scan', scan(T), 0)
     assert waiting.pop(T - MS) == []
     stamps.accept('imu', T + 201 * MS, None)

@@ -9,6 +9,9 @@ IN, OUT = 'sub', 'pub'
 SENSOR, RELIABLE, LATCHED = 'best effort', 'reliable', 'reliable, transient local'
 POSE = 'geometry_msgs/PoseWithCovarianceStamped'
 CLOUD = 'sensor_msgs/PointCloud2'
+STATUS = 'diagnostic_msgs/DiagnosticStatus'
+TF = 'tf2_msgs/TFMessage'
+ODOM_TF = 'odometry, as `odom_frame` to `base_frame`; sensors that have their place here'
 MARKERS = 'visualization_msgs/MarkerArray'
 
 
@@ -62,10 +65,11 @@ TOPICS = (
           'of the back end: reflectors to localize in; a cloud without fields ends it'),
     Topic('front_end', IN, 'rlml/localization_grid', 'nav_msgs/OccupancyGrid', LATCHED,
           'of the back end: the grid of that map, for the scans'),
+    Topic('front_end', IN, '/tf', TF, SENSOR, ODOM_TF),
     Topic('front_end', IN, '/tf_static', 'tf2_msgs/TFMessage', LATCHED, 'where the sensors sit'),
     Topic('front_end', OUT, 'pose', POSE, RELIABLE,
           'pose in the map with covariance, one per scan, stamped as the scan'),
-    Topic('front_end', OUT, 'odometry/filtered', 'nav_msgs/Odometry', RELIABLE,
+    Topic('front_end', OUT, '~/odometry', 'nav_msgs/Odometry', RELIABLE,
           'pose in a continuous local frame, with twist and covariances'),
     Topic('front_end', OUT, 'rlml/frames', CLOUD, RELIABLE,
           'for the back end: all figures of a frame'),
@@ -76,6 +80,8 @@ TOPICS = (
     Topic('front_end', OUT, 'reflectors/statuses', MARKERS, RELIABLE,
           'the same in colours: used green, gated red, new blue, ghost grey, ambiguous yellow, '
           'deferred violet'),
+    Topic('front_end', OUT, '~/health', STATUS, LATCHED,
+          'OK, DEGRADED or LOST with reasons, with every frame and at once on a change'),
     Topic('front_end', OUT, '/diagnostics', 'diagnostic_msgs/DiagnosticArray', RELIABLE,
           '1 Hz: OK, DEGRADED or LOST with reasons; what became of the inputs'),
     Topic('back_end', IN, 'rlml/frames', CLOUD, RELIABLE, 'of the front end'),
@@ -107,6 +113,7 @@ TOPICS = (
     Topic('back_end', OUT, 'reflector_map_points', CLOUD, LATCHED,
           'reflectors with covariance, id, number of sightings'),
     Topic('back_end', OUT, 'graph', MARKERS, LATCHED, 'keyframes, and edges by kind'),
+    Topic('back_end', OUT, '~/health', STATUS, LATCHED, 'health of the newest frame'),
     Topic('back_end', OUT, '/diagnostics', 'diagnostic_msgs/DiagnosticArray', RELIABLE,
           '1 Hz: size of the graph, frames that wait'),
     Topic('reflector_detector', IN, 'scan', 'sensor_msgs/LaserScan', SENSOR,
@@ -114,6 +121,7 @@ TOPICS = (
     Topic('reflector_detector', IN, 'odom', 'nav_msgs/Odometry', SENSOR,
           'takes out the motion during a sweep', 'odom_topic'),
     Topic('reflector_detector', IN, 'imu', 'sensor_msgs/Imu', SENSOR, 'the same', 'imu_topic'),
+    Topic('reflector_detector', IN, '/tf', TF, SENSOR, ODOM_TF),
     Topic('reflector_detector', IN, '/tf_static', 'tf2_msgs/TFMessage', LATCHED,
           'where the lasers sit'),
     Topic('reflector_detector', OUT, 'reflectors', CLOUD, SENSOR,
@@ -149,6 +157,7 @@ TOPICS = (
           "the carrier's nominal velocity from the stamp on, in the axes of the map (or no "
           'frame) or of the base'),
     Topic('deformable_slam', IN, 'initialpose', POSE, RELIABLE, 'start again at this pose'),
+    Topic('deformable_slam', IN, '/tf', TF, SENSOR, ODOM_TF),
     Topic('deformable_slam', IN, '/tf_static', 'tf2_msgs/TFMessage', LATCHED,
           'where the sensors sit'),
     Topic('deformable_slam', OUT, 'pose', POSE, RELIABLE,
@@ -158,6 +167,7 @@ TOPICS = (
     Topic('deformable_slam', OUT, 'markers', MARKERS, RELIABLE, 'features with 95 % ellipses'),
     Topic('deformable_slam', OUT, 'cmd_vel_suggested', 'geometry_msgs/Twist', RELIABLE,
           'how to see the features best; only with `deformable.suggest`'),
+    Topic('deformable_slam', OUT, '~/health', STATUS, LATCHED, 'as front_end'),
     Topic('deformable_slam', OUT, '/diagnostics', 'diagnostic_msgs/DiagnosticArray', RELIABLE,
           '1 Hz: health with reasons, inputs, p99 of the time per update'),
 )  # fmt: skip

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from rlml_slam import se2
 from rlml_slam.errors import MapError
 from rlml_slam.maps.map_container import Content
 from rlml_slam.maps.saved_map import SavedMap
@@ -20,12 +19,11 @@ from rlml_slam.ros.back_end.last_pose import LastPose
 from rlml_slam.ros.back_end.map_archive import MapArchive
 from rlml_slam.ros.back_end.map_journal import MapJournal
 from rlml_slam.ros.back_end.map_topics import MapTopics
+from rlml_slam.ros.back_end.map_transform import MapTransform
 from rlml_slam.ros.back_end.searcher import Searcher
 from rlml_slam.ros.back_end.worker import Worker
 from rlml_slam.ros.map_publisher import MapPublisher
 from rlml_slam.ros.message_guard import guard_of
-from rlml_slam.ros.odom_frame import OdomFrame
-from rlml_slam.ros.tf import TransformPublisher
 from rlml_slam.slam import conversation as say
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.system import System
@@ -68,16 +66,14 @@ class Mapper:
         self.worker = Worker(self._report)
         self.searcher = Searcher(params, self._on_search_result, self._report, search_delay)
         self.products = MapPublisher(node, params.node)
-        self._odom = OdomFrame()
         self._newest: Frame | None = None
         self._session: int | None = None  # of the newest frame that came
-        self._sent = 0
         self._heard = 0.0
         self._ended = False
-        self._tf = TransformPublisher(node)
         self._topics = MapTopics(node, params.node)
         self._command = command or self._topics.send
-        self._steady = SmoothedCorrection(params.back_end, self._topics.jump)
+        steady = SmoothedCorrection(params.back_end, self._topics.jump)
+        self.transform = MapTransform(node, params.node, steady.follow)
         self._executes = self._table()
 
     def _table(self) -> Mapping[type, Callable[[Any], None]]:
@@ -111,10 +107,11 @@ class Mapper:
     def add(self, record: say.SessionFrame) -> None:
         """Give one frame to the worker."""
         if self._session not in (None, record.session):
-            self._odom.restart()
+            self.transform.restart()
         self._session = record.session
         self._heard = time.monotonic()
-        self._odom.follow(record.frame)
+        if self.system.entry is None:
+            self.transform.follow(record.frame)
         self.worker.submit(lambda: self._add(record))
 
     def _add(self, record: say.SessionFrame) -> None:
@@ -226,21 +223,11 @@ class Mapper:
         return known and self.products.stamp < self.stamp
 
     def send_transform(self) -> None:
-        """Publish map to odom at the newest stamp, if it is a new one.
-
-        It waits for no job of the worker, only takes over what the newest one found.
-        """
+        """Publish map to odom once more; it waits for no job of the worker."""
         self.worker.check()
         self.searcher.worker.check()
-        odom = self._odom.newest
-        if odom is None or odom[0] == self._sent or self.system.entry is not None:
-            return
-        self._sent, T = odom
-        if self.system.session == self._session:  # else the worker is in another local frame
-            T = se2.compose(self.system.T_map_local, T)
-        T = self._steady.follow(self._sent, T, self._odom.T_odom_base)
-        n = self._p.node
-        self._tf.publish(self._sent, (n.map_frame, n.odom_frame), T)
+        if self.system.entry is None:
+            self.transform.repeat()
 
     def close(self) -> None:
         """Save what was mapped, behind the running job; then the running search may end."""

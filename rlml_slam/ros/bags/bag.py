@@ -33,6 +33,8 @@ from rlml_slam.ros.bags.bag_recovery import BagRecovery
 from rlml_slam.ros.codecs.message_types import bag_types
 from rlml_slam.ros.sensor_input import PLACED, STREAMS, USED_BY, topics_of
 
+TRUTH = 'ground_truth'  # the name of a topic that is no sensor
+
 
 @dataclass(frozen=True)
 class Topic:
@@ -217,24 +219,32 @@ def _line(error: Exception) -> str:
     return text[0] if text else type(error).__name__
 
 
-def choose_topics(topics: Mapping[str, Topic], node: Node) -> dict[str, str]:
+def choose_topics(
+    topics: Mapping[str, Topic], node: Node, without: Collection[str] = ('imu',)
+) -> dict[str, str]:
     """Which topic of a bag feeds which stream of the sequencer (keys of STREAMS).
 
     By the parameter's name, else by that name inside a namespace, else the only topic of the
-    type. Streams that the parameters switch off are left out. Raises BagError, listing the
-    topics, if several fit or if there is neither a scan nor a reflector stream.
+    type. Streams that the parameters switch off are left out, and those ``without`` which it works
+    if several fit. Raises BagError, listing the topics, if several fit another one, or if there is
+    neither a scan nor a reflector stream.
     """
     chosen: dict[str, str] = {}
     for stream, (parameter, msgtype, fallback) in STREAMS.items():
         if not getattr(node, USED_BY[stream]):
             continue
         name = topics_of(node, stream)[0].strip('/')
-        typed = [t.name for t in topics.values() if t.msgtype == msgtype and t.count]
+        typed = [
+            t.name for t in topics.values()
+            if t.msgtype == msgtype and t.count and t.name.rsplit('/')[-1] != TRUTH
+        ]  # fmt: skip
         fitting = (
             [t for t in typed if t.strip('/') == name]
             or [t for t in typed if t.endswith(f'/{name}')]
             or (typed if fallback else [])
         )
+        if len(fitting) > 1 and stream in without:
+            continue
         if len(fitting) > 1:
             raise BagError(
                 f'several topics fit {stream}: {", ".join(sorted(fitting))}; '

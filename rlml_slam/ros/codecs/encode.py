@@ -209,11 +209,9 @@ def occupancy_grid(make: Make, stamp: int, frame_id: str, grid: OccupancyGrid) -
     )
 
 
-def diagnostics(
-    make: Make, stamp: int, name: str, health: Health, values: Mapping[str, object]
-) -> Any:
-    """DiagnosticArray with one status: the level, its reasons and the figures."""
-    status = make(
+def diagnostic_status(make: Make, name: str, health: Health, values: Mapping[str, object]) -> Any:
+    """DiagnosticStatus: the level, its reasons and the figures."""
+    return make(
         'diagnostic_msgs/msg/DiagnosticStatus',
         level=bytes([int(health.level)]),
         name=name,
@@ -224,8 +222,14 @@ def diagnostics(
             for key, value in values.items()
         ],
     )
+
+
+def diagnostics(
+    make: Make, stamp: int, name: str, health: Health, values: Mapping[str, object]
+) -> Any:
+    """DiagnosticArray with one status."""
     return make(
         'diagnostic_msgs/msg/DiagnosticArray',
         header=header(make, stamp, ''),
-        status=[status],
+        status=[diagnostic_status(make, name, health, values)],
     )

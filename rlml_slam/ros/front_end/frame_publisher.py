@@ -14,6 +14,7 @@ from rlml_slam.ros.codecs.frame_messages import build_points, build_record
 from rlml_slam.ros.codecs.markers import detection_markers
 from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
 from rlml_slam.ros.codecs.reflector_clouds import build_associated
+from rlml_slam.ros.front_end.provided_odometry import ProvidedOdometry
 from rlml_slam.se2 import Array
 from rlml_slam.slam.conversation import SessionFrame
 from rlml_slam.types import Detections, Frame
@@ -21,7 +22,7 @@ from rlml_slam.types import Detections, Frame
 CLOUD = 'sensor_msgs/msg/PointCloud2'
 TOPICS = {
     'pose': ('geometry_msgs/msg/PoseWithCovarianceStamped', 10),
-    'odometry/filtered': ('nav_msgs/msg/Odometry', 10),
+    '~/odometry': ('nav_msgs/msg/Odometry', 10),
     'deskewed_points': (CLOUD, 50),
     'reflectors/associated': (CLOUD, 50),
     'reflectors/statuses': ('visualization_msgs/msg/MarkerArray', 5),
@@ -39,10 +40,17 @@ class FramePublisher:
             topic: node.create_publisher(rclpy_class(kind), topic, depth)
             for topic, (kind, depth) in TOPICS.items()
         }
+        self._odom = ProvidedOdometry(node, params) if params.provide_odom_frame else None
         self.begin_session()
+
+    def with_odometry(self, frame: Frame) -> Frame:
+        """The frame; where the robot has no odometry, with the one that is published for it."""
+        return frame if self._odom is None else self._odom.publish(frame)
 
     def begin_session(self) -> None:
         """From now on, the local frame is another one."""
+        if self._odom is not None:
+            self._odom.begin_session()
         self._last: Frame | None = None
         self._twisted = (np.zeros(3), np.zeros((3, 3)))
 
@@ -57,7 +65,7 @@ class FramePublisher:
         )
         twist, twist_cov = self._twist(frame)
         frames = (p.local_frame, p.base_frame)
-        self._publishers['odometry/filtered'].publish(
+        self._publishers['~/odometry'].publish(
             encode.odometry(
                 make, frame.stamp, frames, frame.T_local_base, frame.cov_local, twist, twist_cov
             )

@@ -12,7 +12,7 @@ from rclpy.clock_type import ClockType
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
 from rlml_slam.ros.diagnostics import PERIOD
-from rlml_slam.ros.sensors import Sensors
+from rlml_slam.ros.sensors import Sensors, input_figures
 from rlml_slam.sensing.reflectors.reflector_detector import Found
 from rlml_slam.types import Health, Level, Scan
 
@@ -55,11 +55,7 @@ class DetectorHealth:
         """Send the status."""
         figures: dict[str, object] = dict(self.counts)
         figures['reflectors in the last scan'] = self._last
-        inputs = self._sensors.synchronizer.inputs
-        for stream, counts in inputs.totals().items():
-            figures |= {f'{stream} {what}': n for what, n in counts.items()}
-        if inputs.last_error:
-            figures['last refused input'] = inputs.last_error
+        figures |= input_figures(self._sensors.synchronizer)
         message = encode.diagnostics(make_rclpy, self._stamp, self._name, self.health(), figures)
         self._reported = self.counts['scans']
         self._publisher.publish(message)

@@ -62,6 +62,14 @@ class SimulatedMessages:
             return 'reflectors', encode.detections(make, message)
         return 'ground_truth', self._truth(message)
 
+    def odom_transform(self, sample: Odometry) -> Any:
+        """TFMessage of odom to base."""
+        n = self._p.node
+        frames = (n.odom_frame, n.base_frame)
+        return encode.tf_message(
+            self._make, [encode.transform(self._make, sample.stamp, frames, sample.pose)]
+        )
+
     def _truth(self, truth: GroundTruth) -> Any:
         n = self._p.node
         frames = (n.map_frame, n.base_frame)

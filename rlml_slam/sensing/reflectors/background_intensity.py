@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,14 +30,24 @@ def is_circular(scan: Scan) -> bool:
     return step * len(scan.ranges) >= 2.0 * math.pi - 0.5 * step
 
 
-def levels(scan: Scan, p: Detector) -> tuple[Array, Array, Array]:
-    """Range (0 where nothing returned), intensity and threshold (n,) of each beam."""
+def valid_beams(scan: Scan) -> tuple[Array, Array]:
+    """Range and intensity (n,) of each beam, 0 where nothing returned."""
     ranges = np.asarray(scan.ranges, dtype=np.float64)
     bright = np.asarray(scan.intensities, dtype=np.float64)
     with np.errstate(invalid='ignore'):
         is_valid = (ranges >= scan.range_min) & (ranges <= scan.range_max) & (ranges > 0.0)
         is_valid &= np.isfinite(bright)
-    ranges, bright = np.where(is_valid, ranges, 0.0), np.where(is_valid, bright, 0.0)
+    return np.where(is_valid, ranges, 0.0), np.where(is_valid, bright, 0.0)
+
+
+def levels(
+    scan: Scan, p: Detector, floor: Callable[[Array], Array] | None = None
+) -> tuple[Array, Array, Array]:
+    """Range (0 where nothing returned), intensity and threshold (n,) of each beam.
+
+    ``floor`` has the least threshold by range, where the scans before have shown it.
+    """
+    ranges, bright = valid_beams(scan)
     if p.threshold == 'bit':
         limit = np.full(len(ranges), np.nextafter(VENDOR_BIT, 0.0))
     elif p.threshold == 'curve':
@@ -45,11 +56,28 @@ def levels(scan: Scan, p: Detector) -> tuple[Array, Array, Array]:
         step, circular = abs(float(scan.angle_increment)), is_circular(scan)
         level = _other_surfaces(ranges, bright, step, circular, _widest(p))
         limit = np.maximum(p.contrast * level, p.intensity_floor)
-    return ranges, bright, np.where(is_valid, limit, 0.0)
+    if floor is not None:
+        limit = np.maximum(limit, floor(ranges))
+    return ranges, bright, np.where(ranges > 0.0, limit, 0.0)
 
 
 def _widest(p: Detector) -> float:
     return max(p.diameter, p.flat_width) + p.size_tolerance
+
+
+@kernel
+def opened(ranges: Array, bright: Array, step: float, circular: bool, widest: float) -> Array:
+    """Intensity (n,) without all that is bright and no wider than ``widest`` [m].
+
+    A morphological opening along the scan: so it does not matter how many beams reflectors take.
+    """
+    n = len(ranges)
+    half = np.zeros(n, np.int64)
+    for k in range(n):
+        if ranges[k] > 0.0:
+            half[k] = min(int(0.5 * widest / (ranges[k] * step)) + 1, MAX_WINDOW, (n - 1) // 2)
+    low = -_window_maximum(-bright, half, circular)
+    return _window_maximum(low, half, circular)
 
 
 @kernel
@@ -58,20 +86,14 @@ def _other_surfaces(
 ) -> Array:
     """Brightness (n,) of bright surfaces as far away as each beam's that are no reflectors.
 
-    A morphological opening along the scan takes away all that is bright and no wider than
-    ``widest`` [m], so that it does not matter how many beams reflectors take. Of what is left, an
-    upper quantile per octave of range, interpolated over the logarithm of range.
+    Of the surfaces that are wider than ``widest`` [m], an upper quantile per octave of range,
+    interpolated over the logarithm of range.
     """
     n = len(ranges)
-    half = np.zeros(n, np.int64)
-    for k in range(n):
-        if ranges[k] > 0.0:
-            half[k] = min(int(0.5 * widest / (ranges[k] * step)) + 1, MAX_WINDOW, (n - 1) // 2)
-    low = -_window_maximum(-bright, half, circular)
-    value = _window_maximum(low, half, circular)
+    value = opened(ranges, bright, step, circular, widest)
     octave = np.full(n, -1, np.int64)
     for k in range(n):
-        if ranges[k] > 0.0 and value[k] > 0.0:
+        if ranges[k] > 0.0 and (value[k] > 0.0 or bright[k] == 0.0):
             octave[k] = min(int(math.log2(max(ranges[k], NEAREST) / NEAREST)), OCTAVES - 1)
     at = np.empty(OCTAVES)
     level = np.empty(OCTAVES)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,7 +12,7 @@ from rlml_slam import se2
 from rlml_slam.params import Detector
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.polar import polar_covariance
-from rlml_slam.sensing.reflectors.background_intensity import is_circular, levels
+from rlml_slam.sensing.reflectors.background_intensity import is_circular, levels, opened
 from rlml_slam.sensing.reflectors.bright_spots import (
     BEAM,
     BEARING,
@@ -75,12 +76,15 @@ class Found:
         )
 
 
-def detect(scan: Scan, params: Detector) -> Found:
-    """The reflectors of a scan; none where it has no intensities."""
+def detect(scan: Scan, params: Detector, floor: Callable[[Array], Array] | None = None) -> Found:
+    """The reflectors of a scan; none where it has no intensities.
+
+    ``floor`` has the least threshold by range, where the scans before have shown it.
+    """
     n = len(scan.ranges)
     if len(scan.intensities) != n or n == 0 or scan.angle_increment == 0.0:
         return _found(scan, np.zeros((0, COLUMNS)))
-    ranges, bright, bound = levels(scan, params)
+    ranges, bright, bound = levels(scan, params, floor)
     settings = settings_of(params)
     beams = Beams(
         ranges, bright, settings.extent * bound,
@@ -111,5 +115,6 @@ def _found(scan: Scan, rows: Array) -> Found:
 def warm_up() -> None:
     """Compile the kernels."""
     surface_depth(0.0, 0.1, 0.1)
+    opened(np.ones(3), np.ones(3), 0.1, False, 0.1)
     ones = np.ones(3, np.float32)
     detect(Scan(1, '', 0.0, 0.1, 0.0, 0.1, 2.0, ones, ones), Detector())

@@ -14,8 +14,10 @@ from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.deskew import project, sweep_time
 from rlml_slam.sensing.detection_frames import placed
+from rlml_slam.sensing.reflectors.scan_reflectors import ScanReflectors
 from rlml_slam.sensing.repeated_scans import RepeatedScans
 from rlml_slam.sensing.synchronization.input_counts import InputCounts
+from rlml_slam.sensing.synchronization.odometry_sources import PoseHistory
 from rlml_slam.sensing.synchronization.waiting_queue import Waiting
 from rlml_slam.types import Detections, Motion, Observation, Scan
 
@@ -30,14 +32,19 @@ class ObservationAssembly:
     ``last`` [ns] is the stamp up to which motion is used, None before the first observation.
     """
 
-    def __init__(self, params: Parameters, inputs: InputCounts) -> None:
+    def __init__(
+        self, params: Parameters, inputs: InputCounts, transforms: PoseHistory | None = None
+    ) -> None:
         self._p = params
         self._node = params.node
         self._inputs = inputs
         self.buffer = MotionBuffer(params.motion, self._node.tf_buffer_duration)
+        self._transforms = transforms or PoseHistory(self._node.tf_buffer_duration)
         self._sensor_poses: dict[str, Array] = {self._node.base_frame: np.zeros(3)}
         self._default_frame: dict[str, str] = {}
         self._repeats = RepeatedScans()
+        self.reflectors = ScanReflectors(params.detector, self._node.detect_reflectors)
+        self._detects = self._node.use_reflectors
         self.last: int | None = None
         self._carried = STILL  # motion up to ``last`` since the last observation
         self._white = 0.0  # [s] white part of the error of the last stamp
@@ -45,6 +52,10 @@ class ObservationAssembly:
     def set_sensor_pose(self, frame_id: str, T_base_sensor: Array) -> None:
         """Set the pose (3,) of a sensor; without it the parameter ``laser_pose`` is used."""
         self._sensor_poses[frame_id] = np.asarray(T_base_sensor, dtype=np.float64)
+
+    def leave_detection(self) -> None:
+        """Somebody else detects the reflectors."""
+        self._detects = self._detects and self._node.detect_reflectors == 'on'
 
     def has_frame(self, stream: str, frame_id: str) -> bool:
         """Whether the pose of a sensor is known; the first unknown frame gets ``laser_pose``."""
@@ -59,7 +70,7 @@ class ObservationAssembly:
 
         ``errors`` [s] are the error of the stamp against odometry, and its white part.
         """
-        odom_pose = self.buffer.pose_at(stamp)
+        odom_pose = self._odom_pose(stamp)
         stale = self._stale_frames(group, odom_pose)
         scan: Scan | None = None
         points = origin = detections = T = sweep = None
@@ -76,6 +87,9 @@ class ObservationAssembly:
             elif self._node.use_scan:
                 scan, T = w.item, T_base_sensor
                 sweep = self._sweep(w.item, w.delay, moved)
+                if self._detects and not any(w.stream == 'reflectors' for w in group):
+                    seen = self.reflectors.detections(scan, T, sweep)
+                    detections = None if seen is None else self._in_base(seen, T)
         if scan is not None and T is not None and sweep is not None:
             points = project(scan, T, sweep, self._p.submap.max_laser_range)
             origin = T[:2].copy()
@@ -86,6 +100,19 @@ class ObservationAssembly:
         return Observation(
             stamp, motion, points, origin, detections, scan, odom_pose, T, sweep, sigma
         )
+
+    def _odom_pose(self, stamp: int) -> Array | None:
+        """Pose (3,) of base in odom at a stamp: that of /tf where it is there, else the topic's.
+
+        Where /tf ends before the stamp, the motion since then continues it.
+        """
+        newest = self._transforms.newest
+        if newest is None:
+            return self.buffer.pose_at(stamp)
+        if stamp <= newest:
+            return self._transforms.at(stamp)
+        since = self._motion(newest, stamp)
+        return se2.compose(self._transforms.last, since.delta) if since.known else None
 
     def carry(self, now: int) -> None:
         """Sum up the motion of a long time without observations before the buffer drops it."""

@@ -44,9 +44,9 @@ class StampJitter:
         self._instants.append((stamp, delay))
         return delay
 
-    def errors(self, source: str) -> tuple[float, float]:
+    def errors(self, source: str, odometry: str) -> tuple[float, float]:
         """Errors [s], 1 sigma, of the time between scan and odometry: all, and its white part."""
-        clocks = (self._filters.get(('odom', '')), self._filters.get(('instant', source)))
+        clocks = (self._filters.get((odometry, '')), self._filters.get(('instant', source)))
         known = [c for c in clocks if c is not None]
         return (
             math.hypot(*(c.sigma for c in known)) / SECOND,

@@ -35,6 +35,10 @@ class SynchronizedSystem(ABC):
         """One wheel odometry sample."""
         return self.process(self.synchronizer.add_odometry(sample))
 
+    def add_transform(self, sample: Odometry) -> list[Frame]:
+        """The pose of base in odom as it is on /tf."""
+        return self.process(self.synchronizer.add_transform(sample))
+
     def add_imu(self, sample: Imu) -> list[Frame]:
         """One IMU sample."""
         return self.process(self.synchronizer.add_imu(sample))

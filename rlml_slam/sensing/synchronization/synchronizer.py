@@ -21,8 +21,10 @@ from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.deskew import sweep_time
 from rlml_slam.sensing.no_return import NoReturnRanges
+from rlml_slam.sensing.reflectors.scan_reflectors import ScanReflectors
 from rlml_slam.sensing.synchronization.input_counts import InputCounts
 from rlml_slam.sensing.synchronization.observation_assembly import ObservationAssembly
+from rlml_slam.sensing.synchronization.odometry_sources import TF, TOPIC, OdometrySources
 from rlml_slam.sensing.synchronization.stamp_check import CONFIRM, StampCheck
 from rlml_slam.sensing.synchronization.stamp_jitter import StampJitter
 from rlml_slam.sensing.synchronization.waiting_queue import WaitingQueue
@@ -44,10 +46,13 @@ class Synchronizer:
         self._stamps = StampCheck(self.inputs)
         self._jitter = StampJitter(self._node.filter_stamps)
         self._queue = WaitingQueue(self._node, self._stamps, self.inputs)
-        self._assembly = ObservationAssembly(params, self.inputs)
+        n = self._node
+        self.odometry = OdometrySources(n.odom_source, n.tf_buffer_duration)
+        self._assembly = ObservationAssembly(params, self.inputs, self.odometry.transforms)
         self._no_returns = NoReturnRanges()
         self._add: dict[str, Callable[[Any], list[Observation]]] = {
-            'odom': self.add_odometry,
+            TOPIC: self.add_odometry,
+            TF: self.add_transform,
             'imu': self.add_imu,
             'scan': self.add_scan,
             'reflectors': self.add_detections,
@@ -58,24 +63,41 @@ class Synchronizer:
         """Odometry and IMU samples."""
         return self._assembly.buffer
 
+    @property
+    def reflectors(self) -> ScanReflectors:
+        """What is detected in the scans themselves."""
+        return self._assembly.reflectors
+
     def set_sensor_pose(self, frame_id: str, T_base_sensor: Array) -> None:
         """Set the pose (3,) of a sensor; without it the parameter ``laser_pose`` is used."""
         self._assembly.set_sensor_pose(frame_id, T_base_sensor)
 
     def add_odometry(self, sample: Odometry) -> list[Observation]:
-        """Add one sample of wheel odometry."""
-        if not self._node.use_odom:
-            return []
-        if self._stamps.holds('odom', sample):
+        """Add one sample of the odometry topic."""
+        return self._add_pose(TOPIC, sample) if self._node.use_odom else []
+
+    def add_transform(self, sample: Odometry) -> list[Observation]:
+        """Add the pose of base in odom as it is on /tf."""
+        return self._add_pose(TF, sample)
+
+    def _add_pose(self, source: str, sample: Odometry) -> list[Observation]:
+        if self._stamps.holds(source, sample):
             return self._release()
-        stamp = self._jitter.filtered('odom', sample.stamp)
-        sample = sample if stamp == sample.stamp else Odometry(stamp, sample.pose)
+        stamp = self._jitter.filtered(source, sample.stamp)
+        # others compute with the stamps that are on /tf: only the motion has the filtered one
+        if source == TOPIC and stamp != sample.stamp:
+            sample = Odometry(stamp, sample.pose)
         valid = np.shape(sample.pose) == (3,) and all(map(math.isfinite, sample.pose))
-        if self._accept('odom', stamp, valid, 'pose is not finite'):
-            self.buffer.add_odometry(sample)
-            if not len(self._queue):
-                self._assembly.carry(stamp)
-            self.inputs.count('odom', 'used')
+        if not self._accept(source, sample.stamp, valid, 'pose is not finite'):
+            return self._release()
+        used = self.odometry.use(source, sample)
+        if used is None or not self._node.use_odom:
+            self.inputs.count(TOPIC, 'compared')
+            return self._release()
+        self.buffer.add_odometry(used if stamp == used.stamp else Odometry(stamp, used.pose))
+        if not len(self._queue):
+            self._assembly.carry(stamp)
+        self.inputs.count(TOPIC, 'used')
         return self._release()
 
     def add_imu(self, sample: Imu) -> list[Observation]:
@@ -116,6 +138,7 @@ class Synchronizer:
         if self._has_frame('reflectors', d.frame_id) and self._accept(
             'reflectors', d.stamp, bool(finite), 'a point or covariance is not finite'
         ):
+            self._assembly.leave_detection()
             self._wait('reflectors', d)
         return self._release()
 
@@ -148,6 +171,7 @@ class Synchronizer:
             self._stamps.forget_after(wrong_after)
             self._queue.drop_after(wrong_after)
             self.buffer.forget_after(wrong_after)
+            self.odometry.forget_after(wrong_after)
         is_measured = stream in ('scan', 'reflectors')
         limit = last if is_measured else self._stamps.newest_of(stream)
         if self._stamps.accept(stream, stamp, limit, source):
@@ -171,11 +195,12 @@ class Synchronizer:
         out = []
         for stream, message in self._stamps.release_held(1 if flush else CONFIRM):
             out += self._add[stream](message)
-        while group := self._queue.pop(self.buffer.newest, flush):
+        while group := self._queue.pop(self.odometry.newest(self.buffer.newest), flush):
             stamp = group[0].stamp
             if self._assembly.last is not None:
                 stamp = max(stamp, self._assembly.last + 1)  # two lidars at the same instant
-            errors = self._jitter.errors(self._clock_of(group[0].item))
+            clock = self._clock_of(group[0].item)
+            errors = self._jitter.errors(clock, self.odometry.source)
             out.append(self._assembly.assemble(stamp, group, errors))
             if len(group) == 2:
                 self._queue.note_pair(stamp)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scans and detections that wait: for odometry, for each other, and for other lidars.
 
-Nothing waits longer than ``transform_timeout``, measured by stamps, never by a clock: a replay
+Nothing waits longer than ``odom_timeout``, measured by stamps, never by a clock: a replay
 decides in the same way.
 """
 
@@ -41,7 +41,7 @@ class WaitingQueue:
         self._node = node
         self._stamps = stamps
         self._inputs = inputs
-        self._timeout = int(node.transform_timeout * SECOND)
+        self._timeout = int(node.odom_timeout * SECOND)
         self._items: list[Waiting] = []
         self._lidars: dict[str, tuple[int, int]] = {}  # by frame: newest stamp and period
         # stamp of the last observation that had, or should have had, scan and detections

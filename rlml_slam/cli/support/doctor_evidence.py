@@ -18,8 +18,9 @@ KEPT = 200_000  # beams in the picture at most
 class Evidence:
     """What the scans hold: beams (n, 2) of range and intensity, spots (m, 2) of reflectors.
 
-    ``is_spot`` (n,) marks beams on reflectors, ``levels`` (n,) are the automatic thresholds of
-    beams, ``counts`` (s,) reflectors per scan, ``widths`` (m,) [m] of spots as seen.
+    ``is_spot`` (n,) marks beams on reflectors, ``levels`` (n,) are the intensities of other
+    surfaces at the ranges of the beams, ``counts`` (s,) reflectors per scan, ``widths`` (m,) [m]
+    of spots as seen; ``found_by`` says by which threshold, where it was learned.
     """
 
     scan: Scan
@@ -29,3 +30,4 @@ class Evidence:
     levels: Array
     spots: Array
     widths: Array
+    found_by: str = ''

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Map to odom on /tf: exact at every scan, and dated ahead until the next one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+from rlml_slam.params import Node
+from rlml_slam.ros.odom_frame import OdomFrame
+from rlml_slam.ros.tf import TransformPublisher
+from rlml_slam.se2 import Array
+from rlml_slam.types import Frame
+
+# stamp [ns], T_map_odom and T_odom_base -> what is to be published of T_map_odom
+Smoothing: TypeAlias = Callable[[int, Array, Array], Array]
+SECOND = 1_000_000_000
+SILENT = SECOND  # [ns] after a frame, from which on it says nothing of where the robot is now
+
+
+class MapTransform:
+    """Publishes map to odom, so that map to base on /tf is the pose that was published.
+
+    With each frame it goes out twice: with the frame's stamp, for those who ask where the robot
+    was when it scanned, and dated ahead by ``transform_tolerance``, as AMCL does, for those who
+    ask where it is now. The second is repeated every ``transform_publish_period`` with the date
+    of then, until SILENT after the last frame. A period of 0, or ``tf_broadcast`` false: never.
+    """
+
+    def __init__(self, node: Any, params: Node, smoothed: Smoothing | None = None) -> None:
+        self._node, self._p, self._smoothed = node, params, smoothed
+        self._frames = params.map_frame, params.odom_frame
+        is_sent = params.tf_broadcast and not params.shadow
+        self._publisher = (
+            TransformPublisher(node) if is_sent and params.transform_publish_period > 0.0 else None
+        )
+        self._odom = OdomFrame()
+        self._newest: tuple[int, Array] | None = None
+        self._heard = self._dated = 0
+
+    def restart(self) -> None:
+        """The local frame is another one from now on."""
+        self._odom.restart()
+        self._newest, self._dated = None, 0
+
+    def follow(self, frame: Frame) -> None:
+        """Take the next frame, and publish."""
+        self._odom.follow(frame)
+        if self._odom.newest is None or self._publisher is None:
+            return
+        stamp, T = self._odom.newest
+        if self._smoothed is not None:
+            T = self._smoothed(stamp, T, self._odom.T_odom_base)
+        if self._newest is not None and stamp < self._newest[0]:
+            self._dated = 0
+        self._newest, self._heard = (stamp, T), self._now()
+        self._publisher.publish(stamp, self._frames, T)
+        self._dated = max(self._dated, stamp)
+        self.repeat()
+
+    def repeat(self) -> None:
+        """Publish the newest one dated ahead, if that is later than what was sent."""
+        if self._newest is None or self._publisher is None:
+            return
+        stamp, T = self._newest
+        since = self._now() - self._heard
+        # a buffer ignores the second of two with one stamp, and that of a scan has to come in:
+        # stamps are multiples of more than a nanosecond, where they may meet
+        date = stamp + since + int(self._p.transform_tolerance * SECOND) - 1
+        if self._p.transform_tolerance > 0.0 and 0 <= since <= SILENT and date > self._dated:
+            self._dated = date
+            self._publisher.publish(date, self._frames, T)
+
+    def _now(self) -> int:
+        """The node's time [ns], simulated where that is used."""
+        return int(self._node.get_clock().now().nanoseconds)

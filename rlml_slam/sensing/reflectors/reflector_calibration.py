@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What reflectors look like to a laser, found in its scans: how bright, how wide, how sharp.
+
+A retro-reflector sends back to the laser what falls on it, a hundred times as much as the whitest
+wall, and it is small. So what is diffuse is learned from surfaces wider than any reflector, over
+all scans and by range; small spots that are far brighter than all of it at their range are
+reflectors, if there are any. The scale of the intensities does not matter: only ratios count, and
+a laser that has a few levels, of which 0 is for everything diffuse, has a ratio without bound.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam.params import Detector
+from rlml_slam.se2 import Array
+from rlml_slam.sensing.reflectors.background_intensity import (
+    MIN_BEAMS,
+    NEAREST,
+    OCTAVES,
+    is_circular,
+    opened,
+    valid_beams,
+)
+from rlml_slam.sensing.reflectors.bright_spots import FATE, PEAK, RANGE, WIDTH, Fate, find
+from rlml_slam.sensing.reflectors.reflector_detector import detect
+from rlml_slam.sensing.reflectors.spot_settings import Beams, settings_of
+from rlml_slam.types import Scan
+
+WIDEST = 0.6  # [m] of a reflector; wider surfaces are walls
+FINE = 8  # bins of an octave of intensity
+BINS = 32 * FINE  # of intensity; from 2^-8 to 2^24 times the first one
+LOWEST = 2.0**-8
+DIFFUSE = 0.98  # quantile of the intensity of wide surfaces: the whitest of them, without glare
+NEARER = 1.5  # times as bright as nearer ones is a diffuse surface at most; more is glare
+FULL = 4  # octave from which on diffuse light falls with range: 2 m
+STANDS_OUT = 2.5  # least ratio of a reflector to that
+BELOW = 0.75  # share of the ratio of dim reflectors at which the threshold is
+SPOTS = 2000  # newest bright spots that are remembered
+ENOUGH_SPOTS, ENOUGH_SCANS = 12, 8  # before anything is said
+PERIOD = 25  # scans between two estimates
+SIZES = np.geomspace(0.02, WIDEST, 40)  # [m]
+DIVERGENCES = np.array([0.001, 0.002, 0.003, 0.005, 0.008, 0.012, 0.016])  # [rad]
+AS_GOOD = 0.97  # share of the spots of the best size that another size has to explain
+AS_MANY = 0.8  # share of the reflectors of the other shape that the expected shape has to find
+RECENT = 4  # scans with which the shape is decided
+TOLERANCE = 0.3  # of the size, by which it may be off
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The detector's parameters for a laser, and the diffuse intensity (OCTAVES,) by range.
+
+    ``ratio`` is how many times as bright as that the dimmest tenth of the reflectors is, infinite
+    where all else has no intensity at all.
+    """
+
+    detector: Detector
+    diffuse: Array
+    ratio: float
+
+    def floor(self, ranges: Array) -> Array:
+        """Intensity (n,) below which nothing at these ranges is a reflector."""
+        return self.detector.contrast * diffuse_at(self.diffuse, ranges)
+
+
+def diffuse_at(diffuse: Array, ranges: Array) -> Array:
+    """Diffuse intensity (n,) at ranges, interpolated over their logarithm."""
+    at = np.log2(np.maximum(ranges, NEAREST) / NEAREST)
+    out: Array = np.interp(at, np.arange(OCTAVES) + 0.5, diffuse)
+    return out
+
+
+class ReflectorCalibration:
+    """Collects the scans of one laser; ``result`` is None as long as nothing stands out."""
+
+    def __init__(self, params: Detector) -> None:
+        self._p = params
+        # wide surfaces are what is left when everything narrower than this is taken away
+        self._search = replace(
+            params, diameter=WIDEST, flat_width=0.0, contrast=STANDS_OUT, min_beams=1,
+            divergence=float(DIVERGENCES[-1]),
+        )  # fmt: skip
+        self._counts = np.zeros((OCTAVES, BINS + 1), np.int64)
+        # range, width, peak, and spacing of beams at that range; of the scans' number
+        self._spots: deque[tuple[float, float, float, float]] = deque(maxlen=SPOTS)
+        self._recent: deque[Scan] = deque(maxlen=RECENT)
+        self.num_scans = 0
+        self.result: Calibration | None = None
+
+    def add(self, scan: Scan) -> None:
+        """One scan with intensities; now and then a new estimate."""
+        self.num_scans += 1
+        ranges, bright = valid_beams(scan)
+        step = abs(float(scan.angle_increment))
+        surface = opened(ranges, bright, step, is_circular(scan), WIDEST)
+        octaves = octave_of(ranges)
+        seen = octaves >= 0
+        # next to beams without a return the width of what is bright is not known
+        wide = seen & ((surface > 0.0) | (bright == 0.0))
+        np.add.at(self._counts, (octaves[wide], bin_of(surface)[wide]), 1)
+        bound = STANDS_OUT * diffuse_at(self._diffuse(), ranges)
+        settings = settings_of(self._search)
+        beams = Beams(
+            ranges, bright, settings.extent * np.where(seen, bound, 0.0), float(scan.angle_min),
+            float(scan.angle_increment), is_circular(scan),
+        )  # fmt: skip
+        rows = find(beams, np.where(seen, bound, 0.0), settings)
+        fates = rows[:, FATE].astype(np.int64)
+        small = ~np.isin(fates, (Fate.DIM, Fate.FEW, Fate.RANGE, Fate.HIDDEN, Fate.FADING))
+        if small.any():
+            self._recent.append(scan)
+        for row in rows[small & (rows[:, WIDTH] < WIDEST + rows[:, RANGE] * DIVERGENCES[-1])]:
+            r = float(row[RANGE])
+            self._spots.append((r, float(row[WIDTH]), float(row[PEAK]), r * step))
+        if self.num_scans >= ENOUGH_SCANS and self.num_scans % PERIOD in (0, ENOUGH_SCANS):
+            self.result = self.estimate()
+
+    def _diffuse(self) -> Array:
+        """The whitest of the wide surfaces (OCTAVES,); nearer ones are at least as bright."""
+        total = self._counts.sum(axis=1)
+        above = np.cumsum(self._counts, axis=1) >= DIFFUSE * total[:, None]
+        level = np.where(total >= MIN_BEAMS, intensity_of(np.argmax(above, axis=1)), np.nan)
+        known = np.isfinite(level)
+        if not known.any():
+            return np.full(OCTAVES, np.inf)
+        at, level = np.flatnonzero(known), level[known]
+        # the first octaves may be nearer than where the lens sees all of the spot
+        brightest = np.maximum.accumulate(np.where(at < FULL, 0.0, level))
+        nearer = np.concatenate([[np.inf], brightest[:-1]])
+        level = np.where(at > FULL, np.minimum(level, NEARER * nearer), level)
+        out: Array = np.interp(np.arange(OCTAVES), at, level)
+        return out
+
+    def estimate(self) -> Calibration | None:
+        """What the spots have in common, None if they are too few."""
+        spots, diffuse = np.array(self._spots).reshape(-1, 4), self._diffuse()
+        level = diffuse_at(diffuse, spots[:, 0])
+        ratios = np.where(level > 0.0, spots[:, 2] / np.maximum(level, 1e-300), np.inf)
+        out = ratios >= STANDS_OUT
+        if out.sum() < max(ENOUGH_SPOTS, 0.02 * self.num_scans):
+            return None
+        ratio = float(np.quantile(ratios[out], 0.1, method='lower'))
+        size, divergence = self._size(spots[out])
+        # below the dimmest reflectors, and as far above everything white as they allow
+        contrast = min(self._p.contrast, max(math.sqrt(ratio), BELOW * ratio))
+        detector = replace(
+            self._p, contrast=contrast, divergence=divergence,
+            size_tolerance=max(self._p.size_tolerance, TOLERANCE * size),
+            # next to what has no intensity, every edge is sharp
+            edge_contrast=0.0 if math.isinf(ratio) else self._p.edge_contrast,
+        )  # fmt: skip
+        shapes = [
+            Calibration(replace(detector, diameter=diameter, flat_width=flat), diffuse, ratio)
+            for diameter, flat in ((size, 0.0), (0.0, size))
+        ]
+        if self._p.diameter > 0.0 and self._p.flat_width > 0.0:
+            both = replace(detector, diameter=self._p.diameter, flat_width=self._p.flat_width)
+            return Calibration(both, diffuse, ratio)
+        if self._p.flat_width > 0.0:  # that is what is expected
+            shapes.reverse()
+        expected, other = (
+            sum(len(detect(s, c.detector, c.floor)) for s in self._recent) for c in shapes
+        )
+        return shapes[0] if expected >= AS_MANY * other else shapes[1]
+
+    def _size(self, spots: Array) -> tuple[float, float]:
+        """Size [m] and divergence [rad] that explain most spots: the given ones if they do.
+
+        A spot of n beams that lie ``spacing`` apart is between n - 1 and n + 1 of these wide.
+        """
+        r, width, spacing = spots[:, 0], spots[:, 1], spots[:, 3]
+
+        def explained(size: Array, divergence: Array) -> Array:
+            want = size[:, None, None] + divergence[:, None] * r
+            fits = (want >= width - spacing) & (want <= width + spacing)
+            return np.asarray(fits.mean(axis=-1))
+
+        found = explained(SIZES, DIVERGENCES)
+        given = max(self._p.diameter, self._p.flat_width)
+        if explained(np.array([given]), np.array([self._p.divergence])) >= AS_GOOD * found.max():
+            return given, self._p.divergence
+        good = np.argwhere(found >= 0.97 * found.max())
+        i, j = good[len(good) // 2]
+        return float(SIZES[i]), float(DIVERGENCES[j])
+
+
+def calibrated(scans: Iterable[Scan], params: Detector) -> Calibration | None:
+    """What all of the scans of a laser show, None if nothing stands out."""
+    calibration = ReflectorCalibration(params)
+    for scan in scans:
+        calibration.add(scan)
+    return calibration.estimate()
+
+
+def octave_of(ranges: Array) -> NDArray[np.int64]:
+    """Octave of range (n,) of each beam, -1 where nothing returned."""
+    octave = np.log2(np.maximum(ranges, NEAREST) / NEAREST).astype(np.int64)
+    return np.where(ranges > 0.0, np.minimum(octave, OCTAVES - 1), -1)
+
+
+def bin_of(bright: Array) -> NDArray[np.int64]:
+    """Bin of intensity, logarithmic; 0 is darkness."""
+    fine = np.floor(FINE * np.log2(np.maximum(bright, LOWEST) / LOWEST)).astype(np.int64) + 1
+    return np.where(bright > LOWEST, np.minimum(fine, BINS), 0)
+
+
+def intensity_of(bins: NDArray[np.int64]) -> Array:
+    """Upper end of a bin of intensity, 0 of darkness."""
+    out: Array = np.where(bins > 0, LOWEST * 2.0 ** (bins / FINE), 0.0)
+    return out

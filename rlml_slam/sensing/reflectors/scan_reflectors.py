@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reflectors in the intensities of the scans themselves, where no topic brings them."""
+
+from __future__ import annotations
+
+import math
+
+from rlml_slam.params import Detector
+from rlml_slam.se2 import Array
+from rlml_slam.sensing.reflectors.reflector_calibration import Calibration, ReflectorCalibration
+from rlml_slam.sensing.reflectors.reflector_detector import detect
+from rlml_slam.types import Detections, Scan
+
+MAX_LASERS = 16
+
+
+class ScanReflectors:
+    """Detects the reflectors of scans; ``mode`` is the parameter detect_reflectors.
+
+    With auto, brightness and size of reflectors are those that the scans show, and there are no
+    detections as long as nothing stands out. With on they are those of the parameters.
+    """
+
+    def __init__(self, params: Detector, mode: str) -> None:
+        self._p = params
+        self._mode = mode
+        self._lasers: dict[str, ReflectorCalibration] = {}
+        self.num_scans = self.num_found = 0
+
+    def detections(self, scan: Scan, T_base_laser: Array, sweep: Array) -> Detections | None:
+        """The reflectors of a scan at its stamp, in the frame of the laser; None if not looked."""
+        if self._mode == 'off' or len(scan.intensities) != len(scan.ranges):
+            return None
+        detector, calibration = self._p, None
+        if self._mode == 'auto':
+            calibration = self._calibrated(scan)
+            if calibration is None:
+                return None
+            detector = calibration.detector
+        found = detect(scan, detector, None if calibration is None else calibration.floor)
+        self.num_scans += 1
+        self.num_found += len(found)
+        return found.at_stamp(scan, T_base_laser, sweep)
+
+    def _calibrated(self, scan: Scan) -> Calibration | None:
+        laser = self._lasers.get(scan.frame_id)
+        if laser is None:
+            if len(self._lasers) >= MAX_LASERS or scan.angle_increment == 0.0:
+                return None
+            laser = self._lasers[scan.frame_id] = ReflectorCalibration(self._p)
+        laser.add(scan)
+        return laser.result
+
+    def __str__(self) -> str:
+        """What was found, and by which threshold, in words; empty if nothing was looked at."""
+        if self.num_scans:
+            mean = self.num_found / self.num_scans
+            found = [c.result for c in self._lasers.values() if c.result is not None]
+            return f'{mean:.1f} in a scan{"".join(f"; {in_words(c)}" for c in found)}'
+        return 'nothing stands out of what is diffuse' if self._lasers else ''
+
+
+def in_words(c: Calibration) -> str:
+    """By which threshold reflectors are found."""
+    p = c.detector
+    size = f'{1e3 * max(p.diameter, p.flat_width):.0f} mm wide'
+    if math.isinf(c.ratio):
+        return f'the only ones with an intensity; {size}'
+    return (
+        f'at least {p.contrast:.1f} times as bright as anything diffuse at their range, most of '
+        f'them {c.ratio:.1f} times; {size}'
+    )

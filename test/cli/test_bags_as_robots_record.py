@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bag of scans with intensities, /tf and /tf_static alone just works."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rlml_slam.cli.main import main
+from rlml_slam.evaluation.metrics import metrics
+from rlml_slam.params import Parameters
+from rlml_slam.recordings.bag_inputs import BagInputs
+from rlml_slam.recordings.bag_replay import replay
+from rlml_slam.ros.bags.bag import BagReader, BagWriter
+from rlml_slam.ros.codecs import encode
+from rlml_slam.ros.codecs.message_types import make_bag
+from rlml_slam.ros.sensor_input import SensorInput
+from rlml_slam.sensing.synchronization.input_counts import InputCounts
+from rlml_slam.types import Odometry, Scan
+
+SECOND = 1_000_000_000
+MOUNT = np.array([0.3, 0.0, 0.1])
+FOOT = np.array([0.0, 0.1, 0.0])
+ROOM = ('--seed', '1', '--set', 'laser.beams=360', '--set', 'wheels.rate=20', '--set',
+        'gyro.rate=25', '--set', 'truth_rate=10')  # fmt: skip
+
+
+def write(path, tf, scans=20, topics=('/scan', '/tf'), storage='mcap'):
+    """A short bag: ``tf`` makes the transforms of the k-th tenth of a second."""
+    with BagWriter(path, storage) as bag:
+        bag.add_topic(topics[0], 'sensor_msgs/msg/LaserScan')
+        bag.add_topic(topics[1], 'tf2_msgs/msg/TFMessage')
+        for k in range(scans):
+            stamp = (k + 10) * SECOND // 10
+            bag.write(topics[1], encode.tf_message(make_bag, tf(stamp, k)), stamp)
+            ranges = np.full(90, 2.0, np.float32)
+            scan = Scan(stamp, 'laser', -1.0, 0.02, 0.0, 0.1, 10.0, ranges, 0.0 * ranges)
+            bag.write(topics[0], encode.laser_scan(make_bag, scan), stamp)
+    return path
+
+
+def transforms(*edges):
+    """The same chain at every instant; a pose None is that of the drive."""
+
+    def of(stamp, k):
+        drive = np.array([0.05 * k, 0.0, 0.01 * k])
+        return [
+            encode.transform(make_bag, stamp, (parent, child), drive if T is None else T)
+            for parent, child, T in edges
+        ]
+
+    return of
+
+
+class Target:
+    def __init__(self):
+        self.poses, self.places = [], {}
+
+    def set_sensor_pose(self, frame_id, T):
+        self.places[frame_id] = T
+
+    def add_transform(self, sample):
+        self.poses.append(sample)
+        return []
+
+    def add_scan(self, scan):
+        return []
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+@pytest.mark.parametrize(
+    ('edges', 'frames'),
+    [
+        ([('odom', 'base_link', None), ('base_link', 'laser', MOUNT)], ('odom', 'base_link')),
+        (
+            [('odom', 'base_footprint', None), ('base_footprint', 'base_link', FOOT),
+             ('base_link', 'laser', MOUNT)],
+            ('odom', 'base_link'),
+        ),
+        ([('/odom', '/base_link', None), ('/base_link', '/laser', MOUNT)], ('odom', 'base_link')),
+        (
+            [('odom', 'base_footprint', None), ('base_footprint', 'laser', MOUNT)],
+            ('odom', 'base_footprint'),
+        ),
+        (
+            [('r1/odom', 'r1/base_link', None), ('r1/base_link', 'laser', MOUNT),
+             ('map', 'r1/odom', FOOT)],
+            ('r1/odom', 'r1/base_link'),
+        ),
+        (
+            [('odom_combined', 'base_link', None), ('base_link', 'laser', MOUNT)],
+            ('odom_combined', 'base_link'),
+        ),
+    ],
+    ids=['plain', 'footprint', 'slashes', 'no base_link', 'namespace', 'another odom'],
+)  # fmt: skip
+def test_frames_of_the_recording_are_found(tmp_path, edges, frames, storage):
+    path = write(tmp_path / 'bag', transforms(*edges), storage=storage)
+    with BagReader(path) as bag:
+        inputs = BagInputs(bag, Parameters())
+        n = inputs.params.node
+        assert (n.odom_frame, n.base_frame) == frames
+        assert inputs.has_odometry_on_tf
+        assert inputs.sources()['odom'] == f'/tf, {frames[0]} to {frames[1]}'
+        target = Target()
+        feed = SensorInput(inputs.params, target, InputCounts())
+        feed.use_extrinsics(inputs.extrinsics)
+        for _, stream, message in inputs:
+            feed.add(stream, message)
+    assert len(target.poses) == 20
+    step = target.poses[-1].pose - target.poses[0].pose
+    assert isinstance(target.poses[0], Odometry)
+    assert step[2] == pytest.approx(0.19)
+    np.testing.assert_allclose(target.places['laser'], MOUNT, atol=1e-9)
+
+
+def test_topics_by_other_names_are_found_by_their_type(tmp_path):
+    edges = [('odom', 'base_link', None), ('base_link', 'laser', MOUNT)]
+    topics = ('/sick/front', '/robot/tf')
+    path = write(tmp_path / 'bag', transforms(*edges), topics=topics)
+    with BagReader(path) as bag:
+        inputs = BagInputs(bag, Parameters())
+    assert inputs.sources() == {
+        'scan': '/sick/front', 'odom': '/robot/tf, odom to base_link'
+    }  # fmt: skip
+
+
+def test_odometry_of_the_topic_can_be_asked_for(tmp_path):
+    edges = [('odom', 'base_link', None), ('base_link', 'laser', MOUNT)]
+    path = write(tmp_path / 'bag', transforms(*edges))
+    p = Parameters()
+    with BagReader(path) as bag:
+        inputs = BagInputs(bag, replace(p, node=replace(p.node, odom_source='topic')))
+    assert not inputs.has_odometry_on_tf
+
+
+@pytest.fixture(scope='module')
+def recorded(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('room')
+    main(['simulate', 'room', str(folder / 'topics'), *ROOM])
+    main(['simulate', 'room', str(folder / 'tf'), *ROOM, '--tf-only'])
+    return folder
+
+
+def test_trajectory_and_reflectors_are_as_with_the_topics(recorded):
+    """Without the IMU, which such a bag does not have; the detector is better than the markers."""
+    p = Parameters()
+    without_imu = replace(p, node=replace(p.node, use_imu=False))
+    topics = metrics(replay(recorded / 'topics', without_imu))
+    run = replay(recorded / 'tf', p)
+    alone = metrics(run)
+    assert alone['health']['OK'] == 1.0
+    for error in ('live_ate_rmse_m', 'ate_rmse_m', 'reflector_rmse_m'):
+        assert alone[error] <= 1.05 * topics[error], error
+    assert alone['reflectors_found'] == topics['reflectors_found'] == alone['reflectors_true']
+    assert alone['reflectors_spurious'] == alone['reflectors_twice'] == 0
+    assert run.topics['odom'] == '/tf, odom to base_link'
+    assert run.topics['reflectors'].startswith('intensities of the scans: ')
+    assert 'as bright as anything diffuse' in run.topics['reflectors']
+
+
+def test_doctor_finds_them_as_well(recorded, capsys):
+    assert main(['doctor', str(recorded / 'tf'), '--json']) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures['reflectors_mean'] > 2.0
+    assert figures['margin'] > 5.0
+    assert 'as bright as anything diffuse' in figures['found_by']

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Health in time: with every scan, at once on a change, and a gate that stops the robot."""
+
+from __future__ import annotations
+
+import runpy
+from functools import partial
+from pathlib import Path
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import Twist
+from live import LATCHED, room
+
+from rlml_slam.nodes.front_end import FrontEndNode
+from rlml_slam.ros import diagnostics
+from rlml_slam.types import Health, Level
+
+GATE = Path(__file__).resolve().parents[2] / 'docs' / 'examples' / 'cmd_vel_gate.py'
+HEALTH = '/front_end/health'
+
+
+def level(msg):
+    return msg.level[0] if isinstance(msg.level, bytes) else msg.level
+
+
+def has_stamp(live, wanted):
+    return any(v.value == wanted for m in live.heard[HEALTH] for v in m.values)
+
+
+@pytest.fixture
+def node(live):
+    node = live.start(FrontEndNode)
+    node.sensors.stop_waiting()
+    live.listen(HEALTH, 'diagnostic_msgs/msg/DiagnosticStatus', LATCHED)
+    live.spin_until(lambda: live.heard[HEALTH])
+    return node
+
+
+def test_health_is_there_before_the_first_scan(live, node):
+    assert level(live.heard[HEALTH][0]) == Level.DEGRADED
+    assert live.heard[HEALTH][0].message == 'no input yet'
+
+
+def test_each_scan_has_its_health_at_once(live, node):
+    poses = 0
+    for stream, msg in room(('/scan', '/odom'), seconds=3.0):
+        before = node.last
+        node.sensors.add(stream, msg)
+        if node.last is not before:
+            poses += 1
+            wanted = f'{node.last.stamp // 10**9}.{node.last.stamp % 10**9:09d}'
+            live.spin_until(partial(has_stamp, live, wanted), timeout=2.0)
+    assert poses > 20
+
+
+def test_silence_is_said_without_waiting_for_diagnostics(live, node, monkeypatch):
+    for stream, msg in room(('/scan', '/odom'), seconds=2.0):
+        node.sensors.add(stream, msg)
+    node.health._found = ()
+    heard = node.health._heard
+    live.heard[HEALTH].clear()
+    monkeypatch.setattr(diagnostics.time, 'monotonic', lambda: heard + 1.1)
+    node.health.watch()
+    monkeypatch.undo()
+    live.spin_until(lambda: live.heard[HEALTH])
+    assert 'no new scan' in live.heard[HEALTH][-1].message
+    assert level(live.heard[HEALTH][-1]) >= Level.DEGRADED
+
+
+def test_gate_stops_the_robot_that_is_lost(live):
+    gate = live.start(runpy.run_path(str(GATE))['CmdVelGate'])
+    live.listen('cmd_vel', 'geometry_msgs/msg/Twist')
+    live.spin_until(lambda: live.heard['cmd_vel'])  # nobody has said that it may drive
+    drive = Twist()
+    drive.linear.x = 1.0
+
+    def after(health):
+        live.spin_until(lambda: live.ear.count_publishers('cmd_vel') == 1)
+        gate.on_health(DiagnosticStatus(level=bytes([health])))
+        live.drain()
+        live.heard['cmd_vel'].clear()
+        gate.on_command(drive)
+        live.spin_until(lambda: live.heard['cmd_vel'])
+        return live.heard['cmd_vel'][0].linear.x
+
+    assert after(Level.OK) == 1.0
+    assert after(Level.LOST) == 0.0
+    assert after(Level.DEGRADED) == 1.0
+    gate._heard -= 1.0  # the localization has died
+    live.heard['cmd_vel'].clear()
+    gate.on_command(drive)
+    live.spin_until(lambda: live.heard['cmd_vel'])
+    assert live.heard['cmd_vel'][0].linear.x == 0.0
+
+
+def test_problems_do_not_make_a_lost_robot_better():
+    lost = Health(Level.LOST, ('nothing fits',))
+    found = diagnostics.with_problems(lost, ('no correction',))
+    assert found == Health(Level.LOST, ('nothing fits', 'no correction'))
+    assert diagnostics.with_problems(Health(), ('no correction',)).level is Level.DEGRADED

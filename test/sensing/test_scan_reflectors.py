@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reflectors are found by themselves in scans of any laser, and walls never become reflectors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rlml_slam.params import Detector
+from rlml_slam.sensing.reflectors.reflector_calibration import calibrated
+from rlml_slam.sensing.reflectors.scan_reflectors import ScanReflectors
+from rlml_slam.types import Scan
+
+POSTS = np.array([[3.0, 1.0], [-2.5, 2.0], [1.0, -3.0], [-4.0, -1.5], [6.0, 3.0], [0.5, 4.0]])
+STILL = np.zeros(3)
+
+
+def scan(k, rng, beams=1440, radius=0.04, divergence=0.003, gain=30.0, gloss=0.0):
+    """A room of 20 m by 12 m with cylinders, seen from a place that changes with k."""
+    at = 0.02 * np.array([k, 0.5 * k])
+    angles = np.linspace(-np.pi, np.pi, beams, endpoint=False)
+    u = np.stack([np.cos(angles), np.sin(angles)], -1)
+    with np.errstate(divide='ignore'):
+        sides = np.where(u > 0.0, np.array([10.0, 6.0]) - at, at + np.array([10.0, 6.0])) / np.abs(
+            u
+        )
+    wall = sides.min(axis=1)
+    cosine = np.where(sides[:, 0] < sides[:, 1], np.abs(u[:, 0]), np.abs(u[:, 1]))
+    ranges, bright = wall.copy(), 200.0 * cosine + gloss * cosine**200
+    for post in POSTS - at:
+        along, across = u @ post, np.abs(u @ [[0.0, -1.0], [1.0, 0.0]] @ post)
+        r = np.hypot(*post)
+        lit = (across < radius + 0.5 * divergence * r) & (along > 0.0)
+        ranges[lit] = r - radius
+        bright[lit] = gain * 200.0
+    ranges += rng.normal(0.0, 0.005, beams)
+    bright *= 1.0 + rng.normal(0.0, 0.03, beams)
+    return Scan(
+        k + 1, 'laser', -np.pi, 2.0 * np.pi / beams, 0.0, 0.1, 30.0,
+        ranges.astype(np.float32), np.maximum(bright, 0.0).astype(np.float32),
+    )  # fmt: skip
+
+
+def scans(change=lambda bright: bright, count=40, **kind):
+    rng = np.random.default_rng(1)
+    for k in range(count):
+        s = scan(k, rng, **kind)
+        yield replace(s, intensities=np.asarray(change(s.intensities), np.float32))
+
+
+def last_seen(change=lambda bright: bright, mode='auto', **kind):
+    """Detections in the newest scan, None if it was not looked at, and what is said of them."""
+    reflectors, seen = ScanReflectors(Detector(), mode), None
+    for s in scans(change, **kind):
+        seen = reflectors.detections(s, STILL, STILL)
+    return seen, str(reflectors)
+
+
+def levels(bright):
+    """A laser with a few levels of brightness, as SICK's of old: 0 is everything diffuse."""
+    return 8192.0 * np.clip(np.floor(np.log2(np.maximum(bright / 500.0, 0.5))), 0.0, 4.0)
+
+
+@pytest.mark.parametrize(
+    ('change', 'kind'),
+    [
+        (lambda b: b, {}),
+        (lambda b: 0.01 * b, {}),
+        (lambda b: 1e4 * b, {}),
+        (lambda b: np.sqrt(b), {}),
+        (levels, {}),
+        (levels, {'beams': 721, 'divergence': 0.012}),
+        (lambda b: (levels(b) / 8192.0), {'radius': 0.08}),
+        (lambda b: b, {'radius': 0.1, 'beams': 2880}),
+        (lambda b: np.minimum(b, 254.0 * 6), {'radius': 0.025}),
+        (lambda b: np.where(b > 2000.0, 65535.0, b), {}),
+    ],
+    ids=['as it is', 'dim', 'bright', 'compressed', 'levels', 'wide beams', 'bits', 'large',
+         'small', 'marked'],
+)  # fmt: skip
+def test_reflectors_are_found_on_any_scale(change, kind):
+    seen, said = last_seen(change, **kind)
+    at = 0.02 * np.array([39.0, 19.5])
+    assert seen is not None, said
+    off = np.linalg.norm(seen.points[:, None] + at - POSTS, axis=-1)
+    # none is anything else; where it looks flat, its surface is its place
+    assert (off.min(axis=1) < 0.03 + kind.get('radius', 0.04)).all()
+    assert len(set(off.argmin(axis=1))) >= 5  # one may be hidden
+    assert 'in a scan' in said
+
+
+@pytest.mark.parametrize('gloss', [0.0, 4000.0])
+def test_walls_are_no_reflectors(gloss):
+    """Neither diffuse ones nor the glare of one that is glossy."""
+    seen, said = last_seen(gain=1.0, gloss=gloss)
+    assert seen is None or len(seen) == 0, said
+
+
+def test_white_posts_are_no_reflectors():
+    seen, said = last_seen(gain=1.8)
+    assert seen is None
+    assert said == 'nothing stands out of what is diffuse'
+
+
+def test_without_intensities_nothing_is_looked_at():
+    assert last_seen(lambda b: np.zeros(0)) == (None, '')
+    assert last_seen(lambda b: np.zeros(len(b)))[0] is None
+    assert last_seen(mode='off') == (None, '')
+
+
+def test_size_and_divergence_are_found():
+    found = calibrated(scans(radius=0.1, divergence=0.012, beams=1440), Detector())
+    p = found.detector
+    assert max(p.diameter, p.flat_width) == pytest.approx(0.2, abs=0.04)
+    assert found.detector.divergence == pytest.approx(0.012, abs=0.004)
+    assert calibrated(scans(levels), Detector()).ratio == np.inf
+    # what explains the spots is left as the parameters have it
+    assert calibrated(scans(), Detector()).detector.diameter == Detector().diameter
