@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 from live import overrides
 from nav_msgs.srv import LoadMap
-from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.serialization import serialize_message
 from scenarios import FIRST_NUMBER, SECOND_NUMBER, Driver, decision
 from std_srvs.srv import SetBool, Trigger
 
@@ -25,7 +25,7 @@ OTHERS = ('deskewed_points', 'reflectors/associated')  # what the ends say to ea
 
 
 class Bus:
-    """Topics between the nodes of this process: bytes, in order, delivered when asked for."""
+    """Topics between the nodes of this process: bytes, in order, as raw subscriptions get them."""
 
     def __init__(self):
         self.callbacks = defaultdict(list)
@@ -37,13 +37,13 @@ class Bus:
         data = serialize_message(msg)
         self.sent.append((topic, msg))
         if qos is LATCHED:
-            self.latched[topic] = type(msg), data
-        self.waiting += [(c, type(msg), data) for _, c in self.callbacks[topic]]
+            self.latched[topic] = data
+        self.waiting += [(c, data) for _, c in self.callbacks[topic]]
 
     def subscribe(self, node, topic, callback):
         self.callbacks[topic].append((node, callback))
         if topic in self.latched:
-            self.waiting.append((callback, *self.latched[topic]))
+            self.waiting.append((callback, self.latched[topic]))
 
     def remove(self, node):
         for topic, callbacks in self.callbacks.items():
@@ -54,8 +54,8 @@ class Bus:
         """Whether anything was there."""
         any_came = bool(self.waiting)
         while self.waiting:
-            callback, kind, data = self.waiting.popleft()
-            callback(deserialize_message(data, kind))
+            callback, data = self.waiting.popleft()
+            callback(data)
         return any_came
 
 
