@@ -92,6 +92,9 @@ class HealthPublisher:
             encode.diagnostic_status(make_rclpy, self._name, self.health(), stamp)
         )
 
+    def _inputs(self) -> dict[str, object]:
+        return {} if self._sensors is None else input_figures(self._sensors.synchronizer)
+
     def summary(self) -> str:
         """What there was, in a line for the end of a run."""
         inputs = [f'{what} {n}' for what, n in self._inputs().items() if n]
@@ -101,9 +104,7 @@ class HealthPublisher:
     def publish(self) -> None:
         """Send the status."""
         figures: dict[str, object] = {
-            'frames': self._frames,
-            **({} if self._sensors is None else input_figures(self._sensors.synchronizer)),
-            **self._guard.figures(),
+            'frames': self._frames, **self._inputs(), **self._guard.figures(),
         }  # fmt: skip
         if self._statuses:
             figures |= {f'detections {s.name.lower()}': self._statuses[s] for s in Status}
