@@ -2,6 +2,8 @@
 """Kernels of a library do what Numba's own do, and check what they are given."""
 
 import pickle
+import subprocess
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
@@ -10,7 +12,8 @@ import numba
 import numpy as np
 import pytest
 
-from rlml_slam.kernels import build, library, native
+from rlml_slam import compiled, warm_up  # noqa: F401, so that it is known whether there is one
+from rlml_slam.kernels import build, library, missing, native
 from rlml_slam.kernels.emit import check_of, entries_of, machine_for
 from rlml_slam.kernels.library import Index, Library
 
@@ -123,6 +126,52 @@ def test_arguments_that_cannot_come_from_python_have_no_entry():
     assert check_of(numba.types.literal(3)) is None
     assert check_of(numba.float64[:, :]) is None
     assert check_of(numba.float32) is None
+
+
+EVERY_KERNEL = """
+import sys
+from rlml_slam import compiled, warm_up
+warm_up.import_core()
+for name, module in sorted(sys.modules.items()):
+    for value in vars(module).values() if name.startswith('rlml_slam') else ():
+        if type(value) is compiled.LIBRARY.module.Kernel:
+            kernel = f'{value.__module__}.{value.__name__}'
+            if kernel not in compiled.LIBRARY.index.entries:
+                print(kernel)
+"""
+
+
+@pytest.mark.skipif(not warm_up.has_library(), reason='the sources have no library: rlml warm-up')
+def test_every_kernel_of_the_package_is_in_its_library():
+    done = subprocess.run(
+        [sys.executable, '-c', EVERY_KERNEL], capture_output=True, text=True, check=True
+    )
+    assert not done.stdout
+
+
+@native.part
+def plus(a, b):
+    return a + offset(b)
+
+
+@native.formula
+def offset(b):
+    return b + 1.0
+
+
+def total(values):
+    """Sum of the values and one each."""
+    s = 0.0
+    for v in values:
+        s = plus(s, v)
+    return s
+
+
+def test_a_kernel_that_the_library_lacks_is_compiled_with_its_parts(made):
+    kernel = made(total)
+    assert kernel(np.arange(3.0)) == 6.0
+    assert kernel(values=np.arange(2)) == 3.0
+    assert isinstance(missing.compiled(total), numba.core.dispatcher.Dispatcher)
 
 
 def test_library_of_other_sources_or_processors_is_not_used(tmp_path):

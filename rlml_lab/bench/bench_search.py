@@ -34,9 +34,7 @@ LASERS = ((180, np.pi), (360, np.pi), (720, 2.0 * np.pi))  # beams, view
 
 def add_parser(subparsers: Any) -> None:
     """Declare ``rlml-lab bench search``."""
-    parser = subparsers.add_parser(
-        'search', help='time and verdicts of global searches by scan in a large building'
-    )
+    parser = subparsers.add_parser('search', help='global searches by scan in a large building')
     parser.add_argument('--scans', type=int, default=30, metavar='N', help='of each building')
     parser.add_argument(
         '--size', type=float, default=141.0, metavar='M', help='side (default: %(default)s)'

@@ -44,7 +44,7 @@ class Outcome:
 
 def add_parser(subparsers: Any) -> None:
     """Declare ``rlml-lab study fuzz-files``."""
-    parser = subparsers.add_parser('fuzz-files', help='mutated files of every format')
+    parser = subparsers.add_parser('fuzz-files', help='mutated files of every format that is read')
     parser.add_argument('--mutations', type=int, default=100_000, help='per format, at most')
     parser.add_argument('--seconds', type=float, default=60.0, help='per format, at most')
     parser.add_argument('--only', nargs='*', default=[], help='names of formats')

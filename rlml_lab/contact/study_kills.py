@@ -63,7 +63,7 @@ class Ear(Node):
 
 def add_parser(subparsers: Any) -> None:
     """Declare ``rlml-lab study kills``."""
-    parser = subparsers.add_parser('kills', help='processes that are killed while they map')
+    parser = subparsers.add_parser('kills', help='processes that are killed while they map, live')
     parser.add_argument('--kills', type=int, default=200)
     parser.add_argument('--longest', type=float, default=15.0, help='[s] between two kills')
     parser.add_argument('--seconds', type=float, default=36_000.0, help='after which it ends')

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rlml_lab.deformable.ekf import dead_reckoning
 from rlml_lab.deformable.experiment import Measurements, edges
 from rlml_slam.compiled import kernel
-from rlml_slam.deformable.block_tridiagonal import factorize, marginals, solve
+from rlml_slam.deformable.block_tridiagonal import factorize, solve, solve_upper
 from rlml_slam.deformable.model import Indices, Noise, motion, observe_feature
 from rlml_slam.se2 import Array
 
@@ -40,6 +40,24 @@ class Smoothed(NamedTuple):
     cost: Array
     iterations: Indices
     converged: NDArray[np.bool_]
+
+
+@kernel
+def marginals(diagonal: Array, below: Array, cov: Array) -> None:
+    """Cov (N, n, n) <- the diagonal blocks of A^-1, after factorize.
+
+    Sigma_ii = L_ii^-T (I + L_{i+1,i}^T Sigma_{i+1,i+1} L_{i+1,i}) L_ii^-1, from the last block.
+    """
+    N, n, _ = diagonal.shape
+    for i in range(N - 1, -1, -1):
+        inner = np.eye(n)
+        if i + 1 < N:
+            inner += below[i].T @ cov[i + 1] @ below[i]
+        for c in range(n):
+            solve_upper(diagonal[i], inner[:, c])
+        for r in range(n):
+            solve_upper(diagonal[i], inner[r])
+        cov[i] = 0.5 * (inner + inner.T)
 
 
 @kernel

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cholesky factor, solution and marginals of a symmetric block-tridiagonal matrix.
+"""Cholesky factor and solution of a symmetric block-tridiagonal matrix.
 
 ``diagonal`` (N, n, n) holds A_ii and ``below`` (N-1, n, n) holds A_{i+1,i}. Cost N n^3 instead
 of (N n)^3. Everything works in place, so that a batch needs its memory once.
@@ -8,8 +8,6 @@ of (N n)^3. Everything works in place, so that a batch needs its memory once.
 from __future__ import annotations
 
 import math
-
-import numpy as np
 
 from rlml_slam.compiled import kernel
 from rlml_slam.se2 import Array
@@ -76,21 +74,3 @@ def solve(diagonal: Array, below: Array, b: Array) -> None:
         if i + 1 < N:
             b[i] -= below[i].T @ b[i + 1]
         solve_upper(diagonal[i], b[i])
-
-
-@kernel
-def marginals(diagonal: Array, below: Array, cov: Array) -> None:
-    """Cov (N, n, n) <- the diagonal blocks of A^-1, after factorize.
-
-    Sigma_ii = L_ii^-T (I + L_{i+1,i}^T Sigma_{i+1,i+1} L_{i+1,i}) L_ii^-1, from the last block.
-    """
-    N, n, _ = diagonal.shape
-    for i in range(N - 1, -1, -1):
-        inner = np.eye(n)
-        if i + 1 < N:
-            inner += below[i].T @ cov[i + 1] @ below[i]
-        for c in range(n):
-            solve_upper(diagonal[i], inner[:, c])
-        for r in range(n):
-            solve_upper(diagonal[i], inner[r])
-        cov[i] = 0.5 * (inner + inner.T)

@@ -34,28 +34,41 @@ def kernel_of(library: Library) -> Callable[[F], F]:
     return kernel
 
 
-def part(function: F) -> F:
-    """A kernel that kernels alone call is built into them."""
+def _within_kernels(decorator: str) -> Callable[[F], F]:
+    """Of what kernels alone call: it is built into them, and called from Python as it is."""
+
+    def mark(function: F) -> F:
+        setattr(function, DECORATOR, decorator)
+        return function
+
+    return mark
+
+
+DECORATOR = 'decorator_of_kernel'  # attribute: which of jit.py a function has there
+part = _within_kernels('part')
+formula = _within_kernels('formula')
+intrinsic = _within_kernels('intrinsic')
+
+
+def _for_kernels(name: str) -> Callable[..., Any]:
+    """What is a function within kernels only."""
+
+    def function(*_args: Any) -> Any:
+        raise TypeError(f'{name} is for kernels only')
+
+    setattr(function, DECORATOR, name)
     return function
 
 
-formula = part  # called from Python, NumPy evaluates it
-intrinsic = part
-
-
-def load8(*_args: Any) -> Any:
-    """For kernels only, as are the next two."""
-    raise TypeError('for kernels only')
-
-
-fetch = array_at = load8
+load8, fetch, array_at = map(_for_kernels, ('load8', 'fetch', 'array_at'))
 
 
 class _Conversion:
     """What a kernel calls whose arguments are not of the types that it was compiled for.
 
     Numba would compile it once more; here they are converted: a view becomes a contiguous array,
-    and what the kernel writes into it is copied back. TypeError where nothing fits.
+    and what the kernel writes into it is copied back. TypeError where nothing fits. A kernel that
+    the library lacks, of another package, is compiled by Numba.
     """
 
     def __init__(
@@ -72,6 +85,10 @@ class _Conversion:
                 kernel.add(self.checks[-1], getattr(self.module, name))
             if self.checks:
                 return kernel(*args, **(kwargs or {}))
+        if not self.checks:
+            from rlml_slam.kernels.missing import compiled
+
+            return compiled(self.function)(*args, **(kwargs or {}))
         if kwargs:
             args = inspect.signature(self.function).bind(*args, **kwargs).args
         name = f'{self.function.__module__}.{self.function.__name__}'
@@ -87,7 +104,7 @@ class _Conversion:
             for original, copy in copies:
                 original[...] = copy
             return result
-        raise TypeError(f'{name}: {reason if self.checks else "not in the library of kernels"}')
+        raise TypeError(f'{name}: {reason}')
 
 
 def _convert(check: Any, value: Any, copies: list[tuple[Any, Any]]) -> Any:

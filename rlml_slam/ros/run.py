@@ -45,11 +45,11 @@ def run(*factories: Callable[[], Any]) -> int:
 
     A node ends the run by raising SystemExit in a callback. SIGINT and SIGTERM end it with 0.
     """
-    code = answered(factories[0], sys.argv)
-    if code is not None:
-        return code
-    keep_large_apart()
     try:
+        code = answered(factories[0], sys.argv)
+        if code is not None:
+            return code
+        keep_large_apart()
         rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
     except RCLError as e:
         print(f'rlml_slam: {_cause(e)}', file=sys.stderr)

@@ -229,7 +229,7 @@ class Sensors:
         self._heard = time.monotonic()
         if stream not in self._came:
             self._came.add(stream)
-            self._logger.info(f'first {stream}, in frame {frame(msg.header.frame_id)[:100]!r}')
+            self._logger.info(f'first {stream}{_place(msg)}')
         if stream not in PLACED:
             self._use(stream, msg)
             return
@@ -312,6 +312,12 @@ class Sensors:
         self._tell_of_refused()
         for observation in observations:
             self._handle(observation)
+
+
+def _place(msg: Any) -> str:
+    """The frame of a message, in words; nothing for transforms."""
+    header = getattr(msg, 'header', None)
+    return '' if header is None else f', in frame {frame(header.frame_id)[:100]!r}'
 
 
 def largest(params: Node, stream: str) -> int:

@@ -131,7 +131,7 @@ def test_topics_are_those_of_the_node(nodes, name, direction):
         if info.node_name == name and topic not in OF_EVERY_NODE
     }
     documented = {
-        ('/' + t.name.lstrip('/'), t.type, t.qos)
+        ('/' + t.name.replace('~', name).lstrip('/'), t.type, t.qos)
         for t in TOPICS
         if (t.node, t.direction) == (name, direction)
     }

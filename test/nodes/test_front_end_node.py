@@ -272,7 +272,7 @@ def test_wrong_frame_is_counted_and_named(live, node):
 
 def test_first_refusal_of_a_stream_is_told_on_the_console(live, node, monkeypatch):
     said = []
-    monkeypatch.setattr(node.sensors, '_logger', SimpleNamespace(warning=said.append))
+    monkeypatch.setattr(node.sensors, '_logger', SimpleNamespace(warning=said.append, info=print))
     for stream, msg in room(['/scan', '/odom'], seconds=1.0):
         if stream == 'scan':
             msg.ranges = msg.intensities = array('f')
@@ -283,7 +283,7 @@ def test_first_refusal_of_a_stream_is_told_on_the_console(live, node, monkeypatc
 
 def test_what_never_came_is_told_once(live, node, monkeypatch):
     said = []
-    monkeypatch.setattr(node.sensors, '_logger', SimpleNamespace(warning=said.append))
+    monkeypatch.setattr(node.sensors, '_logger', SimpleNamespace(warning=said.append, info=print))
     node.sensors.flush_if_silent()
     assert said == []
     (index,) = (k for k, (stream, _) in enumerate(node.sensors._queues) if stream == 'scan')

@@ -25,7 +25,7 @@ from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import Imu as ImuMsg  # noqa: E402
 from sensor_msgs.msg import LaserScan, PointCloud2  # noqa: E402
 
-from rlml_slam.errors import FileFormatError, ParameterError  # noqa: E402
+from rlml_slam.errors import FileFormatError, InputError, ParameterError  # noqa: E402
 from rlml_slam.nodes.simulator import SimulatorNode  # noqa: E402
 from rlml_slam.params import Reflector, SimulatorParameters, from_mapping  # noqa: E402
 from rlml_slam.ros.codecs import decode  # noqa: E402
@@ -209,7 +209,8 @@ def test_cmd_vel_drives_and_nonsense_is_ignored(context, ear):
     bad.linear.x = float('nan')
     for _ in range(100):
         node.on_cmd_vel(msg)
-        node.on_cmd_vel(bad)
+        with pytest.raises(InputError, match='not finite'):
+            node.on_cmd_vel(bad)  # its listener counts this
         node.tick()
         wall.now += 0.01
     twist = node.simulation.truth(node.simulation.time).twist

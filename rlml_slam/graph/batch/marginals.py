@@ -114,3 +114,4 @@ def warm_up() -> None:
     marginals.poses([1])
     marginals.edges()
     marginals.joint([1])
+    marginals.pose_columns(1, [1])

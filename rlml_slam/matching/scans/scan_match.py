@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import params
-from rlml_slam.compiled import brief, kernel
+from rlml_slam.compiled import brief, kernel, part
 from rlml_slam.matching.scans import correlative_search, surfaces
 from rlml_slam.matching.scans.submap import P_MIN, STEP, Submap
 from rlml_slam.se2 import Array, wrapped
@@ -130,7 +130,7 @@ def sample_curved(
     )  # fmt: skip
 
 
-@kernel
+@part
 def known(value: int) -> float:
     """Value of a cell, an unknown one counting as P_MIN."""
     return float(max(int(value), 1))

@@ -52,13 +52,14 @@ class MapArchive:
 
     def save(self, name: str, back_end: BackEnd, current: SavedMap, undrawn: str) -> str:
         """Write a map under a name; what was written. Raises MapError."""
+        whole = self.folder.whole(name)
         if current.grid is None and len(current.reflectors) == 0:
             raise MapError(undrawn or 'there is no map yet')
         try:
             path = self.folder.save(name, current)
         finally:  # after its image, which would be newer otherwise
             if back_end.keyframes:
-                self._write(self.folder.whole(name), back_end, current.grid)
+                self._write(whole, back_end, current.grid)
         return f'{path}: {contents(current)}{f", no grid: {undrawn}" if undrawn else ""}'
 
     def keep(self, back_end: BackEnd, grid: OccupancyGrid | None, reason: str) -> bool:

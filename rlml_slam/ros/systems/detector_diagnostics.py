@@ -51,6 +51,11 @@ class DetectorHealth:
             return Health(Level.DEGRADED, ('scans have no intensities',))
         return Health()
 
+    def summary(self) -> str:
+        """What there was, in a line for the end of a run."""
+        figures = [f'{what} {n}' for what, n in self.counts.items() if n]
+        return '; '.join(['ends', *figures])
+
     def publish(self) -> None:
         """Send the status."""
         figures: dict[str, object] = dict(self.counts)

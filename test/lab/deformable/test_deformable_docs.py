@@ -68,6 +68,6 @@ def test_bounds_are_those_of_chi2():
 def test_node_is_described_with_its_topics_and_parameters():
     node = TEXT[TEXT.index('## Live') : TEXT.index('## Corrections')]
     topics = {t.name for t in TOPICS if t.node == 'deformable_slam'} - {'/tf_static'}
-    assert topics <= set(re.findall(r'`([/a-z_]+)`', node))
+    assert topics <= set(re.findall(r'`([~/a-z_]+)`', node))
     names = {d.name for d in declarations(DeformableParameters)}
     assert set(re.findall(r'`(deformable\.[a-z_]+)', node)) <= names

@@ -6,6 +6,7 @@ import pytest
 from scipy.optimize import least_squares
 from test_deformable_model import whitened_residuals
 
+from rlml_lab.deformable import nls
 from rlml_lab.deformable.ekf import dead_reckoning, run_ekf
 from rlml_lab.deformable.experiment import ROWS, Draws, Measurements, Row, draw, edges
 from rlml_lab.deformable.nls import run_nls
@@ -45,7 +46,7 @@ def test_block_tridiagonal_solution_and_marginals_are_the_dense_ones():
     block_tridiagonal.solve(diagonal, below, b)
     np.testing.assert_allclose(b, expected, atol=1e-12)
     cov = np.empty_like(diagonal)
-    block_tridiagonal.marginals(diagonal, below, cov)
+    nls.marginals(diagonal, below, cov)
     for i in range(N):
         block = inverse[i * n : (i + 1) * n, i * n : (i + 1) * n]
         np.testing.assert_allclose(cov[i], block, atol=1e-12)
