@@ -189,14 +189,15 @@ class Sensors:
             self._missing = []
 
     def _others(self, missing: list[int]) -> str:
-        """Other topics of the types that are missing."""
+        """Other topics of the types that are missing, but for the node's own."""
+        own = self._node.get_fully_qualified_name() + '/'
         kinds = {STREAMS[self._queues[k][0]][1]: self._queues[k][0] for k in missing}
         known = {subscription.topic_name for _, subscription in self._queues}
         found = [
             f'{topic} ({kinds[t]})'
             for topic, types in sorted(self._node.get_topic_names_and_types())
             for t in types
-            if t in kinds and topic not in known
+            if t in kinds and topic not in known and not topic.startswith(own)
         ]
         return f'; of these types there are {", ".join(found[:8])}' if found else ''
 

@@ -18,8 +18,9 @@ from rlml_slam.cli.support.interface import SERVICES, TOPICS
 ROOT = Path(__file__).resolve().parents[2]
 RVIZ = yaml.safe_load((ROOT / 'config' / 'rlml_slam.rviz').read_text())
 FOXGLOVE = json.loads((ROOT / 'config' / 'foxglove.json').read_text())
-TYPES = {'/' + t.name.lstrip('/'): t.type for t in TOPICS}
-QOS = {'/' + t.name.lstrip('/'): t.qos for t in TOPICS}
+NAMES = {t: '/' + t.name.replace('~', t.node).lstrip('/') for t in TOPICS}
+TYPES = {NAMES[t]: t.type for t in TOPICS}
+QOS = {NAMES[t]: t.qos for t in TOPICS}
 # display or tool of RViz -> what it takes; others have no topic
 TAKES = {
     'Map': 'nav_msgs/OccupancyGrid',
