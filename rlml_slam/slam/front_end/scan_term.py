@@ -105,7 +105,11 @@ class ScanTerm:
         return replace(chosen, motion=replace(chosen.motion, cov=cov))
 
     def _fit(self, observation: Observation) -> float | None:
-        """How well scan and reflectors fit after a motion: 0 to 1, None without any."""
+        """How well scan and reflectors fit after a motion: 0 to 1, None without any.
+
+        A motion is searched for as it will be: a fast turn of the wheels is uncertain. A scan that
+        contradicts the map speaks for no motion, however little of it fits by chance.
+        """
         state, p = copy.deepcopy(self._state), self._p.scan_match
         state.predict(observation.motion, 0.0)
         submap, detections, fits = self.submaps.target, observation.detections, []
@@ -115,8 +119,9 @@ class ScanTerm:
             nothing = Sweep()
             floor2 = np.array(p.variance_floor)
             prior = prior_of(state.x, state.P, floor2, nothing.half, nothing.velocity)
-            found = match(submap, points, *prior, p, searched=False)
-            fits.append(found.score + DOUBT * found.prior_weight)
+            found = self._match(submap, points, *prior)
+            contradicted = self._contradicts(submap, points, found)
+            fits.append(0.0 if contradicted else found.score + DOUBT * found.prior_weight)
             state.x[:3] = se2.compose(state.anchor(0), found.pose)
         landmarks = state.landmarks()
         if detections is not None and len(detections) and len(landmarks):
