@@ -22,6 +22,7 @@ from typing import Any
 
 LIBRARY = '_kernels' + (sysconfig.get_config_var('EXT_SUFFIX') or '.so')
 INDEX = '_kernels.index'  # beside it
+DECORATOR = 'decorator_of_kernel'  # attribute of a function: which one of jit.py it has there
 # What the code of a level may contain, as /proc/cpuinfo names it; best first. Every PC of the last
 # ten years has the first, which an image then runs on as well.
 LEVELS = {

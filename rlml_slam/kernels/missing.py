@@ -7,7 +7,7 @@ import types
 from collections.abc import Callable
 from typing import Any
 
-from rlml_slam.kernels import jit, native
+from rlml_slam.kernels import jit, library
 
 _COMPILED: dict[Callable[..., Any], Any] = {}  # by function
 
@@ -36,7 +36,7 @@ def _callee(value: Any) -> Any:
     """What stands for a global in compiled code."""
     if type(value).__name__ == 'Kernel' and hasattr(value, '__wrapped__'):
         return compiled(value.__wrapped__)
-    decorator = getattr(value, native.DECORATOR, None)
+    decorator = getattr(value, library.DECORATOR, None)
     if decorator in ('part', 'formula'):
         if value not in _COMPILED:
             _COMPILED[value] = getattr(jit, decorator)(_with_compiled(value))

@@ -13,7 +13,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from rlml_slam.kernels.library import Library
+from rlml_slam.kernels.library import DECORATOR, Library
 
 F = TypeVar('F', bound=Callable[..., Any])
 
@@ -44,7 +44,6 @@ def _within_kernels(decorator: str) -> Callable[[F], F]:
     return mark
 
 
-DECORATOR = 'decorator_of_kernel'  # attribute: which of jit.py a function has there
 part = _within_kernels('part')
 formula = _within_kernels('formula')
 intrinsic = _within_kernels('intrinsic')
