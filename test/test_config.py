@@ -46,6 +46,15 @@ def test_parameter_files_name_no_unknown_parameter(path):
     assert read_yaml(path).keys() <= KNOWN
 
 
+@pytest.mark.parametrize('of', NODES)
+def test_a_live_change_is_of_one_set_alone(of):
+    for d in declarations(of):
+        if d.live and isinstance(d.default, float):
+            getattr(of(), d.group).change(d.field, d.default + 0.25 * (d.high - d.default) + 0.125)
+    for d in declarations(of):
+        assert getattr(getattr(of(), d.group), d.field) == d.default
+
+
 def test_every_parameter_says_what_it_is():
     for of in NODES:
         for d in declarations(of):

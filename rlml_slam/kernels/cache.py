@@ -18,6 +18,8 @@ import numba
 
 # What a file with kernels imports to make them.
 MAKER = 'rlml_slam.compiled'
+# They find and call compiled kernels, and are in none.
+LOADING = {f'kernels/{name}.py' for name in ('cache', 'library', 'missing', 'native')}
 
 
 def remove_stale(package: Path) -> None:
@@ -49,9 +51,8 @@ def sources_of(package: Path) -> tuple[str, ...]:
     texts = _texts(package, sorted(package.rglob('*.py')))
     imported: dict[str, set[str]] = {}
     makers = [name for name, text in texts.items() if MAKER.encode() in text]
-    return tuple(
-        sorted(set().union(*(_reached(n, texts, imported, package.name) for n in makers)))
-    )
+    found = set().union(*(_reached(n, texts, imported, package.name) for n in makers))
+    return tuple(sorted(found - LOADING))
 
 
 def _cache_of(folder: Path) -> Path:

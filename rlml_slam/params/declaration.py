@@ -139,7 +139,7 @@ def declarations(of: type[Any]) -> Iterator[Declaration]:
     """All parameters of the groups of the set ``of``, in order of declaration."""
     for g in dataclasses.fields(of):
         prefix = '' if g.name == 'node' else f'{g.name}.'
-        group: Any = type(g.default)
+        group: Any = g.default_factory
         for f in dataclasses.fields(group):
             yield Declaration(
                 prefix + f.name,

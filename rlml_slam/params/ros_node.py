@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from rlml_slam.params.declaration import Group, param
 
@@ -169,4 +169,4 @@ class Player(Group, prefix=''):
 class PlayerParameters:
     """Parameters of bag_player."""
 
-    node: Player = Player()
+    node: Player = field(default_factory=Player)

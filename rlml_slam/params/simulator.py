@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from rlml_slam.params.declaration import Group, param
 
@@ -152,9 +152,9 @@ class Transport(Group):
 class SimulatorParameters:
     """Parameters of simulator; fields of ``node`` have plain ROS names."""
 
-    node: Simulator = Simulator()
-    wheels: Wheels = Wheels()
-    gyro: Gyro = Gyro()
-    laser: Laser = Laser()
-    markers: Markers = Markers()
-    transport: Transport = Transport()
+    node: Simulator = field(default_factory=Simulator)
+    wheels: Wheels = field(default_factory=Wheels)
+    gyro: Gyro = field(default_factory=Gyro)
+    laser: Laser = field(default_factory=Laser)
+    markers: Markers = field(default_factory=Markers)
+    transport: Transport = field(default_factory=Transport)

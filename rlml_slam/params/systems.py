@@ -20,45 +20,45 @@ from rlml_slam.params.simulator import SimulatorParameters
 class Parameters:
     """Parameters of RLML: fields of ``node`` have plain ROS names, all others ``group.field``."""
 
-    node: Node = field(default=Node())
-    motion: MotionNoise = field(default=MotionNoise())
-    reflector: Reflector = field(default=Reflector())
-    detector: Detector = field(default=Detector())
-    submap: Submap = field(default=Submap())
-    scan_match: ScanMatch = field(default=ScanMatch())
-    health: HealthLimits = field(default=HealthLimits())
-    back_end: BackEnd = field(default=BackEnd())
-    loop_closure: LoopClosure = field(default=LoopClosure())
-    relocalization: Relocalization = field(default=Relocalization())
-    solver: Solver = field(default=Solver())
+    node: Node = field(default_factory=Node)
+    motion: MotionNoise = field(default_factory=MotionNoise)
+    reflector: Reflector = field(default_factory=Reflector)
+    detector: Detector = field(default_factory=Detector)
+    submap: Submap = field(default_factory=Submap)
+    scan_match: ScanMatch = field(default_factory=ScanMatch)
+    health: HealthLimits = field(default_factory=HealthLimits)
+    back_end: BackEnd = field(default_factory=BackEnd)
+    loop_closure: LoopClosure = field(default_factory=LoopClosure)
+    relocalization: Relocalization = field(default_factory=Relocalization)
+    solver: Solver = field(default_factory=Solver)
 
 
 @dataclass(frozen=True)
 class EkfParameters(Parameters):
     """Parameters of ekf_slam: its own groups, and those that it shares with RLML."""
 
-    ekf: Ekf = field(default=Ekf())
-    spikes: Spikes = field(default=Spikes())
-    ransac: Ransac = field(default=Ransac())
+    ekf: Ekf = field(default_factory=Ekf)
+    spikes: Spikes = field(default_factory=Spikes)
+    ransac: Ransac = field(default_factory=Ransac)
 
 
 @dataclass(frozen=True)
 class DeformableParameters:
     """Parameters of deformable_slam: its own group, and those that it shares with RLML."""
 
-    node: Node = field(default=Node())
-    motion: MotionNoise = field(default=MotionNoise())
-    reflector: Reflector = field(default=Reflector())
-    deformable: Deformable = field(default=Deformable())
+    node: Node = field(default_factory=Node)
+    motion: MotionNoise = field(default_factory=MotionNoise)
+    reflector: Reflector = field(default_factory=Reflector)
+    deformable: Deformable = field(default_factory=Deformable)
 
 
 @dataclass(frozen=True)
 class DetectorParameters:
     """Parameters of reflector_detector: its own group, and those that it shares with RLML."""
 
-    node: Node = field(default=Node())
-    motion: MotionNoise = field(default=MotionNoise())
-    detector: Detector = field(default=Detector())
+    node: Node = field(default_factory=Node)
+    motion: MotionNoise = field(default_factory=MotionNoise)
+    detector: Detector = field(default_factory=Detector)
 
 
 # names of the nodes that read each set

@@ -149,12 +149,11 @@ class Sensors:
         so that a scan that comes between the two takes is not found to be late.
         """
         queues = {k: first.get(k, []) + self._taken(k) for k in reversed(range(len(self._queues)))}
-        count = 0
         ordered = (queues[k] for k in range(len(self._queues)))
+        count = sum(map(len, queues.values()))
         self._missing = [k for k in self._missing if not queues[k]]
         for item in heapq.merge(*ordered, key=lambda item: _stamp(item[1], self._feed.tf.path)):
             self.add(*item)
-            count += 1
         return count
 
     def flush_if_silent(self) -> None:
@@ -184,13 +183,13 @@ class Sensors:
                 if self._queues[k][0] != 'odom' or not self._feed.tf.path
             ]
             if missing:
-                others = self._others(self._missing)
-                self._logger.warning(f'waiting for {", ".join(missing)}{others}')
+                names = ', '.join(missing) + self._others(self._missing)
+                self._logger.warning(f'waiting for {names}')
             self._missing = []
 
     def _others(self, missing: list[int]) -> str:
         """Other topics of the types that are missing, but for the node's own."""
-        own = self._node.get_fully_qualified_name() + '/'
+        own = f'{self._node.get_fully_qualified_name()}/'
         kinds = {STREAMS[self._queues[k][0]][1]: self._queues[k][0] for k in missing}
         known = {subscription.topic_name for _, subscription in self._queues}
         found = [

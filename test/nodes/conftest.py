@@ -24,14 +24,14 @@ def live(monkeypatch, tmp_path):
 
 
 @pytest.fixture
-def start():
+def start(tmp_path):
     """Starts executables, and ends them with the test."""
     from live import Process
 
     processes = []
 
     def run(name, *args):
-        processes.append(Process(name, *args))
+        processes.append(Process(name, *args, cwd=tmp_path))
         return processes[-1]
 
     yield run

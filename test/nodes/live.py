@@ -101,15 +101,15 @@ def room(topics=tuple(STREAM_OF), seconds=30.0):
 
 
 class Process:
-    """An executable of the package as a process of its own."""
+    """An executable of the package as a process of its own, in the folder ``cwd``."""
 
-    def __init__(self, name, *args):
+    def __init__(self, name, *args, cwd=None):
         env = {k: v for k, v in os.environ.items() if k != '_ROS_WHEELS_BOOTSTRAP_COMPLETE'}
         env |= {'ROS_DOMAIN_ID': str(DOMAIN), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
         env['PYTHONPATH'] = os.pathsep.join([str(ROOT), env.get('PYTHONPATH', '')])
         self._process = subprocess.Popen(
             [sys.executable, '-m', name if '.' in name else f'rlml_slam.nodes.{name}', *args],
-            env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            cwd=cwd, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         )  # fmt: skip
 
     def interrupt(self):

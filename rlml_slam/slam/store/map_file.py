@@ -70,7 +70,7 @@ def parameters_of(content: Content) -> Parameters:
     with consistent():
         saved = content.description['parameters']
         for group in dataclasses.fields(Parameters):
-            kind: Any = type(group.default)
+            kind: Any = group.default_factory
             known = {f.name for f in dataclasses.fields(kind)}
             values = saved.get(group.name, {})
             groups[group.name] = kind(**{k: v for k, v in values.items() if k in known})
