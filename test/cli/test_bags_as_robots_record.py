@@ -24,8 +24,7 @@ from rlml_slam.types import Odometry, Scan
 SECOND = 1_000_000_000
 MOUNT = np.array([0.3, 0.0, 0.1])
 FOOT = np.array([0.0, 0.1, 0.0])
-ROOM = ('--seed', '1', '--set', 'laser.beams=360', '--set', 'wheels.rate=20', '--set',
-        'gyro.rate=25', '--set', 'truth_rate=10')  # fmt: skip
+ROOM = ('--seed', '1', '--set', 'wheels.rate=20', '--set', 'gyro.rate=25')
 
 
 def write(path, tf, scans=20, topics=('/scan', '/tf'), storage='mcap'):
@@ -146,7 +145,11 @@ def recorded(tmp_path_factory):
 
 
 def test_trajectory_and_reflectors_are_as_with_the_topics(recorded):
-    """Without the IMU, which such a bag does not have; the detector is better than the markers."""
+    """Without the IMU, which such a bag does not have.
+
+    A laser of 1440 beams measures a reflector at least as well as the simulated detector, 2 cm and
+    3 mrad. One of 360 beams, 17 mrad apart, does not, whatever is done with them.
+    """
     p = Parameters()
     without_imu = replace(p, node=replace(p.node, use_imu=False))
     topics = metrics(replay(recorded / 'topics', without_imu))

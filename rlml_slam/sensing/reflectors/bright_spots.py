@@ -26,8 +26,11 @@ SIGMAS = 4.0  # of the noise of a shape: 3 of 100 000 reflectors are noisier
 SPACED = 0.5  # reflectors' widths between beams that may well miss a gap beside one
 WHOLE = 0.3  # share of its brightness down to which a thing of one depth is one thing
 # columns of what a bright spot is
-FATE, RANGE, BEARING, VAR_RANGE, VAR_BEARING, DIAMETER, BEAM, WIDTH, PEAK = range(9)
-COLUMNS = 9
+FATE, RANGE, BEARING, VAR_RANGE, VAR_BEARING, ODDS, BEAM, WIDTH, PEAK, ROUND, FLAT, TILTED = range(
+    12
+)
+COLUMNS = 12
+SURE = 20.0  # log of the odds of a shape where the other one does not fit
 Ints = NDArray[np.int64]
 
 
@@ -147,10 +150,15 @@ def _place(
     row: Array, spot: Spot, beams: Beams, span: float, whole: float, hidden: bool,
     settings: Settings,
 ) -> Fate:  # fmt: skip
-    """Range and variances of the shapes that fit, into ``row``; or why none does."""
+    """Range to the centre by shape, the log of the odds of flat against round, and variances.
+
+    Into ``row``; or why no shape fits. ODDS are those of the width, and of the ranges about any
+    tilt; TILTED those of the tilt, which is 0 for a cylinder and of variance 1 for a flat one.
+    """
     footprint, spacing = spot.range * settings.divergence, spot.spacing
-    weights, total = np.zeros(2), 0.0
-    along, spread = np.zeros(2), np.zeros(2)
+    size = max(settings.diameter, settings.flat_width)
+    log_fit = np.full(2, -np.inf)
+    along, spread, bent = np.zeros(2), np.zeros(2), np.zeros(2)
     narrow, wide = True, True
     for shape in range(2):
         width = settings.diameter if shape == 0 else settings.flat_width
@@ -163,29 +171,40 @@ def _place(
         if is_narrow or is_wide:
             continue
         radius = 0.5 * width if shape == 0 else 0.0
-        along[shape], spread[shape] = centre_of(radius, spot, beams, settings.divergence)
+        along[shape], spread[shape], bent[shape] = centre_of(
+            radius, spot, beams, settings.divergence
+        )
         if spot.num >= CURVED and spread[shape] > _noise(spot, settings) + (ROUGH * width) ** 2:
             continue
         if shape == 0 and not hidden and is_flat(spot, beams, spread[0], radius, settings):
             continue
         # each of the two edges is uniform within one spacing of beams: variance spacing^2 / 12
         var_width = spacing**2 / 6.0 + (0.5 * settings.size_tolerance) ** 2 + 1e-12
-        weights[shape] = math.exp(-0.5 * (row[WIDTH] - width) ** 2 / var_width) + 1e-9
-        total += weights[shape]
-    if total == 0.0:
+        rough = settings.sigma_range**2 + (ROUGH * width) ** 2
+        log_fit[shape] = (
+            -0.5 * (row[WIDTH] - width) ** 2 / var_width
+            - 0.5 * (spot.num - 1) * bent[shape] / rough
+        )
+    if log_fit[0] > -np.inf and log_fit[1] > -np.inf:
+        rough = settings.sigma_range**2 + (ROUGH * size) ** 2
+        info = spacing**2 * spot.num * (spot.num**2 - 1.0) / 12.0 / rough
+        squares = (spot.num - 1) * (spread[0] - bent[0]) / rough
+        row[TILTED] = 0.5 * (squares * info / (1.0 + info) - math.log(1.0 + info))
+    best = max(log_fit[0], log_fit[1])
+    if best == -np.inf:
         return Fate.NARROW if narrow else (Fate.WIDE if wide else Fate.DEEP)
-    is_round = weights[0] >= weights[1]
-    mean = (weights[0] * along[0] + weights[1] * along[1]) / total
-    between = weights[0] * weights[1] / total**2 * (along[0] - along[1]) ** 2
+    row[ODDS] = max(-SURE, min(SURE, log_fit[1] - log_fit[0]))
+    row[ROUND] = along[0] if log_fit[0] > -np.inf else along[1]
+    row[FLAT] = along[1] if log_fit[1] > -np.inf else along[0]
+    row[VAR_RANGE] = settings.sigma_range**2 / spot.num + settings.sigma_floor**2
+    is_round = row[ODDS] + row[TILTED] <= 0.0
     width = settings.diameter if is_round else settings.flat_width
-    row[RANGE] = mean
-    row[VAR_RANGE] = settings.sigma_range**2 / spot.num + settings.sigma_floor**2 + between
+    mean = row[ROUND] if is_round else row[FLAT]
     # the middle of samples that lie ``spacing`` apart; one alone lies anywhere on the reflector
     across = min(spacing, width + footprint) ** 2 / 12.0 / spot.num
     if hidden:
         across += width**2 / 12.0
     row[VAR_BEARING] = across / mean**2 + settings.sigma_bearing**2
-    row[DIAMETER] = settings.diameter if is_round else np.nan
     return Fate.FOUND
 
 

@@ -29,7 +29,6 @@ from rlml_slam.sensing.reflectors.background_intensity import (
     valid_beams,
 )
 from rlml_slam.sensing.reflectors.bright_spots import FATE, PEAK, RANGE, WIDTH, Fate, find
-from rlml_slam.sensing.reflectors.reflector_detector import detect
 from rlml_slam.sensing.reflectors.spot_settings import Beams, settings_of
 from rlml_slam.types import Scan
 
@@ -48,8 +47,6 @@ PERIOD = 25  # scans between two estimates
 SIZES = np.geomspace(0.02, WIDEST, 40)  # [m]
 DIVERGENCES = np.array([0.001, 0.002, 0.003, 0.005, 0.008, 0.012, 0.016])  # [rad]
 AS_GOOD = 0.97  # share of the spots of the best size that another size has to explain
-AS_MANY = 0.8  # share of the reflectors of the other shape that the expected shape has to find
-RECENT = 4  # scans with which the shape is decided
 TOLERANCE = 0.3  # of the size, by which it may be off
 
 
@@ -90,7 +87,6 @@ class ReflectorCalibration:
         self._counts = np.zeros((OCTAVES, BINS + 1), np.int64)
         # range, width, peak, and spacing of beams at that range; of the scans' number
         self._spots: deque[tuple[float, float, float, float]] = deque(maxlen=SPOTS)
-        self._recent: deque[Scan] = deque(maxlen=RECENT)
         self.num_scans = 0
         self.result: Calibration | None = None
 
@@ -114,8 +110,6 @@ class ReflectorCalibration:
         rows = find(beams, np.where(seen, bound, 0.0), settings)
         fates = rows[:, FATE].astype(np.int64)
         small = ~np.isin(fates, (Fate.DIM, Fate.FEW, Fate.RANGE, Fate.HIDDEN, Fate.FADING))
-        if small.any():
-            self._recent.append(scan)
         for row in rows[small & (rows[:, WIDTH] < WIDEST + rows[:, RANGE] * DIVERGENCES[-1])]:
             r = float(row[RANGE])
             self._spots.append((r, float(row[WIDTH]), float(row[PEAK]), r * step))
@@ -156,19 +150,12 @@ class ReflectorCalibration:
             # next to what has no intensity, every edge is sharp
             edge_contrast=0.0 if math.isinf(ratio) else self._p.edge_contrast,
         )  # fmt: skip
-        shapes = [
-            Calibration(replace(detector, diameter=diameter, flat_width=flat), diffuse, ratio)
-            for diameter, flat in ((size, 0.0), (0.0, size))
-        ]
+        # each reflector shows by itself which of both shapes it has, unless all are flat
+        diameter, flat_width = size if self._p.diameter > 0.0 else 0.0, size
         if self._p.diameter > 0.0 and self._p.flat_width > 0.0:
-            both = replace(detector, diameter=self._p.diameter, flat_width=self._p.flat_width)
-            return Calibration(both, diffuse, ratio)
-        if self._p.flat_width > 0.0:  # that is what is expected
-            shapes.reverse()
-        expected, other = (
-            sum(len(detect(s, c.detector, c.floor)) for s in self._recent) for c in shapes
-        )
-        return shapes[0] if expected >= AS_MANY * other else shapes[1]
+            diameter, flat_width = self._p.diameter, self._p.flat_width
+        detector = replace(detector, diameter=diameter, flat_width=flat_width)
+        return Calibration(detector, diffuse, ratio)
 
     def _size(self, spots: Array) -> tuple[float, float]:
         """Size [m] and divergence [rad] that explain most spots: the given ones if they do.

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,10 +17,12 @@ from rlml_slam.sensing.reflectors.bright_spots import (
     BEAM,
     BEARING,
     COLUMNS,
-    DIAMETER,
     FATE,
+    FLAT,
+    ODDS,
     PEAK,
-    RANGE,
+    ROUND,
+    TILTED,
     VAR_BEARING,
     VAR_RANGE,
     WIDTH,
@@ -40,7 +42,8 @@ class Found:
 
     ``points`` (n, 2) [m], ``cov`` (n, 2, 2) [m^2]; ``diameters`` (n,) [m], NaN for flat ones;
     ``beams`` (n,) [0, number of beams) of their middles; ``widths`` (n,) [m] as seen;
-    ``intensities`` (n,) of their brightest beams. ``rejected`` counts other bright spots by Fate.
+    ``intensities`` (n,) of their brightest beams; ``odds`` (n,) the logarithm of the odds that
+    they are flat. ``rejected`` counts other bright spots by Fate.
     """
 
     points: Array
@@ -49,12 +52,30 @@ class Found:
     beams: Array
     widths: Array
     intensities: Array
+    odds: Array
     rejected: dict[Fate, int] = field(default_factory=dict)
+    rows: Array = field(default_factory=lambda: np.zeros((0, COLUMNS)), repr=False)
 
     def __len__(self) -> int:
         return len(self.points)
 
-    def at_stamp(self, scan: Scan, T_base_laser: Array, sweep: Array) -> Detections:
+    def with_odds(self, odds: Array, diameter: float) -> Found:
+        """The same where the odds of the shapes (n,) are better known.
+
+        The range is the mean over the shapes, and its variance has what they differ by: with the
+        share f of flat, f (1 - f) (r_flat - r_round)^2.
+        """
+        rows, flat = self.rows, 1.0 / (1.0 + np.exp(-odds))
+        r = rows[:, ROUND] + flat * (rows[:, FLAT] - rows[:, ROUND])
+        u = np.stack([np.cos(rows[:, BEARING]), np.sin(rows[:, BEARING])], -1)
+        var = rows[:, VAR_RANGE] + flat * (1.0 - flat) * (rows[:, FLAT] - rows[:, ROUND]) ** 2
+        cov = polar_covariance(u, var, r**2 * rows[:, VAR_BEARING])
+        diameters = np.where(odds > 0.0, np.nan, diameter)
+        return replace(self, points=r[:, None] * u, cov=cov, diameters=diameters, odds=odds)
+
+    def at_stamp(
+        self, scan: Scan, T_base_laser: Array, sweep: Array, once: bool = True
+    ) -> Detections:
         """The same as anonymous detections in the frame of the laser at the scan's stamp.
 
         ``sweep`` (3,) is the motion of base during the whole sweep, at constant twist: what beam
@@ -69,10 +90,10 @@ class Found:
         cov = np.einsum('nij,njk,nlk->nil', R, self.cov, R)
         apart = np.linalg.norm(points[:, None] - points, axis=-1)
         again = (apart < SAME) & (share[:, None] - share > 0.5)
-        once = ~again.any(axis=1)
-        ids = np.full(int(once.sum()), ANONYMOUS, dtype=np.int64)
+        kept = ~(once & again.any(axis=1))
+        ids = np.full(int(kept.sum()), ANONYMOUS, dtype=np.int64)
         return Detections(
-            scan.stamp, scan.frame_id, points[once], cov[once], ids, self.diameters[once]
+            scan.stamp, scan.frame_id, points[kept], cov[kept], ids, self.diameters[kept]
         )
 
 
@@ -83,14 +104,14 @@ def detect(scan: Scan, params: Detector, floor: Callable[[Array], Array] | None 
     """
     n = len(scan.ranges)
     if len(scan.intensities) != n or n == 0 or scan.angle_increment == 0.0:
-        return _found(scan, np.zeros((0, COLUMNS)))
+        return _found(scan, np.zeros((0, COLUMNS)), params)
     ranges, bright, bound = levels(scan, params, floor)
     settings = settings_of(params)
     beams = Beams(
         ranges, bright, settings.extent * bound,
         float(scan.angle_min), float(scan.angle_increment), is_circular(scan),
     )  # fmt: skip
-    return _found(scan, find(beams, bound, settings))
+    return _found(scan, find(beams, bound, settings), params)
 
 
 def threshold(scan: Scan, params: Detector) -> Array:
@@ -98,18 +119,15 @@ def threshold(scan: Scan, params: Detector) -> Array:
     return levels(scan, params)[2]
 
 
-def _found(scan: Scan, rows: Array) -> Found:
+def _found(scan: Scan, rows: Array, p: Detector) -> Found:
     fates = rows[:, FATE].astype(np.int64)
     counts = np.bincount(fates, minlength=len(Fate))
     rejected = {fate: int(counts[fate]) for fate in Fate if fate and counts[fate]}
     rows = rows[fates == Fate.FOUND]
-    u = np.stack([np.cos(rows[:, BEARING]), np.sin(rows[:, BEARING])], -1)
-    r = rows[:, RANGE]
-    cov = polar_covariance(u, rows[:, VAR_RANGE], r**2 * rows[:, VAR_BEARING])
-    return Found(
-        r[:, None] * u, cov, rows[:, DIAMETER], rows[:, BEAM] % max(len(scan.ranges), 1),
-        rows[:, WIDTH], rows[:, PEAK], rejected,
-    )  # fmt: skip
+    beams, none = rows[:, BEAM] % max(len(scan.ranges), 1), np.zeros(0)
+    odds = rows[:, ODDS] + rows[:, TILTED]
+    found = Found(none, none, none, beams, rows[:, WIDTH], rows[:, PEAK], odds, rejected, rows)
+    return found.with_odds(odds, p.diameter)
 
 
 def warm_up() -> None:

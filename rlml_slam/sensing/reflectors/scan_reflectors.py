@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import math
 
+from rlml_slam import se2
 from rlml_slam.params import Detector
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.reflectors.reflector_calibration import Calibration, ReflectorCalibration
 from rlml_slam.sensing.reflectors.reflector_detector import detect
+from rlml_slam.sensing.reflectors.reflector_shapes import ReflectorShapes
 from rlml_slam.types import Detections, Scan
 
 MAX_LASERS = 16
@@ -25,10 +27,16 @@ class ScanReflectors:
         self._p = params
         self._mode = mode
         self._lasers: dict[str, ReflectorCalibration] = {}
+        self._shapes = ReflectorShapes()
         self.num_scans = self.num_found = 0
 
-    def detections(self, scan: Scan, T_base_laser: Array, sweep: Array) -> Detections | None:
-        """The reflectors of a scan at its stamp, in the frame of the laser; None if not looked."""
+    def detections(
+        self, scan: Scan, T_base_laser: Array, sweep: Array, T_odom_base: Array | None = None
+    ) -> Detections | None:
+        """The reflectors of a scan at its stamp, in the frame of the laser; None if not looked.
+
+        With the pose of base in odom (3,), the scans before help to say what their shape is.
+        """
         if self._mode == 'off' or len(scan.intensities) != len(scan.ranges):
             return None
         detector, calibration = self._p, None
@@ -38,6 +46,12 @@ class ScanReflectors:
                 return None
             detector = calibration.detector
         found = detect(scan, detector, None if calibration is None else calibration.floor)
+        if T_odom_base is not None:
+            points = found.at_stamp(scan, T_base_laser, sweep, once=False).points
+            T_odom_laser = se2.compose(T_odom_base, T_base_laser)
+            points = se2.transform(T_odom_laser, points)
+            odds = self._shapes.update(scan.stamp, points, T_odom_laser[:2], found.rows)
+            found = found.with_odds(odds, detector.diameter)
         self.num_scans += 1
         self.num_found += len(found)
         return found.at_stamp(scan, T_base_laser, sweep)

@@ -27,7 +27,7 @@ def is_flat(spot: Spot, beams: Beams, spread: float, radius: float, settings: Se
     being the mean squared residual of the cylinder; or if it lies in a surface that goes on
     straight at both sides, as paint and glare do: a cylinder stands out of what it is fixed to.
     """
-    _, flat = centre_of(0.0, spot, beams, settings.divergence)
+    _, flat, _ = centre_of(0.0, spot, beams, settings.divergence)
     variance = settings.sigma_range**2
     better = spread - flat - (ROUGH * radius) ** 2
     if spot.num >= CURVED and (spot.num - 1) * better > FLATTER * variance:
@@ -73,8 +73,13 @@ def _beside_spot(spot: Spot, beams: Beams, settings: Settings, x: Array, y: Arra
 
 
 @part
-def centre_of(radius: float, spot: Spot, beams: Beams, divergence: float) -> tuple[float, float]:
-    """Range of the centre, and the variance that beams leave about it and a tilt."""
+def centre_of(
+    radius: float, spot: Spot, beams: Beams, divergence: float
+) -> tuple[float, float, float]:
+    """Range of the centre, the variance that beams leave about it, and that about a tilt as well.
+
+    A flat one may be tilted: for it, the first is the second.
+    """
     n, r = len(beams.ranges), spot.range
     footprint = r * divergence
     power = mean = squares = 0.0
@@ -100,10 +105,11 @@ def centre_of(radius: float, spot: Spot, beams: Beams, divergence: float) -> tup
     sxx -= sx * sx / power
     sxy -= sx * sy / power
     syy -= sy * sy / power
-    if sxx > 0.0 and radius == 0.0:
-        syy -= sxy * sxy / sxx  # a flat one may be tilted
     freedom = power - squares / power
-    return mean / power, max(syy, 0.0) / freedom if freedom > 0.0 else 0.0
+    if freedom <= 0.0:
+        return mean / power, 0.0, 0.0
+    bent = max(syy - sxy * sxy / sxx, 0.0) if sxx > 0.0 else syy
+    return mean / power, (bent if radius == 0.0 else max(syy, 0.0)) / freedom, bent / freedom
 
 
 @kernel

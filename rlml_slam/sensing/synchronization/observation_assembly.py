@@ -88,7 +88,7 @@ class ObservationAssembly:
                 scan, T = w.item, T_base_sensor
                 sweep = self._sweep(w.item, w.delay, moved)
                 if self._detects and not any(w.stream == 'reflectors' for w in group):
-                    seen = self.reflectors.detections(scan, T, sweep)
+                    seen = self.reflectors.detections(scan, T, sweep, odom_pose)
                     detections = None if seen is None else self._in_base(seen, T)
         if scan is not None and T is not None and sweep is not None:
             points = project(scan, T, sweep, self._p.submap.max_laser_range)

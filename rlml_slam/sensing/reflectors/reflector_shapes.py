@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Flat or round: what the scans of one reflector say of its shape, added up.
+
+The centre of a cylinder is a radius behind what the beams meet, that of a flat reflector is not.
+A few beams cannot say which of them it is, and guessing is an error of a radius that is the same
+in every scan, so no covariance of a single scan describes it. All scans of one reflector can.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam import se2
+from rlml_slam.se2 import Array
+from rlml_slam.sensing.reflectors.bright_spots import ODDS, SURE, TILTED
+
+NEAR = 0.2  # [m] between a reflector and where it was seen last
+MEMORY = 5_000_000_000  # [ns] for which odometry leaves it there
+VIEW = 0.1  # [rad] by which a reflector is seen from another side
+# round and flat ones, as if seen before: cylinders are more frequent, and a site has one kind
+EXPECTED = 1.0, 0.3
+DECIDED = 3.0  # log of the odds from which on a reflector counts as one of its shape
+
+
+class ReflectorShapes:
+    """The reflectors that were seen lately, in the frame of odometry.
+
+    ``prior`` is the log of the odds that an unknown one is flat: as the decided ones are.
+    """
+
+    def __init__(self) -> None:
+        self._points = np.zeros((0, 2))
+        self._odds = np.zeros(0)
+        self._views = np.zeros(0)
+        self._stamps = np.zeros(0, np.int64)
+        self._decided = np.array(EXPECTED)  # round and flat ones so far
+
+    @property
+    def prior(self) -> float:
+        """Log of the odds that a reflector of which nothing is known is flat."""
+        num_round = self._decided[0] + np.sum(self._odds < -DECIDED)
+        num_flat = self._decided[1] + np.sum(self._odds > DECIDED)
+        return float(np.log(num_flat / num_round))
+
+    def update(self, stamp: int, points: Array, origin: Array, rows: Array) -> Array:
+        """Odds (n,) that reflectors are flat, by this scan and those before.
+
+        ``points`` (n, 2) and the laser at ``origin`` (2,) are in odom, ``rows`` (n, COLUMNS) what
+        the scan shows. From one view a tilt is the same in all scans: it counts once.
+        """
+        self._forget(self._stamps < stamp - MEMORY)
+        n = len(points)
+        before = self._nearest(points)
+        seen = before >= 0
+        odds, view = rows[:, ODDS].copy(), np.arctan2(*(points - origin).T[::-1])
+        odds[seen] += self._odds[before[seen]]
+        last = np.full(n, np.inf)
+        last[seen] = self._views[before[seen]]
+        with np.errstate(invalid='ignore'):
+            is_new = ~(np.abs(se2.wrap(view - last)) < VIEW)
+        odds[is_new] += rows[is_new, TILTED]
+        odds = np.clip(odds, -SURE, SURE)
+        view[~is_new] = last[~is_new]
+        kept = np.setdiff1d(np.arange(len(self._points)), before)
+        self._points = np.concatenate([self._points[kept], points])
+        self._odds = np.concatenate([self._odds[kept], odds])
+        self._views = np.concatenate([self._views[kept], view])
+        self._stamps = np.concatenate([self._stamps[kept], np.full(n, stamp, np.int64)])
+        return np.asarray(odds + self.prior)
+
+    def _nearest(self, points: Array) -> NDArray[np.int64]:
+        """Index (n,) of the known reflector at each point, each once; -1 for none."""
+        out = np.full(len(points), -1)
+        if not len(self._points):
+            return out
+        distance = np.linalg.norm(points[:, None] - self._points, axis=-1)
+        for i in np.argsort(distance.min(axis=1)):
+            j = int(distance[i].argmin())
+            if distance[i, j] < NEAR:
+                out[i] = j
+                distance[:, j] = np.inf
+        return out
+
+    def _forget(self, old: NDArray[np.bool_]) -> None:
+        """Drop reflectors that are out of view; what they were is what others are likely to be."""
+        for is_flat in (0, 1):
+            sign = 2 * is_flat - 1
+            self._decided[is_flat] += np.sum(sign * self._odds[old] > DECIDED)
+        self._points, self._odds = self._points[~old], self._odds[~old]
+        self._views, self._stamps = self._views[~old], self._stamps[~old]
