@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from rlml_slam.params.declaration import Group, param
 
@@ -61,5 +61,5 @@ class Carrier(Group):
 class CarrierParameters:
     """Parameters of carrier_simulator."""
 
-    node: CarrierRun = CarrierRun()
-    carrier: Carrier = Carrier()
+    node: CarrierRun = field(default_factory=CarrierRun)
+    carrier: Carrier = field(default_factory=Carrier)
