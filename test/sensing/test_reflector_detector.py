@@ -337,6 +337,24 @@ def test_the_sweeps_motion_is_taken_out():
     assert (seen.stamp, seen.frame_id) == (scan.stamp, scan.frame_id)
 
 
+def test_what_is_not_known_of_the_sweeps_motion_is_in_the_covariance():
+    """J cov J^T with J by central differences."""
+    scan = made_scan([(*polar(2.0, b), 0.08) for b in (-2.0, 0.3, 2.5)])
+    sweep, T = np.array([1e-3, 0.0, 1e-3]), np.array([0.2, -0.1, 0.5])
+    found, eps = detect(scan, THIN), 1e-6
+    J = np.stack(
+        [
+            found.at_stamp(scan, T, sweep + eps * e).points
+            - found.at_stamp(scan, T, sweep - eps * e).points
+            for e in np.eye(3)
+        ],
+        axis=-1,
+    ) / (2.0 * eps)
+    cov = np.diag([1e-4, 1e-5, 2e-5])
+    added = found.at_stamp(scan, T, sweep, cov).cov - found.at_stamp(scan, T, sweep).cov
+    assert_allclose(added, J @ cov @ J.transpose(0, 2, 1), rtol=0.01, atol=1e-8)
+
+
 # simulated scans
 
 

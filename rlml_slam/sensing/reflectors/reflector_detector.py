@@ -59,28 +59,37 @@ class Found:
     def __len__(self) -> int:
         return len(self.points)
 
-    def with_odds(self, odds: Array, diameter: float) -> Found:
+    def with_odds(self, odds: Array, diameter: float, shared: float = 1.0) -> Found:
         """The same where the odds of the shapes (n,) are better known.
 
         The range is the mean over the shapes, and its variance has what they differ by: with the
-        share f of flat, f (1 - f) (r_flat - r_round)^2.
+        share f of flat, f (1 - f) (r_flat - r_round)^2, times the scans that it is ``shared`` by.
         """
         rows, flat = self.rows, 1.0 / (1.0 + np.exp(-odds))
         r = rows[:, ROUND] + flat * (rows[:, FLAT] - rows[:, ROUND])
         u = np.stack([np.cos(rows[:, BEARING]), np.sin(rows[:, BEARING])], -1)
-        var = rows[:, VAR_RANGE] + flat * (1.0 - flat) * (rows[:, FLAT] - rows[:, ROUND]) ** 2
+        var = (
+            rows[:, VAR_RANGE]
+            + shared * flat * (1.0 - flat) * (rows[:, FLAT] - rows[:, ROUND]) ** 2
+        )
         cov = polar_covariance(u, var, r**2 * rows[:, VAR_BEARING])
         diameters = np.where(odds > 0.0, np.nan, diameter)
         return replace(self, points=r[:, None] * u, cov=cov, diameters=diameters, odds=odds)
 
     def at_stamp(
-        self, scan: Scan, T_base_laser: Array, sweep: Array, once: bool = True
+        self,
+        scan: Scan,
+        T_base_laser: Array,
+        sweep: Array,
+        sweep_cov: Array | None = None,
+        once: bool = True,
     ) -> Detections:
         """The same as anonymous detections in the frame of the laser at the scan's stamp.
 
         ``sweep`` (3,) is the motion of base during the whole sweep, at constant twist: what beam
-        k of n saw is moved by T_base_laser^-1 exp(k / n log(sweep)) T_base_laser. A reflector
-        that a turning laser saw with its first and again with its last beams is returned once.
+        k of n saw is moved by T_base_laser^-1 exp(k / n log(sweep)) T_base_laser, and is off by
+        k / n of the error of ``sweep``, whose covariance is ``sweep_cov`` (3, 3). A reflector that
+        a turning laser saw with its first and again with its last beams is returned once.
         """
         share = self.beams / max(len(scan.ranges), 1)
         moved = se2.exp(share[:, None] * se2.log(sweep))
@@ -88,6 +97,9 @@ class Found:
         R = se2.rotation(T[:, 2])
         points = np.einsum('nij,nj->ni', R, self.points) + T[:, :2]
         cov = np.einsum('nij,njk,nlk->nil', R, self.cov, R)
+        if sweep_cov is not None:
+            J = _turned_by_sweep(points, T_base_laser, share)
+            cov = cov + J @ sweep_cov @ J.transpose(0, 2, 1)
         apart = np.linalg.norm(points[:, None] - points, axis=-1)
         again = (apart < SAME) & (share[:, None] - share > 0.5)
         kept = ~(once & again.any(axis=1))
@@ -95,6 +107,16 @@ class Found:
         return Detections(
             scan.stamp, scan.frame_id, points[kept], cov[kept], ids, self.diameters[kept]
         )
+
+
+def _turned_by_sweep(points: Array, T_base_laser: Array, share: Array) -> Array:
+    """Jacobian (n, 2, 3) of points (n, 2) in the laser's frame with respect to the sweep."""
+    p = se2.transform(T_base_laser, points)
+    J = np.zeros((len(points), 2, 3))
+    J[:, :, :2] = np.eye(2)
+    J[:, 0, 2], J[:, 1, 2] = -p[:, 1], p[:, 0]
+    out: Array = share[:, None, None] * (se2.rotation(T_base_laser[2]).T @ J)
+    return out
 
 
 def detect(scan: Scan, params: Detector, floor: Callable[[Array], Array] | None = None) -> Found:

@@ -17,6 +17,9 @@ from rlml_slam.sensing.reflectors.bright_spots import ODDS, SURE, TILTED
 
 NEAR = 0.2  # [m] between a reflector and where it was seen last
 MEMORY = 5_000_000_000  # [ns] for which odometry leaves it there
+# scans that share what is open about a shape: some 3 s from a similar view. They are fused as if
+# they were independent, so each has the variance of their mean times their number.
+SHARED = 30.0
 VIEW = 0.1  # [rad] by which a reflector is seen from another side
 # round and flat ones, as if seen before: cylinders are more frequent, and a site has one kind
 EXPECTED = 1.0, 0.3

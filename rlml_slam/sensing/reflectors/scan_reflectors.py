@@ -10,7 +10,7 @@ from rlml_slam.params import Detector
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.reflectors.reflector_calibration import Calibration, ReflectorCalibration
 from rlml_slam.sensing.reflectors.reflector_detector import detect
-from rlml_slam.sensing.reflectors.reflector_shapes import ReflectorShapes
+from rlml_slam.sensing.reflectors.reflector_shapes import SHARED, ReflectorShapes
 from rlml_slam.types import Detections, Scan
 
 MAX_LASERS = 16
@@ -31,11 +31,17 @@ class ScanReflectors:
         self.num_scans = self.num_found = 0
 
     def detections(
-        self, scan: Scan, T_base_laser: Array, sweep: Array, T_odom_base: Array | None = None
+        self,
+        scan: Scan,
+        T_base_laser: Array,
+        sweep: Array,
+        sweep_cov: Array | None = None,
+        T_odom_base: Array | None = None,
     ) -> Detections | None:
         """The reflectors of a scan at its stamp, in the frame of the laser; None if not looked.
 
-        With the pose of base in odom (3,), the scans before help to say what their shape is.
+        ``sweep`` (3,) is the motion of base during the sweep with its covariance. With the pose of
+        base in odom (3,), the scans before help to say what the shape of a reflector is.
         """
         if self._mode == 'off' or len(scan.intensities) != len(scan.ranges):
             return None
@@ -51,10 +57,10 @@ class ScanReflectors:
             T_odom_laser = se2.compose(T_odom_base, T_base_laser)
             points = se2.transform(T_odom_laser, points)
             odds = self._shapes.update(scan.stamp, points, T_odom_laser[:2], found.rows)
-            found = found.with_odds(odds, detector.diameter)
+            found = found.with_odds(odds, detector.diameter, SHARED)
         self.num_scans += 1
         self.num_found += len(found)
-        return found.at_stamp(scan, T_base_laser, sweep)
+        return found.at_stamp(scan, T_base_laser, sweep, sweep_cov)
 
     def _calibrated(self, scan: Scan) -> Calibration | None:
         laser = self._lasers.get(scan.frame_id)
