@@ -80,6 +80,7 @@ setup(
         (f'share/{NAME}/launch', sorted(glob('launch/*.launch.py'))),
     ],
     install_requires=[
+        'argcomplete',
         'matplotlib',
         'numba',
         'numpy',

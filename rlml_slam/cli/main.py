@@ -110,6 +110,8 @@ def main(
     description: str = '2D SLAM and localization with reflectors and a laser.',
 ) -> int:
     """Run one command line of the command ``prog``; the exit code."""
+    if '_ARGCOMPLETE' in os.environ:
+        complete(table, prog)
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         parser, module = build_parser(arguments, table, prog, description)
@@ -129,6 +131,15 @@ def main(
         # the reader of our output went away, e.g. `rlml … | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+
+
+def complete(table: Table, prog: str) -> None:
+    """Answer a shell that asks for completions of its line, and end the process."""
+    import argcomplete
+
+    line, point = os.environ['COMP_LINE'], int(os.environ['COMP_POINT'])
+    parser, _ = build_parser(line.encode()[:point].decode().split()[1:], table, prog)
+    argcomplete.autocomplete(parser)
 
 
 def build_parser(

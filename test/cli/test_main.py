@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import os
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -132,3 +133,24 @@ def test_relations_are_evaluated(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)['trans_mean_m'] == pytest.approx(0.1)
     assert main(arguments) == 0
     assert '0.1000 ± 0.0000 m' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ('line', 'expected'),
+    [
+        ('rlml re', {'replay'}),
+        ('rlml map in', {'info'}),
+        ('rlml call ', {'save_map', 'load_map', 'relocalize'}),
+        ('rlml replay --sy', {'--system'}),
+    ],
+)
+def test_shells_complete(line, expected, tmp_path):
+    env = os.environ | {
+        '_ARGCOMPLETE': '1', '_ARGCOMPLETE_STDOUT_FILENAME': str(tmp_path / 'out'),
+        'COMP_LINE': line, 'COMP_POINT': str(len(line)), '_ARGCOMPLETE_IFS': '\n',
+    }  # fmt: skip
+    command = [sys.executable, '-m', 'rlml_slam.cli.main']
+    done = subprocess.run(command, env=env, capture_output=True, check=False)
+    assert done.stderr == b''
+    found = {word.strip() for word in (tmp_path / 'out').read_text().split('\n')}
+    assert expected <= found
