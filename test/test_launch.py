@@ -106,6 +106,10 @@ def test_nav2_config_uses_our_frames_and_no_amcl():
     shared = sections['/**']['ros__parameters']
     assert shared.keys() <= {d.name for of in NODES for d in declarations(of)}
     n = Parameters().node
+    timing = sections['back_end']['ros__parameters']
+    assert timing == {
+        name: getattr(n, name) for name in ('transform_tolerance', 'transform_publish_period')
+    }
     frames = (shared['map_frame'], shared['odom_frame'], shared['base_frame'])
     assert frames == (n.map_frame, n.odom_frame, n.base_frame)
     costmap = sections['global_costmap']['global_costmap']['ros__parameters']

@@ -17,7 +17,7 @@ from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import EkfParameters
 from rlml_slam.ros.back_end.map_transform import MapTransform
 from rlml_slam.ros.codecs import decode
-from rlml_slam.ros.declare import declare
+from rlml_slam.ros.declare import declare, pace
 from rlml_slam.ros.diagnostics import HealthPublisher
 from rlml_slam.ros.front_end.frame_publisher import FramePublisher
 from rlml_slam.ros.kernels import prepare
@@ -37,7 +37,8 @@ class EkfSlamNode(Node):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('ekf_slam', **options)
-        self.params: EkfParameters = declare(self, EkfParameters)
+        checks: dict[str, Any] = {}
+        self.params: EkfParameters = declare(self, EkfParameters, checks)
         n = self.params.node
         self.estimator = Estimator(self.params)
         self.map_services = EkfServices(self, n, self.estimator, self.restart_in)
@@ -45,9 +46,9 @@ class EkfSlamNode(Node):
         self.answers = FramePublisher(self, n)
         self.products = MapPublisher(self, n, TOPICS)
         self.tf = MapTransform(self, n)
-        if n.transform_publish_period > 0.0:
-            steady = Clock(clock_type=ClockType.STEADY_TIME)
-            self.create_timer(n.transform_publish_period, self.tf.repeat, clock=steady)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        timer = self.create_timer(n.transform_publish_period or 0.1, self.tf.repeat, clock=steady)
+        checks['transform_publish_period'] = pace(timer)
         self.sensors = Sensors(self, self.params, STREAMS, self.process, self.restart)
         self.health = HealthPublisher(self, self.sensors)
         Listener(self, PoseWithCovarianceStamped, 'initialpose', self.start_at, RELIABLE)

@@ -97,6 +97,30 @@ def test_now_is_never_refused_and_scans_are_exact(robot):
     assert robot.buffer.repeated == 0
 
 
+def test_period_0_at_run_time_stops_it_and_another_one_starts_it(robot):
+    sent, node = [], Node()
+    robot.publish = lambda stamp, edge, T: sent.append(stamp)
+    transform = MapTransform(robot, node)
+
+    def drive_on(period):
+        node.change('transform_publish_period', period)
+        sent.clear()
+        for _ in range(5):
+            robot.now += 50 * MS
+            transform.repeat()
+        repeated = len(sent)
+        robot.now += MS
+        transform.follow(frame(robot.now))
+        return repeated, len(sent) - repeated
+
+    assert drive_on(0.02) == (0, 2)  # nothing was there to repeat
+    assert drive_on(0.02) == (5, 2)
+    assert drive_on(0.0) == (0, 0)
+    assert drive_on(0.0) == (0, 0)
+    assert drive_on(0.05)[1] == 2
+    assert drive_on(0.05) == (5, 2)
+
+
 def test_without_tolerance_now_is_refused(robot):
     refused, asked, _ = drive(robot, 20.0, np.random.default_rng(1), transform_tolerance=0.0)
     assert refused == asked

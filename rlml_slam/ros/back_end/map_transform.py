@@ -24,19 +24,29 @@ class MapTransform:
     With each frame it goes out twice: with the frame's stamp, for those who ask where the robot
     was when it scanned, and dated ahead by ``transform_tolerance``, as AMCL does, for those who
     ask where it is now. The second is repeated every ``transform_publish_period`` with the date
-    of then, until SILENT after the last frame. A period of 0, or ``tf_broadcast`` false: never.
+    of then, until SILENT after the last frame. A period of 0, which it may become at run time, or
+    ``tf_broadcast`` false: nothing is published.
     """
 
     def __init__(self, node: Any, params: Node, smoothed: Smoothing | None = None) -> None:
         self._node, self._p, self._smoothed = node, params, smoothed
         self._frames = params.map_frame, params.odom_frame
-        is_sent = params.tf_broadcast and not params.shadow
-        self._publisher = (
-            TransformPublisher(node) if is_sent and params.transform_publish_period > 0.0 else None
-        )
+        self._publisher: TransformPublisher | None = None
+        self._publisher = self._open()
         self._odom = OdomFrame()
         self._newest: tuple[int, Array] | None = None
         self._heard = self._dated = 0
+
+    @property
+    def _is_sent(self) -> bool:
+        p = self._p
+        return p.tf_broadcast and not p.shadow and p.transform_publish_period > 0.0
+
+    def _open(self) -> TransformPublisher | None:
+        """The publisher, where anything is to be published."""
+        if not self._is_sent:
+            return None
+        return self._publisher or TransformPublisher(self._node)
 
     def restart(self) -> None:
         """The local frame is another one from now on."""
@@ -46,6 +56,7 @@ class MapTransform:
     def follow(self, frame: Frame) -> None:
         """Take the next frame, and publish."""
         self._odom.follow(frame)
+        self._publisher = self._open()
         if self._odom.newest is None or self._publisher is None:
             return
         stamp, T = self._odom.newest
@@ -60,7 +71,7 @@ class MapTransform:
 
     def repeat(self) -> None:
         """Publish the newest one dated ahead, if that is later than what was sent."""
-        if self._newest is None or self._publisher is None:
+        if self._newest is None or self._publisher is None or not self._is_sent:
             return
         stamp, T = self._newest
         since = self._now() - self._heard
