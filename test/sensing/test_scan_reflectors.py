@@ -98,6 +98,19 @@ def test_walls_are_no_reflectors(gloss):
     assert seen is None or len(seen) == 0, said
 
 
+def test_reflectors_alone_in_an_open_field_are_found():
+    """Nothing else returns: there is nothing to compare them with, and nothing to confuse."""
+
+    def nothing_else(s):
+        return replace(s, ranges=np.where(s.intensities > 2000.0, s.ranges, np.inf))
+
+    reflectors, seen = ScanReflectors(Detector(), 'auto'), None
+    for s in scans():
+        seen = reflectors.detections(nothing_else(s), STILL, STILL)
+    assert len(seen) >= 5
+    assert 'nothing else has an intensity' in str(reflectors)
+
+
 def test_white_posts_are_no_reflectors():
     seen, said = last_seen(gain=1.8)
     assert seen is None

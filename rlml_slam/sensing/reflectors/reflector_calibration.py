@@ -122,8 +122,8 @@ class ReflectorCalibration:
         above = np.cumsum(self._counts, axis=1) >= DIFFUSE * total[:, None]
         level = np.where(total >= MIN_BEAMS, intensity_of(np.argmax(above, axis=1)), np.nan)
         known = np.isfinite(level)
-        if not known.any():
-            return np.full(OCTAVES, np.inf)
+        if not known.any():  # an open field, with nothing but small things in it
+            return np.zeros(OCTAVES)
         at, level = np.flatnonzero(known), level[known]
         # the first octaves may be nearer than where the lens sees all of the spot
         brightest = np.maximum.accumulate(np.where(at < FULL, 0.0, level))

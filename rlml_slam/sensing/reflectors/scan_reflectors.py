@@ -85,7 +85,7 @@ def in_words(c: Calibration) -> str:
     p = c.detector
     size = f'{1e3 * max(p.diameter, p.flat_width):.0f} mm wide'
     if math.isinf(c.ratio):
-        return f'the only ones with an intensity; {size}'
+        return f'bright where nothing else has an intensity; {size}'
     return (
         f'at least {p.contrast:.1f} times as bright as anything diffuse at their range, most of '
         f'them {c.ratio:.1f} times; {size}'
