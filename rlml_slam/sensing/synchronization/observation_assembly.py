@@ -144,14 +144,17 @@ class ObservationAssembly:
             return self.buffer.motion(start, end).delta
         return se2.inverse(self.buffer.motion(end, start).delta)
 
-    def _sweep(self, scan: Scan, delay: int, moved: Array) -> tuple[Array, Array]:
+    def _sweep(self, scan: Scan, delay: int, moved: Array) -> tuple[Array, Array | None]:
         """Motion (3,) of base during a sweep and its covariance, in the base frame at the stamp.
 
         The covariance is that about the first ray, which is at most a scan away from the stamp.
+        None without odometry: whoever estimates the velocity knows how well.
         """
         start = scan.stamp + delay
         swept = self.buffer.motion(start, start + int(sweep_time(scan) * SECOND))
-        return se2.compose(se2.compose(moved, swept.delta), se2.inverse(moved)), swept.cov
+        return se2.compose(
+            se2.compose(moved, swept.delta), se2.inverse(moved)
+        ), swept.cov if swept.known else None
 
     def _sensor_pose(self, frame_id: str) -> Array:
         return self._sensor_poses.get(frame_id, np.array(self._node.laser_pose))
