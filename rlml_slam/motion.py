@@ -223,9 +223,8 @@ def _drive(
                 # when inside a long interval the motion happened is uncertain; what is left of it
                 # at the end is less than what was driven: at least as fast as before, and no arc
                 long_interval_noise = n.long_interval_noise
-                if at > 1 and not math.isnan(twists[at - 1, 0]):
-                    fast = max(fast, abs(twists[at - 1, 0]))
-                    quick = max(quick, abs(twists[at - 1, 2]))
+                before = _speed_before(at - 1, stamps, twists, n.noise_interval)
+                fast, quick = max(fast, before[0]), max(quick, before[1])
                 # a constant twist leads along an arc, which is longer than its chord
                 half = 0.5 * turn * (cuts[k + 1] - cuts[k]) / SECOND
                 chord = math.sin(half) / half if abs(half) > 1e-4 else 1.0
@@ -270,6 +269,22 @@ def _drive(
 
 
 @part
+def _speed_before(at: int, stamps: Stamps, twists: Array, interval: float) -> tuple[float, float]:
+    """Speed and turn rate in the control interval until sample ``at``, without a jump in it.
+
+    Stamps of one burst are too close to divide by.
+    """
+    far = turned = lasted = 0.0
+    while at > 0 and lasted < interval and not math.isnan(twists[at, 0]):
+        dt = (stamps[at] - stamps[at - 1]) / SECOND
+        far, turned = far + abs(twists[at, 0]) * dt, turned + abs(twists[at, 2]) * dt
+        lasted += dt
+        at -= 1
+    lasted = max(lasted, interval)
+    return far / lasted, turned / lasted
+
+
+@part
 def _is_bridged(at: int, start: int, end: int, stamps: Stamps, max_gap: float) -> bool:
     """Whether the interval that ends at sample ``at`` is a long gap, all of it inside."""
     if not 0 < at < len(stamps) or stamps[at] - stamps[at - 1] <= max_gap * SECOND:
@@ -298,9 +313,9 @@ def _rate(stamp: int, stamps: Stamps, rates: Array, max_gap: float) -> float:
     return float(rates[k - 1] * (1.0 - f) + rates[k] * f)
 
 
-def _around(stamps: list[int], start: int, end: int) -> slice:
-    """The samples between two stamps, and one on each side."""
-    return slice(max(bisect_right(stamps, start) - 1, 0), bisect_left(stamps, end) + 1)
+def _around(stamps: list[int], start: int, end: int, before: int = 0) -> slice:
+    """The samples from ``before`` [ns] ahead of a stamp to another, and one on each side."""
+    return slice(max(bisect_right(stamps, start - before) - 1, 0), bisect_left(stamps, end) + 1)
 
 
 class MotionBuffer:
@@ -434,7 +449,7 @@ class MotionBuffer:
         """
         if end <= start:
             return STILL
-        odometry = _around(self._stamps, start, end)
+        odometry = _around(self._stamps, start, end, int(self._noise.noise_interval * SECOND))
         imu = _around(self._imu_stamps, start, end)
         out, known, bias, variance, turned = _drive(
             start, end,

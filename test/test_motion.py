@@ -371,6 +371,20 @@ def test_robot_that_is_back_after_a_gap_may_have_driven_as_before():
     assert math.sqrt(m.cov[0, 0]) > 0.7 * driven * math.sqrt(gap * NOISE.noise_interval)
 
 
+def test_burst_of_stamps_before_an_interval_is_no_speed():
+    """A driver that sends two samples 1 ms apart: the robot has not driven at 50 m/s."""
+    sigmas = []
+    for burst in (0.1, 0.001):
+        buffer, stamp = filled(line(0.5), duration=1.0), T0 + SECOND
+        for dt in (burst, 0.45):
+            stamp += round(dt * SECOND)
+            buffer.add_odometry(
+                Odometry(stamp, se2.compose(buffer.pose_at(buffer.newest), [0.05, 0.0, 0.01]))
+            )
+        sigmas.append(np.sqrt(np.diag(buffer.motion(stamp - round(0.45 * SECOND), stamp).cov)))
+    assert (sigmas[1] < 2.0 * sigmas[0]).all()
+
+
 def test_motion_in_a_part_of_a_long_gap_is_unknown_and_wide():
     gap = NOISE.max_gap + 1.0
     m = with_gap(gap).motion(T0 + 2 * SECOND, T0 + round((2.0 + gap) * SECOND) - 1)
