@@ -183,7 +183,7 @@ def _drive(
     ``twists`` (k, 3) are the velocities of the intervals that end at the odometry's ``stamps``,
     ``rates`` those measured by the IMU at its own. Between two stamps of either, the control is
     that of the middle (eq. 6). Of a gap that is all between the two stamps, the odometry says
-    where it led to. A part of one longer than max_gap is unknown.
+    where it led to. A part of one longer than max_gap is unknown, but for COAST at its ends.
     """
     cuts = np.empty(len(stamps) + len(imu_stamps) + 2, np.int64)
     cuts[0], m, i, j = start, 1, 0, 0
@@ -203,6 +203,7 @@ def _drive(
     rows = np.empty((8, m))
     all_known = True
     weight = weighted = turned = 0.0
+    open2 = turned2 = 0.0  # [s^2] near the end of a long gap, of which odometry says nothing
     for k in range(m):
         dt = (cuts[k + 1] - cuts[k]) / SECOND
         middle = (cuts[k] + cuts[k + 1]) // 2
@@ -213,7 +214,9 @@ def _drive(
         known = 0 < at < len(stamps) and not math.isnan(twists[at, 0])
         gap = (stamps[at] - stamps[at - 1]) / SECOND if known else 0.0
         bridged = _is_bridged(at, start, end, stamps, n.max_gap)
-        known = known and (gap <= n.max_gap or bridged)
+        whole = _within(at, start, end, stamps) if known else 0.0
+        unsure = min(whole, gap - whole) if gap > n.max_gap else 0.0
+        known = known and unsure <= COAST
         speed = sideways = turn = 0.0
         sigma_v, sigma_w = n.max_speed / 5.0, n.max_turn_rate / 5.0
         if known:
@@ -255,6 +258,8 @@ def _drive(
         rows[0, k], rows[1, k], rows[2, k], rows[6, k] = speed, turn, dt, gyro
         rows[3, k], rows[4, k] = sigma_v**2 * along, sigma_w**2 * scale
         rows[5, k], rows[7, k] = lateral**2 * along, sideways
+        if known:
+            open2, turned2 = max(open2, unsure**2), max(turned2, (1.0 - gyro) * unsure**2)
         all_known = all_known and known
         if says_bias:
             weight += 1.0 / (bias_sigma**2 * scale)
@@ -263,6 +268,9 @@ def _drive(
     out = integrate(
         rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6], rows[7]
     )  # fmt: skip
+    out[1, 0] += open2 * (n.max_speed / 5.0) ** 2
+    out[2, 1] += open2 * (n.max_speed / 5.0) ** 2
+    out[3, 2] += turned2 * (n.max_turn_rate / 5.0) ** 2
     if weight > 0.0:
         return out, all_known, weighted / weight, 1.0 / weight, turned / weight
     return out, all_known, 0.0, np.inf, 0.0
@@ -286,10 +294,17 @@ def _speed_before(at: int, stamps: Stamps, twists: Array, interval: float) -> tu
 
 @part
 def _is_bridged(at: int, start: int, end: int, stamps: Stamps, max_gap: float) -> bool:
-    """Whether the interval that ends at sample ``at`` is a long gap, all of it inside."""
+    """Whether the interval until sample ``at`` is a long gap, all but COAST of it inside."""
     if not 0 < at < len(stamps) or stamps[at] - stamps[at - 1] <= max_gap * SECOND:
         return False
-    return bool(start <= stamps[at - 1] and stamps[at] <= end)
+    gap = (stamps[at] - stamps[at - 1]) / SECOND
+    return bool(gap - _within(at, start, end, stamps) <= COAST)
+
+
+@part
+def _within(at: int, start: int, end: int, stamps: Stamps) -> float:
+    """Seconds between two stamps of the interval that ends at sample ``at``."""
+    return float(max(min(end, stamps[at]) - max(start, stamps[at - 1]), 0) / SECOND)
 
 
 @part

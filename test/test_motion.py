@@ -387,7 +387,7 @@ def test_burst_of_stamps_before_an_interval_is_no_speed():
 
 def test_motion_in_a_part_of_a_long_gap_is_unknown_and_wide():
     gap = NOISE.max_gap + 1.0
-    m = with_gap(gap).motion(T0 + 2 * SECOND, T0 + round((2.0 + gap) * SECOND) - 1)
+    m = with_gap(gap + 0.5).motion(T0 + 2 * SECOND, T0 + round((2.0 + gap) * SECOND))
     assert not m.known
     np.testing.assert_array_equal(m.delta, 0.0)
     # a speed that lasts, and a turn rate that is independent in each interval: after so long, no
@@ -399,11 +399,29 @@ def test_motion_in_a_part_of_a_long_gap_is_unknown_and_wide():
     assert not longer.known
 
 
+@pytest.mark.parametrize('early', [0.02, 0.15])
+def test_scan_just_before_a_long_gap_ends_is_where_the_odometry_is_then(early):
+    """The first message after a gap is a scan: odometry tells where it is a moment later."""
+    gap = NOISE.max_gap + 1.0
+    buffer, end = with_gap(gap), T0 + round((2.0 + gap) * SECOND)
+    seen = end - round(early * SECOND)
+    m, rest = buffer.motion(T0 + SECOND, seen), buffer.motion(seen, end)
+    assert m.known
+    assert rest.known
+    np.testing.assert_allclose(m.delta, [1.0 + gap - early, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(rest.delta, [early, 0.0, 0.0], atol=1e-6)
+    for part in (m, rest):  # it may have turned, stopped or hurried in that moment
+        more = np.sqrt(np.diag(part.cov)) / early
+        assert (
+            more > np.array([NOISE.max_speed, NOISE.max_speed, NOISE.max_turn_rate]) / 5.01
+        ).all()
+    assert (np.sqrt(np.diag(m.cov)) < [0.3, 0.3, 0.7]).all()
+
+
 def test_parts_of_a_gap_add_up_to_the_whole():
     gap = NOISE.max_gap + 1.0
     ends = T0 + 2 * SECOND + np.rint(np.linspace(0.0, gap, 8) * SECOND).astype(np.int64)
-    ends[-1] -= 1
-    buffer = with_gap(gap)
+    buffer = with_gap(gap + 0.5)
     whole = buffer.motion(int(ends[0]), int(ends[-1])).cov
     parts = [buffer.motion(a, b).cov for a, b in itertools.pairwise(ends.tolist())]
     np.testing.assert_allclose(sum(np.diag(cov) for cov in parts), np.diag(whole), rtol=1e-6)
