@@ -376,7 +376,9 @@ class MotionBuffer:
         self._parked = None
         self._stamps.append(sample.stamp)
         self._poses.append(np.array(sample.pose, dtype=np.float64))
-        self._forget(self._stamps, sample.stamp, self._poses, self._twists)
+        # what was before a gap is needed after it, however long that lasted
+        before = self._stamps[-2] if len(self._stamps) > 1 else sample.stamp
+        self._forget(self._stamps, before, self._poses, self._twists)
 
     def _step(self, stamp: int, pose: Array, sample: Odometry) -> Array | None:
         """Velocity (3,) since an earlier sample, None where no robot moves like that."""

@@ -359,6 +359,15 @@ def test_pose_after_a_long_gap_says_where_it_led_to():
     assert np.trace(m.cov) > 4.0 * np.trace(whole.cov)
 
 
+def test_pose_after_a_gap_longer_than_the_memory_says_where_it_led_to():
+    buffer = filled(line(1.0), rate=100, duration=10.0, memory=2.0)
+    for k in range(3):
+        buffer.add_odometry(Odometry(T0 + (40 + k) * SECOND, line(1.0)(12.0 + k)))
+    m = buffer.motion(T0 + 9 * SECOND, T0 + 40 * SECOND)
+    assert m.known
+    np.testing.assert_allclose(m.delta, [3.0, 0.0, 0.0], atol=1e-9)
+
+
 def test_robot_that_is_back_after_a_gap_may_have_driven_as_before():
     gap = 2.0
     buffer = filled(line(1.0, 0.5), duration=2.0)
