@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     evidence = gather(args.bag, args.topic, given, args.json, learns=args.config is None)
     figures = examine(evidence)
     if args.out is not None:
-        from rlml_slam.cli.doctor_picture import picture
+        from rlml_slam.cli.support.doctor_picture import picture
 
         write_atomically(args.out, picture(evidence, figures))
     print(json.dumps(figures) if args.json else '\n'.join(words(figures)))

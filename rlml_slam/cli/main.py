@@ -96,6 +96,9 @@ COMMANDS: Table = {
         'rlml_slam.cli.doctor',
         'what the scans of a bag are like, and a threshold for its reflectors',
     ),
+    'check': Command(
+        'rlml_slam.cli.check', 'a running robot: topics, transforms and clocks, and what is wrong'
+    ),
     'docs': Command(
         'rlml_slam.cli.docs',
         'the tables of topics, services and parameters, from the declarations in the code',

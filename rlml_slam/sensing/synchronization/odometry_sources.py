@@ -41,6 +41,11 @@ class PoseHistory:
         return self._stamps[-1] if self._stamps else None
 
     @property
+    def first(self) -> int:
+        """Stamp of the oldest pose."""
+        return self._stamps[0]
+
+    @property
     def last(self) -> Array:
         """The newest pose (3,)."""
         return self._poses[-1]

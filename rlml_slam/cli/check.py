@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``rlml check``: a running robot, heard for ten seconds: what is there, and what is wrong."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from rlml_slam.cli.support.robot_setup import Finding, RobotSetup
+from rlml_slam.cli.support.service_call import asking
+from rlml_slam.cli.support.text_table import aligned
+from rlml_slam.params import Node, Parameters, from_mapping, read_yaml
+
+TRANSFORMS = 'tf2_msgs/msg/TFMessage'
+STATIC = 'tf_static'
+
+
+def add_parser(subparsers: Any) -> None:
+    """Declare ``rlml check``."""
+    parser = subparsers.add_parser(
+        'check',
+        help='a running robot: topics, transforms and clocks, and what is wrong',
+        description='Listens for a while, and says what is missing or wrong with the line to '
+        'type. Turn the robot meanwhile: then the mounting of the laser is checked as well. '
+        'Exit code 0: nothing is wrong, 1: something is.',
+    )
+    parser.add_argument('--seconds', type=float, default=10.0, metavar='S')
+    parser.add_argument('--config', type=Path, metavar='YAML', help='ROS parameter file')
+    parser.add_argument(
+        '--scan', metavar='TOPIC', help='of the scans (default: the parameter scan_topic)'
+    )
+    parser.add_argument('--json', action='store_true', help='print one JSON object and no more')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Listen, and say what was heard."""
+    values = read_yaml(args.config) if args.config else {}
+    values |= {'scan_topic': args.scan} if args.scan else {}
+    params: Parameters = from_mapping(values)
+    setup = RobotSetup(params)
+    with asking() as node:
+        topics = topics_of(params.node)
+        listen(node, setup, topics, args.seconds)
+        findings = [*of_publishers(node, setup, topics), *setup.findings()]
+        rows = [row(node, stream, topic, setup) for stream, (topic, _) in topics.items()]
+    wrong = [f for f in findings if f.is_wrong]
+    if args.json:
+        print(json.dumps({'topics': rows, 'findings': [vars(f) for f in findings]}))
+    else:
+        print('\n'.join(words(rows, findings)))
+    return 1 if wrong else 0
+
+
+def topics_of(n: Node) -> dict[str, tuple[str, str]]:
+    """Topic and type of each stream."""
+    return {
+        'scan': (n.scan_topic, 'sensor_msgs/msg/LaserScan'),
+        'odom': (n.odom_topic, 'nav_msgs/msg/Odometry'),
+        'imu': (n.imu_topic, 'sensor_msgs/msg/Imu'),
+        'reflectors': (n.reflectors_topic, 'sensor_msgs/msg/PointCloud2'),
+        'tf': ('/tf', TRANSFORMS),
+        STATIC: ('/tf_static', TRANSFORMS),
+    }
+
+
+def listen(
+    node: Any, setup: RobotSetup, topics: dict[str, tuple[str, str]], seconds: float
+) -> None:
+    """Hear all topics for a while; by /clock where a bag or a simulator publishes it."""
+    import rclpy
+    from rclpy.parameter import Parameter
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+
+    from rlml_slam.ros.codecs.message_types import rclpy_class
+    from rlml_slam.ros.message_guard import LARGE, Listener
+    from rlml_slam.ros.sensors import MOTION, SENSOR
+
+    keep, latched = [], QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    for stream, (topic, kind) in topics.items():
+        found = rclpy_class(kind)
+        if found is None:
+            continue
+        qos = latched if stream == STATIC else SENSOR if stream == 'scan' else MOTION
+
+        def take(msg: Any, stream: str = stream) -> None:
+            setup.hear(stream, msg, time.monotonic(), node.get_clock().now().nanoseconds)
+
+        keep.append(Listener(node, found, topic, take, qos, LARGE))
+    end = time.monotonic() + seconds
+    is_simulated = False
+    while time.monotonic() < end:
+        rclpy.spin_once(node, timeout_sec=0.05)
+        if not is_simulated and node.count_publishers('/clock'):
+            node.set_parameters([Parameter('use_sim_time', value=True)])
+            is_simulated = True
+
+
+def of_publishers(
+    node: Any, setup: RobotSetup, topics: dict[str, tuple[str, str]]
+) -> Iterator[Finding]:
+    """Sensors that two nodes publish, types and qualities of service that do not fit."""
+    for stream, (topic, kind) in topics.items():
+        found = node.get_publishers_info_by_topic(topic)
+        if stream in ('odom', 'imu', 'scan') and len(found) > 1:
+            yield Finding(
+                f'{topic} has {len(found)} publishers: {", ".join(map(name_of, found))}',
+                f'ros2 topic info {topic} --verbose; stop one of them, or remap it',
+            )
+        for publisher in found:
+            if publisher.topic_type != kind:
+                yield Finding(f'{topic} of {name_of(publisher)} is a {publisher.topic_type}')
+            if stream == STATIC and publisher.qos_profile.durability.name == 'VOLATILE':
+                yield Finding(
+                    f'{topic} of {name_of(publisher)} is not latched (durability volatile): '
+                    'who comes later hears nothing of it',
+                    'ros2 run tf2_ros static_transform_publisher, which latches',
+                )
+            yield from refused_by(node, topic, publisher)
+        if not found and stream == 'scan':
+            others = [
+                t for t, kinds in node.get_topic_names_and_types() if kind in kinds and t != topic
+            ]
+            if others:
+                yield Finding(
+                    f'scans are on {", ".join(sorted(others))}, not on {topic}',
+                    f'-p scan_topic:={sorted(others)[0]}',
+                )
+
+
+def refused_by(node: Any, topic: str, publisher: Any) -> Iterator[Finding]:
+    """Who listens reliably to one that publishes with best effort: it hears nothing."""
+    if publisher.qos_profile.reliability.name != 'BEST_EFFORT':
+        return
+    for listener in node.get_subscriptions_info_by_topic(topic):
+        if listener.qos_profile.reliability.name == 'RELIABLE':
+            yield Finding(
+                f'{name_of(listener)} asks for reliable {topic}, and {name_of(publisher)} gives '
+                'best effort: it hears nothing',
+                f'set the reliability of {topic} in {name_of(listener)} to best_effort',
+            )
+
+
+def name_of(endpoint: Any) -> str:
+    """Full name of the node of an endpoint."""
+    return f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
+
+
+def row(node: Any, stream: str, topic: str, setup: RobotSetup) -> dict[str, Any]:
+    """What was heard on a topic."""
+    heard = setup.heard[stream]
+    found = node.get_publishers_info_by_topic(topic)
+    return {
+        'topic': topic,
+        'publishers': sorted(map(name_of, found)),
+        'reliability': sorted({p.qos_profile.reliability.name.lower() for p in found}),
+        'messages': len(heard.arrivals),
+        'rate_hz': round(heard.rate, 1),
+        'age_ms': round(1e3 * heard.age) if heard.ages else None,
+        'frames': sorted(heard.frames)[:8],
+    }
+
+
+def words(rows: list[dict[str, Any]], findings: list[Finding]) -> list[str]:
+    """The table of topics, then the findings with the line to type."""
+    cells = [['topic', 'of', 'Hz', 'age [ms]', 'QoS', 'frames']]
+    for r in rows:
+        cells.append([
+            r['topic'], ', '.join(r['publishers']) or 'nobody', f'{r["rate_hz"]:g}',
+            '' if r['age_ms'] is None else str(r['age_ms']), ', '.join(r['reliability']),
+            ', '.join(r['frames']),
+        ])  # fmt: skip
+    out = [aligned(cells), '']
+    for f in sorted(findings, key=lambda f: not f.is_wrong):
+        out.append(f'{"WRONG" if f.is_wrong else "note"}: {f.text}')
+        out += [f'       {f.line}'] if f.line else []
+    if not any(f.is_wrong for f in findings):
+        out.append('nothing is wrong')
+    return out
