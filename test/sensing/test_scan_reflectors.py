@@ -123,6 +123,24 @@ def test_without_intensities_nothing_is_looked_at():
     assert last_seen(mode='off') == (None, '')
 
 
+@pytest.mark.parametrize('sigma', [0.005, 0.02, 0.04])
+@pytest.mark.parametrize('beams', [720, 1440])
+def test_the_noise_of_ranges_is_found(sigma, beams):
+    """A laser noisier than the parameter says: its reflectors are not taken for rough things."""
+    rng = np.random.default_rng(4)
+    more = np.sqrt(max(sigma**2 - 0.005**2, 0.0))  # that of the scans is 5 mm
+    noisy = [
+        replace(s, ranges=(s.ranges + rng.normal(0.0, more, beams)).astype(np.float32))
+        for s in scans(beams=beams)
+    ]
+    found = calibrated(noisy, Detector())
+    assert found.detector.sigma_range == pytest.approx(max(sigma, 0.01), rel=0.15)
+    reflectors = ScanReflectors(Detector(), 'auto')
+    for s in noisy:
+        seen = reflectors.detections(s, STILL, STILL)
+    assert len(seen) >= 5
+
+
 def test_size_and_divergence_are_found():
     found = calibrated(scans(radius=0.1, divergence=0.012, beams=1440), Detector())
     p = found.detector

@@ -41,12 +41,14 @@ NEARER = 1.5  # times as bright as nearer ones is a diffuse surface at most; mor
 FULL = 4  # octave from which on diffuse light falls with range: 2 m
 STANDS_OUT = 2.5  # least ratio of a reflector to that
 BELOW = 0.75  # share of the ratio of dim reflectors at which the threshold is
+SCANS = 200  # newest ones whose range noise is remembered
 SPOTS = 2000  # newest bright spots that are remembered
 ENOUGH_SPOTS, ENOUGH_SCANS = 12, 8  # before anything is said
 PERIOD = 25  # scans between two estimates
 SIZES = np.geomspace(0.02, WIDEST, 40)  # [m]
 DIVERGENCES = np.array([0.001, 0.002, 0.003, 0.005, 0.008, 0.012, 0.016])  # [rad]
 AS_GOOD = 0.97  # share of the spots of the best size that another size has to explain
+NOISY = 0.05  # [m] of range noise at most
 TOLERANCE = 0.3  # of the size, by which it may be off
 
 
@@ -87,6 +89,7 @@ class ReflectorCalibration:
         self._counts = np.zeros((OCTAVES, BINS + 1), np.int64)
         # range, width, peak, and spacing of beams at that range; of the scans' number
         self._spots: deque[tuple[float, float, float, float]] = deque(maxlen=SPOTS)
+        self._noise: deque[float] = deque(maxlen=SCANS)  # [m] of the newest scans
         self.num_scans = 0
         self.result: Calibration | None = None
 
@@ -94,6 +97,7 @@ class ReflectorCalibration:
         """One scan with intensities; now and then a new estimate."""
         self.num_scans += 1
         ranges, bright = valid_beams(scan)
+        self._noise.append(range_noise(ranges))
         step = abs(float(scan.angle_increment))
         surface = opened(ranges, bright, step, is_circular(scan), WIDEST)
         octaves = octave_of(ranges)
@@ -146,6 +150,7 @@ class ReflectorCalibration:
         contrast = min(self._p.contrast, max(math.sqrt(ratio), BELOW * ratio))
         detector = replace(
             self._p, contrast=contrast, divergence=divergence,
+            sigma_range=max(self._p.sigma_range, min(float(np.median(self._noise)), NOISY)),
             size_tolerance=max(self._p.size_tolerance, TOLERANCE * size),
             # next to what has no intensity, every edge is sharp
             edge_contrast=0.0 if math.isinf(ratio) else self._p.edge_contrast,
@@ -184,6 +189,19 @@ def calibrated(scans: Iterable[Scan], params: Detector) -> Calibration | None:
     for scan in scans:
         calibration.add(scan)
     return calibration.estimate()
+
+
+def range_noise(ranges: Array) -> float:
+    """Range noise [m] of a scan: what neighbouring beams (n,) differ by where a surface goes on.
+
+    The second difference of three beams of variance sigma^2 has the variance 6 sigma^2, and on a
+    straight wall next to no mean; its median does not see edges.
+    """
+    met = (ranges[:-2] > 0.0) & (ranges[1:-1] > 0.0) & (ranges[2:] > 0.0)
+    if met.sum() < MIN_BEAMS:
+        return 0.0
+    bent = np.abs(ranges[:-2] - 2.0 * ranges[1:-1] + ranges[2:])[met]
+    return float(np.median(bent)) / (0.6745 * math.sqrt(6.0))
 
 
 def octave_of(ranges: Array) -> NDArray[np.int64]:
