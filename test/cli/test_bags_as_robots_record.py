@@ -168,9 +168,9 @@ def test_trajectory_and_reflectors_are_as_with_the_topics(recorded):
 
 
 def test_reflectors_are_found_without_odometry_as_well(recorded):
-    """What is not known of the motion during a sweep is no error of the detections.
+    """Of the motion during a sweep is only known how fast a robot may be.
 
-    Nor is it taken out of them: at 1 m/s and 0.1 s it is up to 10 cm for the last beams.
+    It is not taken out of the detections: at 1 m/s and 0.1 s it is 10 cm for the last beams.
     """
     p = Parameters()
     figures = metrics(replay(recorded / 'tf', replace(p, node=replace(p.node, use_odom=False))))

@@ -24,6 +24,7 @@ from rlml_slam.types import Detections, Motion, Observation, Scan
 # [ns] Motion older than this is summed up while there are no observations: the buffer drops it,
 # and an observation that is later than this is late.
 MAX_LATE = 5 * SECOND
+MAY_MOVE = np.array([0.5, 0.5, 0.5])  # [m/s, m/s, rad/s] of a robot without odometry, 1 sigma
 
 
 class ObservationAssembly:
@@ -144,17 +145,18 @@ class ObservationAssembly:
             return self.buffer.motion(start, end).delta
         return se2.inverse(self.buffer.motion(end, start).delta)
 
-    def _sweep(self, scan: Scan, delay: int, moved: Array) -> tuple[Array, Array | None]:
+    def _sweep(self, scan: Scan, delay: int, moved: Array) -> tuple[Array, Array]:
         """Motion (3,) of base during a sweep and its covariance, in the base frame at the stamp.
 
-        The covariance is that about the first ray, which is at most a scan away from the stamp.
-        None without odometry: whoever estimates the velocity knows how well.
+        The covariance is that about the first ray, which is at most a scan away from the stamp;
+        without odometry that of a robot of which only is known how fast it may be.
         """
-        start = scan.stamp + delay
-        swept = self.buffer.motion(start, start + int(sweep_time(scan) * SECOND))
-        return se2.compose(
-            se2.compose(moved, swept.delta), se2.inverse(moved)
-        ), swept.cov if swept.known else None
+        start, lasts = scan.stamp + delay, sweep_time(scan)
+        swept = self.buffer.motion(start, start + int(lasts * SECOND))
+        cov = swept.cov
+        if not swept.known:
+            cov = np.diag(np.minimum(np.diag(cov), (MAY_MOVE * lasts) ** 2))
+        return se2.compose(se2.compose(moved, swept.delta), se2.inverse(moved)), cov
 
     def _sensor_pose(self, frame_id: str) -> Array:
         return self._sensor_poses.get(frame_id, np.array(self._node.laser_pose))
