@@ -23,7 +23,9 @@ from rlml_slam.types import Imu, Motion, Odometry
 
 SECOND = 1_000_000_000
 Stamps = NDArray[np.int64]
-BATCH = 256  # samples at least that are forgotten at once
+# samples at least that are forgotten at once, and that are kept: what was before a gap is needed
+# after it, however long that lasted
+BATCH = 256
 COAST = 0.2  # [s] for which a robot is taken to go on as it went before its odometry ended
 # Share of the noise of a slow motion that is left where the wheels do not turn: what they miss is
 # less than a tick in all, and adds up to no walk. A larger one lets the noise of the first scan
@@ -354,6 +356,11 @@ class MotionBuffer:
         """Stamp of the newest odometry, None before the first."""
         return self._stamps[-1] if self._stamps else None
 
+    def newest_until(self, stamp: int) -> int | None:
+        """Stamp of the newest odometry not later than a stamp, None without any."""
+        k = bisect_right(self._stamps, stamp)
+        return self._stamps[k - 1] if k else None
+
     def add_odometry(self, sample: Odometry) -> None:
         """Append a sample, unless it is no later than the newest one.
 
@@ -376,9 +383,7 @@ class MotionBuffer:
         self._parked = None
         self._stamps.append(sample.stamp)
         self._poses.append(np.array(sample.pose, dtype=np.float64))
-        # what was before a gap is needed after it, however long that lasted
-        before = self._stamps[-2] if len(self._stamps) > 1 else sample.stamp
-        self._forget(self._stamps, before, self._poses, self._twists)
+        self._forget(self._stamps, sample.stamp, self._poses, self._twists)
 
     def _step(self, stamp: int, pose: Array, sample: Odometry) -> Array | None:
         """Velocity (3,) since an earlier sample, None where no robot moves like that."""
@@ -398,8 +403,8 @@ class MotionBuffer:
 
     def _forget(self, stamps: list[int], now: int, *columns: list) -> None:  # type: ignore[type-arg]
         # in batches: deleting from the front of a list moves all of it
-        if len(stamps) > BATCH and stamps[BATCH] < now - self._memory:
-            k = bisect_left(stamps, now - self._memory)
+        if len(stamps) > 2 * BATCH and stamps[BATCH] < now - self._memory:
+            k = min(bisect_left(stamps, now - self._memory), len(stamps) - BATCH)
             for column in (stamps, *columns):
                 del column[:k]
 

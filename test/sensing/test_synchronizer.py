@@ -375,6 +375,24 @@ def test_motion_carried_over_a_long_time_is_the_direct_motion(gap):
     np.testing.assert_allclose(b.motion.cov, expected.cov, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize('gap', [4.0, 10.0, 31.0])
+def test_odometry_after_a_gap_of_everything_tells_the_motion_in_it(gap):
+    """The last scan before the gap waits for odometry until after it; the next comes at once."""
+    synchronizer, t = running()
+    out = feed(synchronizer, [scan(t + 50 * MS)])
+    after = t + round(gap * SECOND)
+    for k in range(6):
+        out += add(synchronizer, odometry(after + k * 20 * MS))
+        if k == 2:
+            out += feed(synchronizer, [scan(after + 50 * MS)])
+    seen = {o.stamp: o for o in out + synchronizer.flush()}
+    first = seen[after + 50 * MS]
+    assert first.motion.known
+    moved = se2.between(pose_at(t + 50 * MS), pose_at(after + 50 * MS))
+    np.testing.assert_allclose(first.motion.delta, moved, atol=0.2)
+    assert (np.sqrt(np.diag(first.motion.cov)) < 0.1 * gap + 0.5).all()
+
+
 def stalled(imu=False):
     """Observations every 100 ms while odometry stalls, and the first one after it goes on."""
     synchronizer, t = running()

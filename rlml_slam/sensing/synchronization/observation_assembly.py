@@ -119,7 +119,9 @@ class ObservationAssembly:
         """Sum up the motion of a long time without observations before the buffer drops it."""
         if self.last is None or now - self.last < 2 * MAX_LATE:
             return
-        until = now - MAX_LATE
+        until = self.buffer.newest_until(now - MAX_LATE)
+        if until is None or until <= self.last:
+            return  # in a gap: what the odometry tells of it is where it leads to
         self._carried = compose_motion(self._carried, self._motion(self.last, until))
         self.last = until
 
