@@ -204,6 +204,8 @@ def propose(e: Evidence) -> tuple[float, float, float, float]:
         middle.append(math.sqrt(low * high) if low > 0.0 else 0.5 * high)
         ratios.append(high / low if low > 0.0 else math.inf)
     least = min(ratios, default=math.nan)
+    if math.isinf(least):  # any threshold below them will do
+        return 0.0, 0.0, round(0.5 * float(e.spots[:, 1].min()), 1), math.inf
     if math.isfinite(least):  # where there is no reflector, as far above the rest as elsewhere
         at += [x for x, _ in alone]
         middle += [low * math.sqrt(least) for _, low in alone]
@@ -274,6 +276,12 @@ def words(f: dict[str, Any]) -> list[str]:
             )
         else:
             out.append(f'They are at least {f["margin"]:.1f} times as bright as the rest.')
+    if 'proposed' in f:
+        found = f['found_by'] and f['reflectors_mean'] > 0.0
+        out.append(
+            'Nothing has to be set: slam and replay find them as they are. For a node '
+            'reflector_detector of its own:' if found else 'To be set:'
+        )  # fmt: skip
     for name, value in f.get('proposed', {}).items():
         out.append(f'  {name}: {value}')
     return out

@@ -16,9 +16,10 @@ from rlml_slam.params import Parameters
 from rlml_slam.recordings.bag_inputs import BagInputs
 from rlml_slam.recordings.bag_replay import replay
 from rlml_slam.ros.bags.bag import BagReader, BagWriter
-from rlml_slam.ros.codecs import encode
+from rlml_slam.ros.codecs import decode, encode
 from rlml_slam.ros.codecs.message_types import make_bag
 from rlml_slam.ros.sensor_input import SensorInput
+from rlml_slam.sensing.mirror import mirrored_scan
 from rlml_slam.sensing.synchronization.input_counts import InputCounts
 from rlml_slam.types import Odometry, Scan
 
@@ -165,6 +166,97 @@ def test_trajectory_and_reflectors_are_as_with_the_topics(recorded):
     assert run.topics['odom'] == '/tf, odom to base_link'
     assert run.topics['reflectors'].startswith('intensities of the scans: ')
     assert 'as bright as anything diffuse' in run.topics['reflectors']
+
+
+def levels(bright):
+    """Four levels, of which 0 is everything diffuse: 8192 to 24576."""
+    return 8192.0 * np.clip(np.floor(np.log2(np.maximum(bright / 3000.0, 0.5))), 0.0, 3.0)
+
+
+def bytes_of(bright):
+    """0 to 255, compressed and saturated by most reflectors."""
+    return np.clip(np.round(60.0 * np.sqrt(bright / 1000.0)), 0.0, 255.0)
+
+
+def as_recorded(source, target, brightness):
+    """The bag as a robot records it.
+
+    The laser hangs and base_footprint is between odom and base_link; odometry comes at 10 Hz, 60
+    ms after its stamps; another localization, an arm and wheels are on /tf; several nodes publish
+    /tf_static, late and again.
+    """
+    kept = []
+    with BagReader(source) as bag:
+        start, count = bag.start, 0
+        for time, topic, msg in bag.messages():
+            if topic == '/tf':
+                count += 1
+                if count % 2:
+                    stamp = decode.stamp(msg.transforms[0], '')
+                    msg.transforms[0].child_frame_id = 'base_footprint'
+                    other = [
+                        encode.transform(
+                            make_bag, stamp, frames, np.array([0.2, 0.1, 0.01 * count])
+                        )
+                        for frames in (('map', 'odom'), ('base_link', 'arm'))
+                    ]
+                    kept.append((time + 60_000_000, topic, msg))
+                    kept.append((time + 60_000_001, topic, encode.tf_message(make_bag, other)))
+            elif topic == '/tf_static':
+                place = msg.transforms[0]
+                r = place.transform.rotation
+                r.x, r.y, r.z, r.w = 1.0, 0.0, 0.0, 0.0
+                foot = encode.transform(
+                    make_bag, start, ('base_footprint', 'base_link'), np.zeros(3)
+                )
+                for k in range(6):
+                    one = encode.tf_message(make_bag, [(place, foot)[k % 2]])
+                    kept.append((time + (k + 2) * SECOND, topic, one))
+            elif topic == '/scan':
+                scan = mirrored_scan(decode.scan(msg))
+                bright = brightness(scan.intensities.astype(np.float64)).astype(np.float32)
+                scan = replace(scan, intensities=bright)
+                kept.append((time, topic, encode.laser_scan(make_bag, scan)))
+            else:
+                kept.append((time, topic, msg))
+        kinds = {t.name: t.msgtype for t in bag.topics.values()}
+    with BagWriter(target, 'sqlite3') as bag:
+        for topic, kind in kinds.items():
+            bag.add_topic(topic, kind, latched=topic == '/tf_static')
+        for time, topic, msg in sorted(kept, key=lambda item: item[0]):
+            bag.write(topic, msg, time)
+    return target
+
+
+@pytest.mark.parametrize(
+    ('brightness', 'said', 'proposed'),
+    [
+        (levels, 'nothing else has an intensity', 'detector.intensity_floor: 8192.0'),
+        (bytes_of, 'as bright as anything diffuse', 'detector.threshold: curve'),
+    ],
+    ids=['levels', 'bytes'],
+)
+def test_a_recording_with_all_that_robots_have(
+    recorded, tmp_path, capsys, brightness, said, proposed
+):
+    p = Parameters()
+    bag = as_recorded(recorded / 'tf', tmp_path / 'bag', brightness)
+    without_imu = replace(p, node=replace(p.node, use_imu=False))
+    topics = metrics(replay(recorded / 'topics', without_imu))
+    run = replay(bag, p)
+    figures = metrics(run)
+    assert said in run.topics['reflectors']
+    assert run.topics['odom'] == '/tf, odom to base_link'
+    assert figures['health']['OK'] == 1.0
+    assert figures['reflectors_found'] == figures['reflectors_true']
+    assert figures['reflectors_spurious'] == figures['reflectors_twice'] == 0
+    # at a few levels of brightness the middle of a spot is that of its beams, not of its light
+    assert figures['live_ate_rmse_m'] < 1.5 * topics['live_ate_rmse_m']
+    assert main(['doctor', str(bag)]) == 0
+    words = capsys.readouterr().out
+    assert said in words
+    assert 'Nothing has to be set' in words
+    assert proposed in words
 
 
 def test_reflectors_are_found_without_odometry_as_well(recorded):
