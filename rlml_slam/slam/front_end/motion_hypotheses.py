@@ -65,25 +65,24 @@ class MotionHypotheses:
         It is the only one where nothing speaks against it. ``velocity`` (3,) is that until then,
         None if it is unknown.
         """
-        plain = observation.motion
-        single = [Hypothesis(observation, 0.0)]
-        if self._last is None or self._trusted is None or velocity is None:
+        plain, single = observation.motion, [Hypothesis(observation, 0.0)]
+        if self._last is None or self._trusted is None:
             return single
         dt = (observation.stamp - self._last[0]) * 1e-9
-        if not 0.0 < dt <= FRESH:
+        if dt <= 0.0:
             return single
-        since, goes_on = self._since_trusted(observation), se2.exp(velocity * dt)
-        stands = not plain.delta.any() and bool((np.abs(goes_on) > MOVED).any())
-        # of a burst of stamps, the times say nothing of the speed
-        is_sudden = dt >= SHORTEST and _penalty(plain.delta, velocity, dt) > 0.5
-        if plain.known and since is None and not (stands or is_sudden):
-            return single
-        sigma = ACCELERATION * max(dt, SHORTEST) * dt
-        onward = Motion(goes_on, np.diag(sigma**2 + (0.5 * SAME) ** 2), known=False)
+        since, onward = self._since_trusted(observation), None
+        velocity = velocity if dt <= FRESH else None
+        if velocity is not None and (since or not plain.known or _is_odd(plain, velocity, dt)):
+            sigma = ACCELERATION * max(dt, SHORTEST) * dt
+            cov = np.diag(sigma**2 + (0.5 * SAME) ** 2)
+            onward = Motion(se2.exp(velocity * dt), cov, known=False)
         motions = [plain]
         for other in (since, onward):
             if other is not None and all(_differ(other.delta, m.delta) for m in motions):
                 motions.append(other)
+        if len(motions) == 1:
+            return single
         return [
             Hypothesis(self._moved(observation, m, dt), _penalty(m.delta, velocity, dt))
             for m in motions
@@ -153,12 +152,23 @@ class MotionHypotheses:
         )
 
 
-def _penalty(delta: Array, velocity: Array, dt: float) -> float:
+def _is_odd(motion: Motion, velocity: Array, dt: float) -> bool:
+    """Whether the odometry stands exactly still at a speed, or moves suddenly."""
+    goes_on = np.abs(se2.exp(velocity * dt))
+    if not motion.delta.any():
+        return bool((goes_on > MOVED).any())
+    # of a burst of stamps, the times say nothing of the speed
+    return dt >= SHORTEST and _penalty(motion.delta, velocity, dt) > 0.5
+
+
+def _penalty(delta: Array, velocity: Array | None, dt: float) -> float:
     """Share to which a motion (3,) in ``dt`` [s] is too sudden: Geman and McClure's loss.
 
     Stamps err, by as much as an interval where a driver sends in bursts: twice as fast is not
     sudden, nor is a motion of less than MOVED.
     """
+    if velocity is None:
+        return 0.0
     sigma = ACCELERATION * max(dt, SHORTEST) * dt
     faster = np.maximum(np.abs(delta) - 2.0 * np.abs(velocity) * dt - MOVED, 0.0)
     u2 = float(np.max(faster / sigma)) ** 2

@@ -78,6 +78,22 @@ def test_odometry_that_lost_a_stall_is_right_since_then():
     assert len(drive.go()) == 1  # two frames have confirmed it
 
 
+def test_odometry_after_a_long_gap_counts_from_where_it_was_trusted():
+    """Scans went on for a moment after the odometry, then all was missing for ten seconds."""
+    drive = Drive()
+    drive.go()
+    drive.go(known=False)
+    step = se2.exp(np.array([2.0, 0.5, 1.2]))
+    drive.odometry = se2.compose(drive.odometry, step)
+    drive.stamp += 10**10
+    unknown = Motion(np.zeros(3), np.eye(3), known=False)
+    seen = Observation(drive.stamp, unknown, odom_pose=drive.odometry)
+    plain, since = (h.observation.motion for h in drive.hypotheses.of(seen, TWIST))
+    assert plain is unknown
+    np.testing.assert_allclose(since.delta, step, atol=1e-9)
+    assert (np.sqrt(np.diag(since.cov)) < 1.0).all()
+
+
 def test_robot_that_stops_has_stopped():
     drive = Drive()
     drive.go()
