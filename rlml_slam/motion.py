@@ -21,6 +21,8 @@ from rlml_slam.params import MotionNoise
 from rlml_slam.se2 import Array
 from rlml_slam.types import Imu, Motion, Odometry
 
+# [m^2], [rad^2] of a pose or a motion: from 1e9 or so, updates lose all their digits
+MAX_VARIANCE = 1e6
 SECOND = 1_000_000_000
 Stamps = NDArray[np.int64]
 # samples at least that are forgotten at once, and that are kept: what was before a gap is needed

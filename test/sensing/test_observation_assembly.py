@@ -2,12 +2,16 @@
 import numpy as np
 
 from rlml_slam import se2
-from rlml_slam.motion import SECOND
+from rlml_slam.motion import MAX_VARIANCE, SECOND
 from rlml_slam.params import Parameters
 from rlml_slam.sensing.synchronization.input_counts import InputCounts
-from rlml_slam.sensing.synchronization.observation_assembly import MAX_LATE, ObservationAssembly
+from rlml_slam.sensing.synchronization.observation_assembly import (
+    MAX_LATE,
+    ObservationAssembly,
+    limited,
+)
 from rlml_slam.sensing.synchronization.waiting_queue import Waiting
-from rlml_slam.types import Odometry, Scan
+from rlml_slam.types import Motion, Odometry, Scan
 
 T0 = 10 * SECOND
 STEP = SECOND // 50
@@ -72,3 +76,16 @@ def test_motion_of_a_long_time_without_observations_is_carried():
     stamp = T0 + 12 * SECOND
     observation = assembly.assemble(stamp, waiting(stamp), (0.0, 0.0))
     np.testing.assert_allclose(observation.motion.delta, pose_at(stamp), atol=2e-5)
+
+
+def test_no_motion_is_more_uncertain_than_can_be_computed_with():
+    cov = np.array([[4e18, 1e12, 0.0], [1e12, 4e6, 10.0], [0.0, 10.0, 0.25]])
+    found = limited(Motion(np.zeros(3), cov, known=False)).cov
+    np.testing.assert_allclose(np.diag(found), [MAX_VARIANCE, MAX_VARIANCE, 0.25])
+    np.testing.assert_allclose(found, found.T)
+    correlation = cov / np.sqrt(np.outer(np.diag(cov), np.diag(cov)))
+    np.testing.assert_allclose(
+        found / np.sqrt(np.outer(np.diag(found), np.diag(found))), correlation
+    )
+    plain = Motion(np.zeros(3), np.eye(3))
+    assert limited(plain) is plain

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from rlml_slam.errors import InputError
 from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.motion import MAX_VARIANCE
 from rlml_slam.params import Reflector
 from rlml_slam.ros.codecs.point_cloud import bounded, column, read_cloud
 from rlml_slam.se2 import Array
@@ -26,7 +27,6 @@ from rlml_slam.types import ANONYMOUS, Detections, Imu, Odometry, Scan
 MAX_TILT = 0.35  # [rad] a larger roll or pitch is not a planar pose
 MIN_UPRIGHT = math.cos(MAX_TILT)
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # (x, y, yaw) of ROS's 6 x 6 covariances
-MAX_VARIANCE = 1e6  # [m^2], [rad^2] of a start: from 1e9 or so, updates lose all their digits
 _ROUNDING = 1e-9  # of the largest variance
 LARGEST_VARIANCE = 1e15  # [m^2], [rad^2] of what another node of this package sends
 LARGEST_SIGMA = 100.0  # [m], [rad] of a detection

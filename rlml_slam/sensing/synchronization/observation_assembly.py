@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from rlml_slam import se2
-from rlml_slam.motion import SECOND, STILL, MotionBuffer, compose_motion
+from rlml_slam.motion import MAX_VARIANCE, SECOND, STILL, MotionBuffer, compose_motion
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.deskew import project, sweep_time
@@ -131,6 +131,7 @@ class ObservationAssembly:
         if self.last is not None:
             motion = compose_motion(self._carried, self._motion(self.last, stamp))
             motion = widened(motion, stamp - self.last, math.hypot(white, self._white))
+            motion = limited(motion)
         self.last, self._carried, self._white = stamp, STILL, white
         return motion
 
@@ -190,3 +191,12 @@ def widened(motion: Motion, duration: int, sigma: float) -> Motion:
         return motion
     moved = motion.delta / (duration / SECOND) * sigma
     return dataclasses.replace(motion, cov=motion.cov + np.outer(moved, moved))
+
+
+def limited(motion: Motion) -> Motion:
+    """The motion, no variance of it above MAX_VARIANCE, whatever time its stamps say it took."""
+    variances = motion.cov.diagonal()
+    if variances.max() <= MAX_VARIANCE:
+        return motion
+    scale = np.sqrt(MAX_VARIANCE / np.maximum(variances, MAX_VARIANCE))
+    return dataclasses.replace(motion, cov=scale[:, None] * motion.cov * scale)
