@@ -43,7 +43,10 @@ def run(args: argparse.Namespace) -> int:
     params: Parameters = from_mapping(values)
     setup = RobotSetup(params)
     with asking() as node:
-        topics = topics_of(params.node)
+        topics = {
+            stream: (node.resolve_topic_name(topic), kind)
+            for stream, (topic, kind) in topics_of(params.node).items()
+        }
         listen(node, setup, topics, args.seconds)
         findings = [*of_publishers(node, setup, topics), *setup.findings()]
         rows = [row(node, stream, topic, setup) for stream, (topic, _) in topics.items()]
@@ -120,9 +123,11 @@ def of_publishers(
                     'ros2 run tf2_ros static_transform_publisher, which latches',
                 )
             yield from refused_by(node, topic, publisher)
-        if not found and stream == 'scan':
+        if stream == 'scan' and not setup.heard[stream].arrivals:
             others = [
-                t for t, kinds in node.get_topic_names_and_types() if kind in kinds and t != topic
+                t
+                for t, kinds in node.get_topic_names_and_types()
+                if kind in kinds and t != topic and node.count_publishers(t)
             ]
             if others:
                 yield Finding(

@@ -104,11 +104,11 @@ def test_nothing_is_wrong_with_a_sound_robot(checked):
     found, wrong = checked()
     assert wrong == []
     topics = {t['topic']: t for t in found['topics']}
-    assert topics['scan']['rate_hz'] == pytest.approx(10.0, abs=1.0)
-    assert topics['scan']['reliability'] == ['best_effort']
-    assert topics['scan']['frames'] == ['laser']
+    assert topics['/scan']['rate_hz'] == pytest.approx(10.0, abs=1.0)
+    assert topics['/scan']['reliability'] == ['best_effort']
+    assert topics['/scan']['frames'] == ['laser']
     assert topics['/tf']['publishers'] == ['/robot']
-    assert -50 < topics['odom']['age_ms'] < 200
+    assert -50 < topics['/odom']['age_ms'] < 200
 
 
 def test_no_transform_at_all(checked):
@@ -156,7 +156,7 @@ def test_two_publishers_of_odometry(checked):
 
     _, wrong = checked(another, edit=drifting)
     texts = ' '.join(f['text'] for f in wrong)
-    assert 'odom has 2 publishers: /robot, /robot' in texts
+    assert '/odom has 2 publishers: /robot, /robot' in texts
     assert 'odom to base_link on /tf jumps to and fro' in texts
     assert 'two nodes publish it' in texts
 
@@ -168,7 +168,7 @@ def test_a_listener_that_asks_for_reliable_scans(checked):
 
     _, wrong = checked(costmap)
     assert [f['text'] for f in wrong] == [
-        '/robot asks for reliable scan, and /robot gives best effort: it hears nothing'
+        '/robot asks for reliable /scan, and /robot gives best effort: it hears nothing'
     ]
 
 
@@ -218,9 +218,22 @@ def test_no_odometry(checked):
     assert '-p use_odom:=false' in wrong[0]['line']
 
 
+def test_scans_on_another_topic(checked):
+    def remapped(topic, msg):
+        return [] if topic == '/scan' else [msg]
+
+    def front(node):
+        node.create_publisher(rclpy_class('sensor_msgs/msg/LaserScan'), 'front/scan', 5)
+
+    _, wrong = checked(front, edit=remapped)
+    texts = {f['text']: f['line'] for f in wrong}
+    assert texts['scans are on /front/scan, not on /scan'] == '-p scan_topic:=/front/scan'
+
+
 def test_nobody_is_there(live, monkeypatch, capsys):
     monkeypatch.setenv('ROS_DOMAIN_ID', str(DOMAIN))
     assert main(['check', '--seconds', '1']) == 1
     said = capsys.readouterr().out
     assert 'WRONG: no scan on scan' in said
+    assert 'scans are on' not in said
     assert '-p scan_topic:=' in said
