@@ -14,8 +14,9 @@ from rlml_slam.cli.support.robot_setup import Finding, RobotSetup
 from rlml_slam.cli.support.service_call import asking
 from rlml_slam.cli.support.text_table import aligned
 from rlml_slam.params import Node, Parameters, from_mapping, read_yaml
+from rlml_slam.ros.sensor_input import STREAMS
+from rlml_slam.ros.tf import TF_MESSAGE
 
-TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 STATIC = 'tf_static'
 
 
@@ -43,10 +44,7 @@ def run(args: argparse.Namespace) -> int:
     params: Parameters = from_mapping(values)
     setup = RobotSetup(params)
     with asking() as node:
-        topics = {
-            stream: (node.resolve_topic_name(topic), kind)
-            for stream, (topic, kind) in topics_of(params.node).items()
-        }
+        topics = topics_of(node, params.node)
         listen(node, setup, topics, args.seconds)
         findings = [*of_publishers(node, setup, topics), *setup.findings()]
         rows = [row(node, stream, topic, setup) for stream, (topic, _) in topics.items()]
@@ -58,16 +56,13 @@ def run(args: argparse.Namespace) -> int:
     return 1 if wrong else 0
 
 
-def topics_of(n: Node) -> dict[str, tuple[str, str]]:
-    """Topic and type of each stream."""
-    return {
-        'scan': (n.scan_topic, 'sensor_msgs/msg/LaserScan'),
-        'odom': (n.odom_topic, 'nav_msgs/msg/Odometry'),
-        'imu': (n.imu_topic, 'sensor_msgs/msg/Imu'),
-        'reflectors': (n.reflectors_topic, 'sensor_msgs/msg/PointCloud2'),
-        'tf': ('/tf', TRANSFORMS),
-        STATIC: ('/tf_static', TRANSFORMS),
-    }
+def topics_of(node: Any, n: Node) -> dict[str, tuple[str, str]]:
+    """Full name and type of the topic of each stream."""
+    chosen = [('tf', '/tf', TF_MESSAGE), (STATIC, '/tf_static', TF_MESSAGE)]
+    for stream in ('reflectors', 'imu', 'odom', 'scan'):
+        parameter, kind, _ = STREAMS[stream]
+        chosen.insert(0, (stream, getattr(n, parameter), kind))
+    return {stream: (node.resolve_topic_name(name), kind) for stream, name, kind in chosen}
 
 
 def listen(

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -14,6 +14,7 @@ from rlml_slam.sensing.deskew import project
 from rlml_slam.sensing.mirror import mirrored_scan
 from rlml_slam.types import Scan
 
+Mounting = Callable[[Scan, Array], tuple[Scan, Array]]
 Sighting = tuple[Scan, Array]  # a scan with the pose (3,) of base in odom
 TURN, WAY = 0.15, 1.0  # [rad] at least and [m] at most between two scans that are compared
 PAIRS = 12
@@ -23,7 +24,7 @@ BETTER = 0.6  # share of it that another mounting leaves
 FLIP_X, FLIP_Y = np.array([-1.0, 1.0, 1.0]), np.array([1.0, -1.0, 1.0])
 BACK, OTHER_WAY = np.array([0.0, 0.0, np.pi]), np.array([1.0, 1.0, -1.0])
 # what is wrong -> how the scan and the pose (3,) of the laser would be right
-MOUNTINGS = {
+MOUNTINGS: dict[str, Mounting] = {
     'is as /tf_static says': lambda s, T: (s, T),
     'is mirrored, left is right: it hangs upside down, or its driver turns it round': (
         lambda s, T: (mirrored_scan(s), T)
@@ -56,8 +57,7 @@ def distances(pairs: Sequence[tuple[Sighting, Sighting]], T_base_laser: Array) -
     }
 
 
-def _distance(first: Sighting, second: Sighting, mounted: object, T_base_laser: Array) -> float:
-    assert callable(mounted)
+def _distance(first: Sighting, second: Sighting, mounted: Mounting, T_base_laser: Array) -> float:
     points = []
     for scan, T_odom_base in (first, second):
         s, T = mounted(scan, T_base_laser)

@@ -115,18 +115,16 @@ class RobotSetup:
         self._poses.append(sample.pose)
         return []
 
-    def add_imu(self, sample: Imu) -> list[None]:
-        """Not looked at."""
-        return []
-
     def add_scan(self, scan: Scan) -> list[None]:
         """One sweep, upright."""
         self.scans.append(scan)
         return []
 
-    def add_detections(self, detections: Detections) -> list[None]:
-        """Not looked at."""
+    def add_detections(self, detections: Detections | Imu) -> list[None]:
+        """Not looked at, as the IMU."""
         return []
+
+    add_imu = add_detections
 
     def findings(self) -> list[Finding]:
         """All that is wrong or worth knowing."""
