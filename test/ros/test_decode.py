@@ -86,6 +86,13 @@ def test_stamp_that_is_not_positive_is_refused(make, stamp):
         decode.scan(msg)
 
 
+def test_stamp_that_no_message_can_answer_is_refused(make):
+    msg = encode.laser_scan(make, a_scan(stamp=1))
+    msg.header.stamp.sec, msg.header.stamp.nanosec = (1 << 31) - 1, 1_000_000_000
+    with pytest.raises(InputError, match=r'header\.stamp is 2147483648000000000 ns'):
+        decode.scan(msg)
+
+
 def test_leading_slash_of_a_frame_is_dropped(make):
     assert decode.scan(encode.laser_scan(make, a_scan(frame_id='/laser'))).frame_id == 'laser'
 

@@ -70,7 +70,15 @@ def test_file_of_a_robot_that_stands_is_left_alone(last, tmp_path):
 
 
 @pytest.mark.parametrize(
-    'content', ['', '{', '{"x": 1}', '[1, 2]', '{"x": NaN, "y": 0, "theta": 0}']
+    'content',
+    [
+        '',
+        '{',
+        '{"x": 1}',
+        '[1, 2]',
+        '{"x": NaN, "y": 0, "theta": 0}',
+        f'{{"x": {10**400}, "y": 0, "theta": 0}}',
+    ],
 )
 def test_damaged_file_is_told(last, tmp_path, content):
     (tmp_path / 'map.pose').write_text(content)

@@ -36,7 +36,7 @@ class LastPose:
             pose = np.array([float(values[name]) for name in ('x', 'y', 'theta')])
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, TypeError, KeyError, RecursionError) as e:
+        except (OSError, ValueError, TypeError, KeyError, RecursionError, OverflowError) as e:
             raise FileFormatError(f'{self._path}: no pose: {e}') from e
         if not np.isfinite(pose).all():
             raise FileFormatError(f'{self._path}: the pose is not finite')

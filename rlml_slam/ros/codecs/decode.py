@@ -30,6 +30,7 @@ _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # (x, y, yaw) of ROS's 6 x 6 covariances
 _ROUNDING = 1e-9  # of the largest variance
 LARGEST_VARIANCE = 1e15  # [m^2], [rad^2] of what another node of this package sends
 LARGEST_SIGMA = 100.0  # [m], [rad] of a detection
+LAST_STAMP = (1 << 31) * 1_000_000_000  # [ns] seconds are 32 bits in a message
 FASTEST = 1e3  # [m/s], [rad/s]
 FARTHEST = 1e4  # [m] beyond any laser
 LARGE = 50  # rows of a covariance whose eigenvalues are not computed
@@ -79,10 +80,10 @@ def frame(frame_id: str) -> str:
 
 
 def stamp(msg: Any, topic: str) -> int:
-    """The header's stamp [ns]; InputError if it is zero or negative."""
+    """The header's stamp [ns]; InputError if no clock can have it."""
     t = msg.header.stamp
     ns = int(t.sec) * 1_000_000_000 + int(t.nanosec)
-    if ns <= 0:
+    if not 0 < ns < LAST_STAMP:
         raise InputError(f'{topic}: header.stamp is {ns} ns')
     return ns
 
