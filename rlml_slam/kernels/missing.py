@@ -12,10 +12,10 @@ from rlml_slam.kernels import jit, library
 _COMPILED: dict[Callable[..., Any], Any] = {}  # by function
 
 
-def compiled(function: Callable[..., Any]) -> Any:
+def compiled(function: Callable[..., Any], decorator: str = 'kernel') -> Any:
     """The function as Numba compiles it, with all kernels and parts that it calls."""
     if function not in _COMPILED:
-        _COMPILED[function] = jit.kernel(_with_compiled(function))
+        _COMPILED[function] = getattr(jit, decorator)(_with_compiled(function))
     return _COMPILED[function]
 
 
@@ -38,9 +38,7 @@ def _callee(value: Any) -> Any:
         return compiled(value.__wrapped__)
     decorator = getattr(value, library.DECORATOR, None)
     if decorator in ('part', 'formula'):
-        if value not in _COMPILED:
-            _COMPILED[value] = getattr(jit, decorator)(_with_compiled(value))
-        return _COMPILED[value]
+        return compiled(value, decorator)
     if decorator == 'intrinsic':
         return _COMPILED.setdefault(value, jit.intrinsic(value))
     return getattr(jit, decorator) if decorator else value

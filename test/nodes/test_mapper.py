@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import os
 import resource
 import threading
 import time
@@ -569,16 +570,19 @@ def test_map_of_a_killed_process_is_recovered(make, ear, tmp_path):
     assert again.system.entry is None
 
 
-def test_continued_map_is_the_recovered_one(make, ear, tmp_path):
+@pytest.mark.parametrize('clock', [0.0, -3600.0], ids=['clock goes on', 'clock was set back'])
+def test_continued_map_is_the_recovered_one(make, ear, tmp_path, clock):
     mapper = make(map_directory=str(tmp_path), journal_period=1e-3)
     mapper.back_end.reflectors = lambda: posts(5)
     drives(mapper, range(30))
     mapper.requests.save('map')
+    saved = (tmp_path / 'map.rlml').stat().st_mtime - clock
+    os.utime(tmp_path / 'map.rlml', (saved, saved))
     drives(mapper, range(30, 60))
     keys = len(mapper.back_end.keyframes)
     killed(mapper)
     again = make(map_directory=str(tmp_path), continue_map=True)
-    assert len(again.back_end.keyframes) == keys
+    assert len(again.back_end.keyframes) == keys, ear.warnings
 
 
 def test_journal_of_a_running_process_is_left_alone(make, tmp_path):

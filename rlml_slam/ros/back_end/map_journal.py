@@ -107,15 +107,17 @@ class MapJournal:
             self._file.close()
         self._file = None
 
-    def recover(self) -> None:
-        """Make maps of what killed processes left."""
+    def recover(self) -> Path | None:
+        """Make maps of what killed processes left; the path of the last one."""
+        made = None
         for path in self._left():
             with path.open('rb') as file:
                 try:
                     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except OSError:
                     continue  # another process is writing it
-                self._recover(path)
+                made = self._recover(path) or made
+        return made
 
     def _check(self) -> None:
         if self.ends:
@@ -125,7 +127,7 @@ class MapJournal:
         files = self._folder.automatic(self._p.node.map_file_name, (JOURNAL,))
         return [path for path in files if path.name[-1].isdecimal() and path.is_file()]
 
-    def _recover(self, path: Path) -> None:
+    def _recover(self, path: Path) -> Path | None:
         name = self._p.node.map_file_name
         self._logger.warning(
             f'{path}: the last run ended without saving its map; recovering it '
@@ -137,17 +139,18 @@ class MapJournal:
             content = map_file.content_of(back_end, params, back_end.occupancy_grid())
         except InterruptedError:
             self._logger.warning(f'{path}: left for the next start')
-            return
+            return None
         except (RlmlError, OSError) as e:
             bad = path.with_name(path.name + '.damaged')
             path.rename(bad)
             self._logger.error(f'{bad}: no map can be made of it: {e}')
-            return
+            return None
         to = self._folder.free(name, AUTOSAVE, int(time.time()))
         try:
             map_container.write(to, content)
             path.unlink()
         except (MapError, OSError) as e:
             self._logger.error(f'{path}: left for the next start: {e}')
-            return
+            return None
         self._logger.warning(f'recovered: {len(back_end.keyframes)} keyframes in {to}')
+        return to

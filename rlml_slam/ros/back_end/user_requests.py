@@ -43,8 +43,8 @@ class UserRequests:
         if not node.continue_map:
             self._mapper.searcher.worker.submit(journal.recover)
             return begin
-        journal.recover()
-        whole = self._archive.folder.newest(name)
+        # times of files are no evidence: a robot's clock may have been set back since
+        whole = journal.recover() or self._archive.folder.newest(name)
         if whole.exists():
             self._logger.info(f'continues {whole}')
             return [*begin, *self._continue(str(whole.relative_to(self._archive.folder.root)))]
