@@ -20,6 +20,7 @@ from rlml_slam.se2 import Array
 # often where the wall lies near their border, have become free: given back half of the wall's.
 BESIDE = 50
 WALL = 0.25  # probability from which a cell of the map may stop a beam
+MAX_STEPS = 4096  # along a beam, 205 m in cells of 0.05 m: a message may have far smaller ones
 
 
 @dataclass(frozen=True)
@@ -91,11 +92,12 @@ def possible(submap: Submap, points: Array, pose: Array, score: float, best: flo
     """
     ends = se2.transform(pose, points)
     reach = float(np.hypot(points[:, 0], points[:, 1]).max())
-    share = np.linspace(0.0, 1.0, max(2, int(reach / submap.resolution)))
-    # the laser is near enough to the base for this
-    way = pose[:2] + share[None, :, None] * (ends - pose[:2])[:, None, :]
-    walls = _values(submap, way) > value_of(WALL)
-    free = (_values(submap, ends) == 0) & ~walls.any(axis=1)
+    share = np.linspace(0.0, 1.0, min(max(2, int(reach / submap.resolution)), MAX_STEPS))[:, None]
+    free = _values(submap, ends) == 0
+    for k in np.flatnonzero(free).tolist():
+        # the laser is near enough to the base for this
+        way = pose[:2] + share * (ends[k] - pose[:2])
+        free[k] = not (_values(submap, way) > value_of(WALL)).any()
     return score + float(np.mean(free)) * max(best - UNKNOWN, 0.0)
 
 
