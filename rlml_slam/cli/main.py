@@ -82,6 +82,9 @@ COMMANDS: Table = {
             ),
         },
     ),
+    'plan': Command(
+        'rlml_slam.cli.layout.plan', 'accuracy and uniqueness that a layout of reflectors gives'
+    ),
     'compare': Command(
         'rlml_slam.cli.compare', 'from a bag of both, how far two localizations were apart'
     ),

@@ -55,7 +55,7 @@ def png(figure: Figure) -> bytes:
     return out.getvalue()
 
 
-def _dress(axes: Any, x: str = '', y: str = '') -> None:
+def dress(axes: Any, x: str = '', y: str = '') -> None:
     """The look that all axes share."""
     axes.set_xlabel(x, color=INK)
     axes.set_ylabel(y, color=INK)
@@ -77,10 +77,10 @@ def map_picture(run: Run) -> bytes:
     size = (max(4.5, width * scale) + 0.6, max(3.5, height * scale) + 0.9)
     figure = Figure(figsize=size, layout='constrained')
     axes = figure.add_subplot()
-    _dress(axes, 'x [m]', 'y [m]')
+    dress(axes, 'x [m]', 'y [m]')
     axes.grid(False)
     if run.grid is not None:
-        _draw_grid(axes, run.grid)
+        draw_grid(axes, run.grid)
     handles: list[Any] = []
     if run.truth is not None and run.truth.is_map:
         true = run.truth.trajectory.poses
@@ -130,7 +130,8 @@ def _extent(run: Run) -> tuple[Array, Array]:
     return low - margin, high + margin
 
 
-def _draw_grid(axes: Any, grid: OccupancyGrid) -> None:
+def draw_grid(axes: Any, grid: OccupancyGrid) -> None:
+    """The grid below all else, unknown cells in grey."""
     cells = np.ma.masked_less(grid.cells, 0)
     rows, columns = grid.cells.shape
     (x, y), r = grid.origin, grid.resolution
@@ -181,7 +182,7 @@ def error_picture(run: Run, errors: RunErrors) -> bytes:
     names = (('x error [cm]', 100.0), ('y error [cm]', 100.0), ('heading error [°]', 57.29578))
     for k, axes in enumerate(panels):
         label, unit = names[k]
-        _dress(axes, 'time [s]' if k == known - 1 else '', label)
+        dress(axes, 'time [s]' if k == known - 1 else '', label)
         t = (live.stamps - start) * 1e-9
         band = 3.0 * unit * sigmas[:, k]
         axes.fill_between(
@@ -212,13 +213,13 @@ def health_picture(run: Run) -> bytes:
     figure = Figure(figsize=(9.0, 1.3 * sum(heights) + 0.6), layout='constrained')
     panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
     _health_strip(panels[0], t, frames.levels)
-    _dress(panels[1], '', 'position σ [cm]')
+    dress(panels[1], '', 'position σ [cm]')
     covs = np.array(frames.covs)
     sigma = 100.0 * np.sqrt(np.maximum(np.linalg.eigvalsh(covs[:, :2, :2])[:, 1], 0.0))
     panels[1].plot(t, sigma, color=LIVE, linewidth=0.9)
     panels[1].set_ylim(0.0, max(1.05 * float(np.max(sigma)), 0.1))
     if has_reflectors:
-        _dress(panels[2], '', 'reflectors')
+        dress(panels[2], '', 'reflectors')
         panels[2].plot(t, frames.seen, color=SOFT, linewidth=0.8, label='seen')
         panels[2].plot(t, frames.used, color=REFLECTOR, linewidth=0.8, label='used')
         panels[2].set_ylim(bottom=0)
@@ -231,7 +232,7 @@ def health_picture(run: Run) -> bytes:
 
 def _health_strip(axes: Any, t: Array, levels: Sequence[int]) -> None:
     """A bar over time in the colour of each level."""
-    _dress(axes)
+    dress(axes)
     axes.grid(False)
     axes.set_yticks([])
     for side in axes.spines.values():
@@ -260,7 +261,7 @@ def timing_picture(run: Run) -> bytes:
     figure = Figure(figsize=(9.0, 2.6), layout='constrained')
     panels = figure.subplots(1, len(sets), squeeze=False)[0]
     for axes, (title, ms, colour) in zip(panels, sets, strict=True):
-        _dress(axes, 'time [ms]', 'count')
+        dress(axes, 'time [ms]', 'count')
         shown = np.maximum(ms, 1e-3)
         low, high = float(shown.min()), float(shown.max())
         bins = np.geomspace(0.95 * low, 1.05 * high + 1e-3, 60)

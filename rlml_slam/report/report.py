@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -52,24 +52,29 @@ def report_html(run: Run, figures: Mapping[str, Any], pictures: Mapping[str, byt
         f'<div class="cards">{"".join(_cards(figures))}</div>',
     ]
     if run.problem:
-        parts.append(_section('The results are incomplete', escape(run.problem), 'problem'))
+        parts.append(section('The results are incomplete', escape(run.problem), 'problem'))
     parts += [_picture(name, pictures[name]) for name in ('map', 'errors') if name in pictures]
-    parts.append(_section('Figures', _table(summary_rows(figures))))
+    parts.append(section('Figures', _table(summary_rows(figures))))
     if figures.get('survey', {}).get('found'):
-        parts.append(_section('Reflectors against the survey', _table(_residuals(figures))))
+        parts.append(section('Reflectors against the survey', _table(_residuals(figures))))
     changed = [describe(s).partition(': ') for s in run.reflector_states if s.state != PRESENT]
     if changed:
         rows = [(kind, what) for kind, _, what in changed]
-        parts.append(_section('New, moved, missing and ghost reflectors', _table(rows)))
+        parts.append(section('New, moved, missing and ghost reflectors', _table(rows)))
     parts += [_picture(name, pictures[name]) for name in ('health', 'timing') if name in pictures]
     spells = list(bad_spells(run))
     if spells:
-        parts.append(_section('When it was not OK', _table(spells)))
+        parts.append(section('When it was not OK', _table(spells)))
+    return page(run.name, parts)
+
+
+def page(title: str, parts: Sequence[str]) -> str:
+    """A whole page of these parts, in the style of the report."""
     body = '\n'.join(parts)
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f'<title>{escape(run.name)} · rlml_slam</title><style>{_STYLE}</style></head>\n'
+        f'<title>{escape(title)} · rlml_slam</title><style>{_STYLE}</style></head>\n'
         f'<body><main>\n{body}\n<footer>rlml_slam {__version__}</footer></main></body></html>\n'
     )
 
@@ -113,10 +118,11 @@ def _residuals(f: Mapping[str, Any]) -> list[tuple[str, str]]:
 def _picture(name: str, png: bytes) -> str:
     data = base64.b64encode(png).decode('ascii')
     alt = escape(CAPTIONS[name])
-    return _section(CAPTIONS[name], f'<img alt="{alt}" src="data:image/png;base64,{data}">')
+    return section(CAPTIONS[name], f'<img alt="{alt}" src="data:image/png;base64,{data}">')
 
 
-def _section(title: str, body: str, kind: str = '') -> str:
+def section(title: str, body: str, kind: str = '') -> str:
+    """A box of the page; ``body`` is HTML."""
     return f'<section class="{kind}"><h2>{escape(title)}</h2>{body}</section>'
 
 

@@ -17,6 +17,7 @@ from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.matching.reflectors.association import gate
 from rlml_slam.matching.scans import scan_information, voxel_filter
 from rlml_slam.matching.scans.scan_match import match
+from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.front_end.joint_state import JointState
@@ -41,14 +42,24 @@ class GridMatch:
     contradicts: bool = False
 
 
+def map_information(submap: Submap, points: Array, pose: Array, params: Parameters) -> Array:
+    """Information (3, 3) of a match with the grid of a saved map, in the frame of the submap.
+
+    The error of the map at this place is one that more beams do not lower.
+    """
+    information = scan_information.information(submap, points, pose, params.scan_match)
+    floor = np.diag(params.submap.grid_bias_variance)
+    out = np.linalg.solve(np.eye(3) + information @ floor, information)
+    return np.asarray(0.5 * (out + out.T), dtype=np.float64)
+
+
 class GridLocalizer:
     """Matches scans with a grid."""
 
     def __init__(self, grid: OccupancyGrid, params: Parameters) -> None:
         self._p = params
         self._saved = submap_of(grid, params.submap)
-        self._floor = np.zeros((3, 3))
-        self._floor[[0, 1, 2], [0, 1, 2]] = params.submap.grid_bias_variance
+        self._floor = np.diag(params.submap.grid_bias_variance)
         self._gate = [gate(GATE_PROBABILITY, dof) for dof in (1, 2, 3)]
         self._last: Array | None = None
 
@@ -77,12 +88,8 @@ class GridLocalizer:
                 submap, points[::BEAM_STEP], found.pose, found.score, p.search_threshold
             )
             return GridMatch(found.score, contradicts=may_be < p.min_score)
-        information = scan_information.information(submap, points, found.pose, p)
-        # the error of the map at this place, which more beams do not lower
-        information = np.asarray(
-            np.linalg.solve(np.eye(3) + information @ self._floor, information), dtype=np.float64
-        )
-        values, axes = np.linalg.eigh(0.5 * (information + information.T))
+        information = map_information(submap, points, found.pose, self._p)
+        values, axes = np.linalg.eigh(information)
         keep = values > 1e-6
         root = (axes[:, keep] * np.sqrt(values[keep])).T
         offset = found.pose - prior

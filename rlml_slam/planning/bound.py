@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cramér-Rao bound of the pose at many places, with one or two reflectors hidden.
+
+The information of a reflector is J^T S^-1 J with the Jacobian of the front end's reflector term
+(eq. 1, ``innovations.expected``) at heading zero, and S its noise and the covariance of the map.
+Another heading turns the axes of the position and changes no sigma. Information is kept as rows
+xx, xy, xt, yy, yt, tt of x, y and heading.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam.params import Reflector
+from rlml_slam.se2 import Array
+from rlml_slam.sensing.polar import polar_covariance
+
+CHUNK = 4000  # places at a time, for memory
+OPEN = 1e-9  # share of the strongest direction's information below which one is open
+
+
+class Bound(NamedTuple):
+    """Sigmas (n,) of position, in its worst direction [m], and heading [rad].
+
+    ``hidden`` (n, 2): of position with the worst one, the worst two reflectors hidden.
+    ``information`` (n, 6) without any hidden. Infinite where it is open.
+    """
+
+    position: Array
+    heading: Array
+    hidden: Array
+    information: Array
+
+
+def reflector_information(offsets: Array, cov: Array, p: Reflector) -> Array:
+    """Information (k, 6) of reflectors at ``offsets`` (k, 2) with map covariances (k, 2, 2)."""
+    r = np.maximum(np.hypot(offsets[:, 0], offsets[:, 1]), 1e-6)
+    noise = polar_covariance(offsets / r[:, None], p.sigma_range**2, (r * p.sigma_bearing) ** 2)
+    S = noise + cov
+    det = S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] ** 2
+    a, b, c = S[:, 1, 1] / det, -S[:, 0, 1] / det, S[:, 0, 0] / det
+    x, y = offsets.T
+    xt, yt = b * x - a * y, c * x - b * y
+    return np.stack([a, b, xt, c, yt, yt * x - xt * y], -1)
+
+
+def sigmas(information: Array) -> tuple[Array, Array]:
+    """Position sigma [m] in the worst direction and heading sigma [rad], of rows (..., 6)."""
+    xx, xy, xt, yy, yt, tt = np.moveaxis(information, -1, 0)
+    # of the position, with the heading unknown: Schur complement
+    inverse = 1.0 / np.maximum(tt, 1e-30)
+    a, b, c = xx - xt * xt * inverse, xy - xt * yt * inverse, yy - yt * yt * inverse
+    mean, least = 0.5 * (a + c), OPEN * (xx + yy)
+    weakest = mean - np.sqrt((0.5 * (a - c)) ** 2 + b * b)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        position = np.where(weakest > least, weakest**-0.5, np.inf)
+        det = xx * yy - xy * xy
+        rest = tt - (yy * xt * xt - 2.0 * xy * xt * yt + xx * yt * yt) / det
+        heading = np.where((det > 0.0) & (rest > OPEN * tt), rest**-0.5, np.inf)
+    return position, heading
+
+
+def bound(
+    places: Array, seen: NDArray[np.bool_], reflectors: Array, cov: Array, p: Reflector,
+    also: Array | None = None,
+) -> Bound:  # fmt: skip
+    """The bound at places (n, 2) that see (n, m) reflectors (m, 2) with covariances (m, 2, 2).
+
+    ``also`` (n, 6): information from elsewhere, such as the scan.
+    """
+    n = len(places)
+    total = np.zeros((n, 6)) if also is None else also.copy()
+    hidden = np.zeros((n, 2))
+    for first in range(0, n, CHUNK):
+        rows, columns = np.nonzero(seen[first : first + CHUNK])
+        rows += first
+        offsets = reflectors[columns] - places[rows]
+        each = reflector_information(offsets, cov[columns], p)
+        starts = np.flatnonzero(np.diff(rows, prepend=-1))
+        if len(starts):
+            total[rows[starts]] += np.add.reduceat(each, starts)
+        _hide(total, rows, each, hidden)
+    position, heading = sigmas(total)
+    few = seen.sum(axis=1)
+    for k in range(2):  # with fewer in view, all are hidden
+        rest = position if k == 0 else hidden[:, 0]
+        hidden[:, k] = np.where(few <= k, rest, hidden[:, k])
+    return Bound(position, heading, hidden, total)
+
+
+def _hide(total: Array, rows: NDArray[np.int64], each: Array, hidden: Array) -> None:
+    """Write the largest sigma without one, without two of the reflectors of each place."""
+    left = total[rows] - each
+    np.maximum.at(hidden[:, 0], rows, sigmas(left)[0])
+    for step in range(1, len(rows)):
+        both = np.flatnonzero(rows[step:] == rows[:-step])
+        if not len(both):
+            break
+        np.maximum.at(hidden[:, 1], rows[both], sigmas(left[both] - each[both + step])[0])

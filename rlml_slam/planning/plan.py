@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The plan of a layout: at each place, what is seen, how accurate the pose is, if it is unique."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from rlml_slam import se2
+from rlml_slam.errors import MapError
+from rlml_slam.params import Parameters, SimulatorParameters
+from rlml_slam.planning.bound import Bound, bound, sigmas
+from rlml_slam.planning.samples import patterns, rival, scan_information
+from rlml_slam.planning.site import Site
+from rlml_slam.planning.visibility import close_pairs, visible
+from rlml_slam.se2 import Array
+from rlml_slam.types import Verdict
+
+MAX_SAMPLES = 600  # places at which the scan and the uniqueness are evaluated
+HEADINGS = 12  # of a laser that does not see all around
+SQUARES = 8  # areas along the longer side
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Values at places (n, 2), of the worst heading where the laser does not see all around.
+
+    ``in_view`` (n,) reflectors; bounds by ``reflectors`` alone, by the ``scan`` and by ``both``.
+    At ``sampled`` (s,) places: ``verdicts`` and the ``rivals`` (s, 3) they may be mistaken for.
+    """
+
+    site: Site
+    goal: float
+    places: Array
+    in_view: NDArray[np.int64]
+    reflectors: Bound
+    scan: Array
+    both: Bound
+    sampled: NDArray[np.int64]
+    verdicts: tuple[Verdict, ...]
+    rivals: Array
+    notes: tuple[str, ...]
+
+    @property
+    def is_unique(self) -> NDArray[np.bool_]:
+        """Whether the reflectors alone give one pose, at each sampled place."""
+        return np.array([v is Verdict.UNIQUE for v in self.verdicts], dtype=np.bool_)
+
+
+def make_plan(
+    site: Site, places: Array, p: Parameters, sensor: SimulatorParameters, goal: float
+) -> Plan:
+    """Evaluate a layout at ``places`` (n, 2); MapError where there is none."""
+    if not len(places):
+        raise MapError('there is no free place in the area; see --clearance and --area')
+    seen, points = visible(site, places, p, sensor), site.reflectors.points
+    n, fov = len(places), sensor.laser.field_of_view
+    chosen = np.unique(np.linspace(0, n - 1, min(n, MAX_SAMPLES)).round().astype(np.int64))
+    nearest = chosen[cKDTree(places[chosen]).query(places)[1]]
+    whole = fov > 2.0 * math.pi - 1e-6
+    alone: list[Bound] = []
+    both: list[Bound] = []
+    scans, counts = [], []
+    for heading in np.arange(1 if whole else HEADINGS) * (2.0 * np.pi / HEADINGS):
+        in_view = seen if whole else seen & _within(places, points, heading, fov)
+        scan = np.zeros((n, 6))
+        for k in chosen:
+            scan[k] = scan_information(site, places[k], heading, p, sensor.laser)
+        scan = scan[nearest]
+        alone.append(bound(places, in_view, points, site.cov, p.reflector))
+        both.append(bound(places, in_view, points, site.cov, p.reflector, scan))
+        scans.append(scan)
+        counts.append(in_view.sum(axis=1))
+    worst = np.argmax([b.position for b in both], axis=0)
+    fewest = np.argmin(counts, axis=0)
+    answers = []
+    for k in chosen:
+        heading = fewest[k] * (2.0 * np.pi / HEADINGS)
+        row = seen[k] if whole else seen[k] & _within(places[[k]], points, heading, fov)[0]
+        answers.append(rival(site, places[k], row, p))
+    rivals = np.array([other for _, other in answers])
+    close = [
+        f'reflectors {site.reflectors.ids[a]} and {site.reflectors.ids[b]} are closer than '
+        f'{p.reflector.min_separation:g} m: the detector sees one'
+        for a, b in close_pairs(points, p.reflector.min_separation)
+    ]
+    return Plan(
+        site, goal, places, np.min(counts, axis=0), _worst(alone),
+        np.take_along_axis(np.array(scans), worst[None, :, None], 0)[0], _worst(both), chosen,
+        tuple(v for v, _ in answers), rivals, tuple(close + patterns(places[chosen], rivals)),
+    )  # fmt: skip
+
+
+def _within(places: Array, points: Array, heading: float, fov: float) -> NDArray[np.bool_]:
+    """Whether a laser at places (n, 2) with one heading has points (m, 2) in its view."""
+    d = points - places[:, None]
+    bearing = se2.wrap(np.arctan2(d[..., 1], d[..., 0]) - heading)
+    inside: NDArray[np.bool_] = np.abs(bearing) <= 0.5 * fov + 1e-9
+    return inside
+
+
+def _worst(bounds: list[Bound]) -> Bound:
+    """The largest sigmas over headings; the information of the heading worst in position."""
+    worst = np.argmax([b.position for b in bounds], axis=0)
+    information = np.array([b.information for b in bounds])
+    return Bound(
+        np.max([b.position for b in bounds], axis=0), np.max([b.heading for b in bounds], axis=0),
+        np.max([b.hidden for b in bounds], axis=0),
+        np.take_along_axis(information, worst[None, :, None], 0)[0],
+    )  # fmt: skip
+
+
+def square_size(places: Array) -> float:
+    """Side [m] of the areas of the table: 1, 2 or 5 times a power of ten."""
+    longest = float(np.ptp(places, axis=0).max())
+    least = max(longest / SQUARES, 1.0)
+    return next(s for k in range(9) for s in (10.0**k, 2.0 * 10.0**k, 5.0 * 10.0**k) if s >= least)
+
+
+def areas(plan: Plan) -> list[dict[str, Any]]:
+    """Figures of each square, which has a letter along x and a number along y from the corner."""
+    size = square_size(plan.places)
+    low = np.floor(plan.places.min(axis=0) / size)
+    cell = (np.floor(plan.places / size) - low).astype(np.int64)
+    rows = []
+    for j, i in np.unique(cell, axis=0):
+        mine = (cell == (j, i)).all(axis=1)
+        corner = (low + np.array([j, i])) * size
+        rows.append({'area': f'{chr(65 + j)}{i + 1}', 'x_m': corner[0], 'y_m': corner[1],
+                     **_figures(plan, mine)})  # fmt: skip
+    return rows
+
+
+def figures(plan: Plan) -> dict[str, Any]:
+    """What plan.json has: the whole, each area, notes, ambiguous places with their rivals."""
+    everywhere = np.ones(len(plan.places), dtype=np.bool_)
+    lost = [
+        {'x_m': x, 'y_m': y, 'like_x_m': other[0], 'like_y_m': other[1], 'like_turn_rad': other[2]}
+        for (x, y), other in zip(plan.places[plan.sampled].tolist(), plan.rivals.tolist(),
+                                 strict=True)
+        if math.isfinite(other[0])
+    ]  # fmt: skip
+    return {
+        'reflectors': len(plan.site.reflectors), 'places': len(plan.places), 'goal_m': plan.goal,
+        'area_size_m': square_size(plan.places), **_figures(plan, everywhere),
+        'areas': areas(plan), 'notes': list(plan.notes), 'mistaken': lost,
+    }  # fmt: skip
+
+
+def _figures(plan: Plan, mine: NDArray[np.bool_]) -> dict[str, Any]:
+    """Figures of some of the places; a sigma that is open is None."""
+    sampled = mine[plan.sampled]
+    both = plan.both.position[mine]
+    return {
+        'in_view_min': int(plan.in_view[mine].min()),
+        'in_view_median': float(np.median(plan.in_view[mine])),
+        'reflectors_sigma_m': _percentiles(plan.reflectors.position[mine]),
+        'scan_sigma_m': _percentiles(scan_sigma(plan)[mine]),
+        'both_sigma_m': _percentiles(both),
+        'heading_sigma_rad': _percentiles(plan.both.heading[mine]),
+        'one_hidden_sigma_m': _percentiles(plan.both.hidden[mine, 0]),
+        'two_hidden_sigma_m': _percentiles(plan.both.hidden[mine, 1]),
+        'goal_share': float(np.mean(both <= plan.goal)),
+        'unique_share': float(np.mean(plan.is_unique[sampled])) if sampled.any() else None,
+    }
+
+
+def scan_sigma(plan: Plan) -> Array:
+    """Position sigma (n,) by the scan alone."""
+    return sigmas(plan.scan)[0]
+
+
+def _percentiles(values: Array) -> dict[str, float | None]:
+    """Median and largest."""
+    found = {'median': np.percentile(values, 50, method='lower'), 'max': values.max()}
+    return {k: float(v) if math.isfinite(v) else None for k, v in found.items()}

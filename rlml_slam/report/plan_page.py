@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The files of a plan: plan.json, maps as PNG, and a page in the style of the report."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.figure import Figure
+
+from rlml_slam.maps.atomic_file import write_atomically
+from rlml_slam.planning.plan import Plan, figures, scan_sigma
+from rlml_slam.report.outputs import make_folder
+from rlml_slam.report.pictures import REFLECTOR, SOFT, draw_grid, dress, png
+from rlml_slam.report.report import page, section
+from rlml_slam.se2 import Array
+
+CAPTIONS = {
+    'view': 'Reflectors in view',
+    'reflectors': 'Position sigma by reflectors alone',
+    'scan': 'Position sigma by the scan alone',
+    'both': 'Position sigma by reflectors and scan',
+    'one_hidden': 'Position sigma with the worst reflector hidden',
+    'two_hidden': 'Position sigma with the worst two reflectors hidden',
+    'unique': 'Where reflectors alone find a lost robot (1: one pose fits)',
+}
+
+
+def write_plan(plan: Plan, name: str, folder: Path) -> dict[str, Any]:
+    """Write plan.json, the pictures and plan.html, each whole or not at all; the figures."""
+    folder, found = make_folder(folder), figures(plan)
+    pictures = {k: _map(plan, k, v) for k, v in _values(plan).items()}
+    for key, image in pictures.items():
+        write_atomically(folder / f'{key}.png', image)
+    write_atomically(folder / 'plan.json', (json.dumps(found, indent=2) + '\n').encode())
+    write_atomically(folder / 'plan.html', _page(name, found, pictures).encode())
+    return found
+
+
+def _values(plan: Plan) -> dict[str, Array]:
+    hidden = plan.both.hidden
+    return {
+        'view': plan.in_view.astype(np.float64), 'both': plan.both.position,
+        'reflectors': plan.reflectors.position, 'scan': scan_sigma(plan),
+        'one_hidden': hidden[:, 0], 'two_hidden': hidden[:, 1],
+        'unique': plan.is_unique.astype(np.float64),
+    }  # fmt: skip
+
+
+def _map(plan: Plan, key: str, values: Array) -> bytes:
+    """The places, coloured by a value; sigmas in cm up to three goals."""
+    places = plan.places[plan.sampled] if key == 'unique' else plan.places
+    low, high = plan.places.min(axis=0) - 1.5, plan.places.max(axis=0) + 1.5
+    width, height = high - low
+    scale = 8.0 / max(width, height)
+    size = (max(4.0, width * scale) + 1.8, max(3.0, height * scale) + 0.9)
+    figure = Figure(figsize=size, layout='constrained')
+    axes = figure.add_subplot()
+    dress(axes, 'x [m]', 'y [m]')
+    axes.grid(False)
+    draw_grid(axes, plan.site.grid)
+    is_sigma = key not in ('view', 'unique')
+    # the side of a marker in points, so that markers of neighbours touch
+    side = 72.0 * scale * np.sqrt(width * height / len(places))
+    colours = colormaps['viridis_r' if is_sigma else 'viridis'].with_extremes(bad='#d9534f')
+    drawn = axes.scatter(
+        places[:, 0], places[:, 1], c=100.0 * values if is_sigma else values,
+        s=min(side, 8.0) ** 2, marker='s', linewidths=0.0, cmap=colours, vmin=0.0,
+        vmax=300.0 * plan.goal if is_sigma else max(float(values.max()), 1.0), zorder=2,
+        plotnonfinite=True,
+    )  # fmt: skip
+    axes.plot(*plan.site.reflectors.points.T, 'D', color=REFLECTOR, mec='white', ms=5, zorder=3)
+    label = 'sigma [cm], red: not held' if is_sigma else CAPTIONS[key]
+    figure.colorbar(drawn, ax=axes, label=label, extend='max' if is_sigma else 'neither')
+    axes.set(aspect='equal', xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    axes.set_title(CAPTIONS[key], fontsize=10, color='black' if is_sigma else SOFT)
+    return png(figure)
+
+
+def cm(value: float | None) -> str:
+    """A sigma for people."""
+    return 'open' if value is None else f'{100.0 * value:.2f}'
+
+
+HEADER = ('area', 'in view', 'reflectors [cm]', 'scan [cm]', 'both [cm]', 'one hidden [cm]',
+          'two hidden [cm]', 'goal', 'unique')  # fmt: skip
+
+
+def table_rows(found: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """The table: the whole, then each area; largest sigmas."""
+    rows: list[tuple[str, ...]] = [HEADER]
+    for row in [{'area': 'all', **found}, *found['areas']]:
+        sigmas = [cm(row[f'{k}_sigma_m']['max'])
+                  for k in ('reflectors', 'scan', 'both', 'one_hidden', 'two_hidden')]  # fmt: skip
+        unique = '' if row['unique_share'] is None else f'{row["unique_share"]:.0%}'
+        view = f'{row["in_view_min"]} to {row["in_view_median"]:g}'
+        rows.append((row['area'], view, *sigmas, f'{row["goal_share"]:.1%}', unique))
+    return rows
+
+
+def _page(name: str, found: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
+    goal, share = 100.0 * found['goal_m'], found['goal_share']
+    parts = [
+        f'<h1>Layout of {escape(name)}</h1><p class="sub">{found["reflectors"]} reflectors, '
+        f'{found["places"]} places; {goal:g} cm reached at {share:.1%}</p>'
+    ]
+    if found['notes']:
+        items = ''.join(f'<li>{escape(n)}</li>' for n in found['notes'])
+        parts.append(section('Notes', f'<ul>{items}</ul>', 'problem'))
+    for key, image in pictures.items():
+        data = base64.b64encode(image).decode('ascii')
+        body = f'<img alt="{escape(CAPTIONS[key])}" src="data:image/png;base64,{data}">'
+        parts.append(section(CAPTIONS[key], body))
+    cells = ''.join(
+        '<tr>' + ''.join(f'<td>{escape(c)}</td>' for c in row) + '</tr>'
+        for row in table_rows(found)
+    )
+    size = found['area_size_m']
+    parts.append(section(f'Areas of {size:g} m, largest sigmas', f'<table>{cells}</table>'))
+    return page(f'Layout of {name}', parts)
