@@ -12,6 +12,7 @@ import pytest
 from rlml_slam import se2
 from rlml_slam.errors import MapError
 from rlml_slam.maps.survey import Survey
+from rlml_slam.matching.reflectors.constellation import locate
 from rlml_slam.matching.reflectors.innovations import expected
 from rlml_slam.params import Parameters, Reflector, SimulatorParameters
 from rlml_slam.planning import site as sites
@@ -25,6 +26,7 @@ from rlml_slam.simulation.world import REFLECTOR
 from rlml_slam.simulation.world_file import load_world
 from rlml_slam.slam.front_end.joint_state import JointState
 from rlml_slam.slam.front_end.reflector_update import use_reflectors
+from rlml_slam.types import Verdict
 
 P, SENSOR = Parameters(), SimulatorParameters()
 UPPER = np.triu_indices(3)
@@ -191,3 +193,25 @@ def test_inside_a_polygon():
     triangle = np.array([[0.0, 0.0], [4.0, 0.0], [0.0, 4.0]])
     points = np.array([[1.0, 1.0], [3.0, 3.0], [-1.0, 1.0]])
     assert sites.inside(triangle, points).tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize('name', ['hall', 'room', 'symmetric'])
+def test_no_place_that_is_planned_unique_is_answered_wrongly(name):
+    """Relocalization with noise, 2 % misses and 0.3 ghosts per scan, against the plan."""
+    site, rng = sites.of_world(load_world(name)), np.random.default_rng(7)
+    places, points = sites.places(site, 1.0, 0.3), site.reflectors.points
+    plan = make_plan(site, places, P, SENSOR, 0.02)
+    seen = visible(site, places, P, SENSOR)[plan.sampled]
+    agree = []
+    for place, row, planned in zip(places[plan.sampled], seen, plan.is_unique, strict=True):
+        ghosts = rng.uniform(-15.0, 15.0, (rng.poisson(0.3), 2))
+        z = np.vstack([points[row & (rng.random(len(points)) > 0.02)] - place, ghosts])
+        cov = covariance(z, P.reflector)
+        z += (np.linalg.cholesky(cov) @ rng.standard_normal((len(z), 2, 1)))[..., 0]
+        found = locate(z, cov, points, site.cov, P.relocalization)
+        is_unique = found.verdict is Verdict.UNIQUE
+        agree.append(is_unique == planned)
+        if is_unique:
+            assert np.hypot(*(found.candidates[0].pose[:2] - place)) < 0.3
+    # misses make a few places with three or four in view ambiguous
+    assert np.mean(agree) > 0.9
