@@ -28,6 +28,7 @@ from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Node, Parameters, from_mapping, read_yaml
 from rlml_slam.recordings.bag_inputs import BagInputs
+from rlml_slam.recordings.bag_replay import Given
 from rlml_slam.recordings.bag_replay import replay as run_replay
 from rlml_slam.recordings.products import collect
 from rlml_slam.report.outputs import write_outputs
@@ -321,7 +322,7 @@ def replay(
     """
     path, own = (bag.path, bag.parameters) if isinstance(bag, Bag) else (bag, Parameters())
     known, begun = _start(localize_in, continue_from)
-    return Result(run_replay(path, parameters or own, known=known, begun=begun))
+    return Result(run_replay(path, parameters or own, given=Given(known, begun)))
 
 
 def evaluate(

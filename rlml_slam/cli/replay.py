@@ -16,7 +16,7 @@ from rlml_slam.evaluation.run_record import Truth
 from rlml_slam.maps import saved_map, survey
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import from_mapping, read_yaml
-from rlml_slam.recordings.bag_replay import SYSTEMS, replay
+from rlml_slam.recordings.bag_replay import SYSTEMS, Given, replay
 from rlml_slam.report.outputs import make_folder, write_outputs
 from rlml_slam.report.summary import print_summary
 from rlml_slam.slam.store import map_file
@@ -54,6 +54,10 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         '--no-odometry', action='store_true', help='leave out the odometry: as use_odom false'
     )
+    parser.add_argument(
+        '--mcap', metavar='FILE', type=Path,
+        help='inputs and estimates as one file for Foxglove, RViz and others',
+    )  # fmt: skip
     parser.add_argument('--json', action='store_true', help='print metrics.json and no more')
 
 
@@ -72,7 +76,13 @@ def run(args: argparse.Namespace) -> int:
     surveyed = survey.load(args.survey) if args.survey else None
     with Progress('replay', 1.0, args.json) as progress:
         result = replay(
-            args.bag, params, truth, args.system, known, begun, surveyed, progress.update
+            args.bag,
+            params,
+            truth,
+            args.system,
+            Given(known, begun, surveyed),
+            args.mcap,
+            progress.update,
         )
     return print_summary(result, write_outputs(result, args.out), args.out, args.json)
 

@@ -60,6 +60,12 @@ class BagInputs:
         for time, topic, message in self._bag.messages(stream_of):
             yield time, stream_of[topic], message
 
+    def shown(self) -> list[str]:
+        """The topics that a viewer needs beside the estimates, without moving transforms."""
+        named = (_named(self._bag, TRUTH), _named(self._bag, TRUE_REFLECTORS))
+        others = filter(None, (self._transforms('tf_static'), *named))
+        return [*self.topics.values(), *self.more_scans, *others]
+
     def sources(self) -> dict[str, str]:
         """Where each counted stream comes from, in words."""
         n, out = self.params.node, sources(self.topics, self.more_scans)

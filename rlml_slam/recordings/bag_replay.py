@@ -5,19 +5,22 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from rlml_slam import warm_up
 from rlml_slam.ekf.slam import EkfSlam
 from rlml_slam.errors import BagError, InputError, ParameterError
+from rlml_slam.evaluation.metrics import run_errors
 from rlml_slam.evaluation.run_record import FrameLog, Run, Truth
 from rlml_slam.maps.map_container import Content
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.maps.survey import Survey
 from rlml_slam.params import EkfParameters, Parameters
 from rlml_slam.recordings.bag_inputs import BagInputs
+from rlml_slam.recordings.estimate_bag import EstimateBag
 from rlml_slam.recordings.products import collect, fates, survey_figures
 from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.sensor_input import SensorInput
@@ -31,74 +34,92 @@ SYSTEMS: Mapping[str, tuple[type[Any], Callable[[Any], Slam | EkfSlam]]] = {
 }
 
 
+@dataclass(frozen=True)
+class Given:
+    """What a replay begins with: a map to localize in, one to continue, surveyed reflectors."""
+
+    known: SavedMap | None = None
+    begun: Content | None = None
+    surveyed: Survey | None = None
+
+
 def replay(
     path: str | Path,
     params: Parameters,
     truth: Truth | None = None,
     system: str = 'rlml',
-    known: SavedMap | None = None,
-    begun: Content | None = None,
-    surveyed: Survey | None = None,
+    given: Given = Given(),
+    mcap: Path | None = None,
     progress: Callable[[float, str], None] = lambda share, note: None,
 ) -> Run:
     """Drive the system with a bag's messages in the order of the log.
 
-    ``truth`` replaces that of the bag; ``known`` is a map to localize in, from the pose
-    ``map_start_pose`` or from where the robot finds itself, ``begun`` one to go on with;
-    ``surveyed`` reflectors define the frame of the map. ``progress`` is called with the share that
-    is done and a note. A damaged bag, or one whose clock jumps
-    back, gives what came before, and ``Run.problem`` says so. Raises BagError if there is nothing
-    to use at all.
+    ``truth`` replaces that of the bag. In a known map the robot starts at ``map_start_pose`` or
+    where it finds itself; surveyed reflectors define the frame of the map. ``mcap`` is a file for
+    all that was estimated (EstimateBag). ``progress`` is called with the share that is done and a
+    note. A damaged bag, or one whose clock jumps back, gives what came before, and
+    ``Run.problem`` says so. Raises BagError if there is nothing to use at all.
     """
     warm_up.compile_loaded()
     with BagReader(path) as bag:
         inputs = BagInputs(bag, patient(params))
         params = inputs.params
-        slam = SYSTEMS[system][1](params)
-        if known is not None:
-            if not isinstance(slam, Slam):
-                raise ParameterError('replay: --map is for --system rlml')
-            slam = Slam(replace(params, node=replace(params.node, mode='localization')))
-            slam.use_map(known)
-        if surveyed is not None:
-            if not isinstance(slam, Slam):
-                raise ParameterError('replay: --survey is for --system rlml')
-            slam = Slam(params, survey=surveyed)
-        if begun is not None:
-            if not isinstance(slam, Slam):
-                raise ParameterError('replay: --continue is for --system rlml')
-            slam.continue_map(begun)
+        slam = _begin(system, params, given)
+        recording = None if mcap is None else EstimateBag(mcap, bag, inputs)
         log, problem = FrameLog(), ''
-        began = time.perf_counter()
-        try:
-            _drive(slam, params, inputs, log, (bag.start, bag.end), progress)
-        except BagError as e:
-            problem = str(e)
-        except InputError as e:
-            problem = f'{path}: {e}'
-        log.add(slam.finish())
-        wall = time.perf_counter() - began
-        problem = problem or bag.damage
-        if not log.stamps:
-            why = problem or slam.synchronizer.inputs.last_error or 'no scan and no reflectors'
-            raise BagError(f'{path}: nothing in it could be used: {why}')
-        truth = truth or inputs.truth()
-        if truth is not None and surveyed is not None:
-            truth = replace(truth, is_map=False)  # the bag knows nothing of the survey
-        result = collect(slam, log, Path(path).resolve().name, truth)
-        if isinstance(slam, Slam) and known is None:
-            result.stored = map_file.content_of(slam.back_end, params, result.grid)
-            result.extra = survey_figures(slam.back_end)
-        result.inputs = fates(slam.counts, bag.skipped, inputs.topics)
-        result.topics = inputs.sources()
-        detected = str(slam.synchronizer.reflectors)
-        if detected and 'reflectors' not in result.topics:
-            result.topics['reflectors'] = f'intensities of the scans: {detected}'
-            result.inputs['reflectors'] = {'used': slam.synchronizer.reflectors.num_scans}
+        with recording or nullcontext():
+            began = time.perf_counter()
+            try:
+                _drive(slam, inputs, log, recording, (bag.start, bag.end), progress)
+            except BagError as e:
+                problem = str(e)
+            except InputError as e:
+                problem = f'{path}: {e}'
+            frames = slam.finish()
+            log.add(frames)
+            wall = time.perf_counter() - began
+            problem = problem or bag.damage
+            if not log.stamps:
+                why = problem or slam.synchronizer.inputs.last_error or 'no scan and no reflectors'
+                raise BagError(f'{path}: nothing in it could be used: {why}')
+            truth = truth or inputs.truth()
+            if truth is not None and given.surveyed is not None:
+                truth = replace(truth, is_map=False)  # the bag knows nothing of the survey
+            result = collect(slam, log, Path(path).resolve().name, truth)
+            if isinstance(slam, Slam) and given.known is None:
+                result.stored = map_file.content_of(slam.back_end, params, result.grid)
+                result.extra = survey_figures(slam.back_end)
+            result.inputs = fates(slam.counts, bag.skipped, inputs.topics)
+            result.topics = inputs.sources()
+            detected = str(slam.synchronizer.reflectors)
+            if detected and 'reflectors' not in result.topics:
+                result.topics['reflectors'] = f'intensities of the scans: {detected}'
+                result.inputs['reflectors'] = {'used': slam.synchronizer.reflectors.num_scans}
+            if recording is not None:
+                recording.add(bag.end, frames, slam)
+                recording.finish(slam, run_errors(result))
     result.wall_s = wall
     ended = f'{problem}; the results hold what came before' if problem else ''
     result.problem = '; '.join(filter(None, (ended, result.problem)))
     return result
+
+
+def _begin(system: str, params: Any, given: Given) -> Slam | EkfSlam:
+    """The system, in the map or with the survey that is given."""
+    options = {'--map': given.known, '--survey': given.surveyed, '--continue': given.begun}
+    for option, value in options.items():
+        if value is not None and SYSTEMS[system][1] is not Slam:
+            raise ParameterError(f'replay: {option} is for --system rlml')
+    if given.known is not None:
+        slam = Slam(replace(params, node=replace(params.node, mode='localization')))
+        slam.use_map(given.known)
+        return slam
+    if SYSTEMS[system][1] is not Slam:
+        return SYSTEMS[system][1](params)
+    slam = Slam(params, survey=given.surveyed)
+    if given.begun is not None:
+        slam.continue_map(given.begun)
+    return slam
 
 
 def patient(params: Parameters) -> Parameters:
@@ -110,18 +131,21 @@ def patient(params: Parameters) -> Parameters:
 
 def _drive(
     slam: Slam | EkfSlam,
-    params: Parameters,
     inputs: BagInputs,
     log: FrameLog,
+    recording: EstimateBag | None,
     span: tuple[int, int],
     progress: Callable[[float, str], None],
 ) -> None:
     """Feed all inputs, the same way as the live nodes do."""
-    feed = SensorInput(params, slam, slam.synchronizer.inputs)
+    feed = SensorInput(inputs.params, slam, slam.synchronizer.inputs)
     feed.use_extrinsics(inputs.extrinsics)
     began, (start, end) = time.perf_counter(), span
     for k, (log_time, stream, message) in enumerate(inputs):
-        log.add(feed.add(stream, message))
+        frames = feed.add(stream, message)
+        log.add(frames)
+        if recording is not None:
+            recording.add(log_time, frames, slam)
         if k % 200 == 0:
             done = log_time - start
             factor = done * 1e-9 / max(time.perf_counter() - began, 1e-3)

@@ -268,18 +268,22 @@ LATCHED = Qos(
 class BagWriter:
     """A new rosbag2 folder, as a context manager: it appears whole or, after an error, not at all.
 
-    The same messages in the same order give the same bytes.
+    A ``path`` that ends in .mcap is one file without a folder and its metadata.yaml. The same
+    messages in the same order give the same bytes.
     """
 
     def __init__(self, path: str | Path, storage: Literal['mcap', 'sqlite3'] = 'mcap') -> None:
         self.path = Path(path)
+        self._is_file = self.path.suffix == '.mcap'
         if self.path.exists():
             raise BagError(f'{path}: exists already and is not overwritten')
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._folder = Path(tempfile.mkdtemp(prefix='.bag-', dir=self.path.parent))
             plugin = StoragePlugin.MCAP if storage == 'mcap' else StoragePlugin.SQLITE3
-            self._writer = Writer(self._folder / self.path.name, version=9, storage_plugin=plugin)
+            # the name of its folder is in the file
+            self._made = self._folder / ('bag' if self._is_file else self.path.name)
+            self._writer = Writer(self._made, version=9, storage_plugin=plugin)
             self._writer.open()
         except OSError as e:
             raise BagError(f'{path}: cannot be written: {e.strerror}') from e
@@ -300,7 +304,10 @@ class BagWriter:
         """Append a message made by ``messages.make_bag``; unannounced topics are added."""
         msgtype = message.__msgtype__
         self.add_topic(topic, msgtype)
-        data = bag_types().serialize_cdr(message, msgtype)
+        self.write_serialized(topic, bag_types().serialize_cdr(message, msgtype), log_time)
+
+    def write_serialized(self, topic: str, data: bytes | memoryview, log_time: int) -> None:
+        """Append the bytes (CDR) of a message to a topic that was announced."""
         try:
             self._writer.write(self._connections[topic], int(log_time), data)
         except OSError as e:
@@ -315,7 +322,8 @@ class BagWriter:
         try:
             if kind is None:
                 self._writer.close()
-                os.rename(self._folder / self.path.name, self.path)
+                made = self._made / f'{self._made.name}.mcap' if self._is_file else self._made
+                os.rename(made, self.path)
             else:
                 self._writer.abort()
         except OSError as e:

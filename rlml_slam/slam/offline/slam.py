@@ -49,6 +49,7 @@ class Slam(SynchronizedSystem):
             self.batch_reassociation.close()
         self.updates: list[Update] = []
         self.answers: dict[int, say.Answer] = {}
+        self.logs: list[say.Log] = []
         self._params, self._survey = params, survey
         self._path: list[tuple[int, Array]] = []
         self._loaded: BackEnd | None = None
@@ -65,6 +66,7 @@ class Slam(SynchronizedSystem):
             say.DrawMap: lambda c: self.execute(self.system.on_map_drawn(c.number, self.map())),
             say.TakeMap: self._take_map,
             say.ForgetMap: self._forget_map,
+            say.Log: self.logs.append,
             say.Answer: lambda answer: self.answers.update({answer.number: answer}),
         }
 
@@ -137,7 +139,7 @@ class Slam(SynchronizedSystem):
         """Run the conductor's commands, each with all that its answer asks for."""
         for command in commands:
             run = self._executes.get(type(command))
-            if run is not None:  # a replay writes no log and publishes nothing
+            if run is not None:  # nothing is published
                 run(command)
 
     def _command(self, command: say.FrontEndCommand) -> None:
