@@ -121,7 +121,6 @@ class BackEnd:
             self.interval.add_motion(frame)
             if frame.jumped:
                 self.interval.jump(frame)
-                self.scan_graph.finish_active()
         update = None
         last = self.keyframes[-1] if self.keyframes else None
         if is_keyframe(last, frame, self._p.back_end):
@@ -158,6 +157,7 @@ class BackEnd:
         else:
             self._add_sightings(interval)
             last = self.keyframes[-1]
+            self.scan_graph.follow(last, frame)
             motion = se2.between(last.T_local, frame.T_local_base)
             self.frame_trajectory.begin_keyframe(motion)
             index = self.graph.add_pose(se2.compose(self.graph.poses[last.index], motion))

@@ -14,6 +14,7 @@ from rlml_slam.se2 import Array
 from rlml_slam.slam.keyframes import Interval, Keyframe
 from rlml_slam.types import Frame
 
+GATE = 3.0  # [sigma]
 MOVED = 0.02  # [m], [rad] below which the robot stands still
 
 
@@ -46,6 +47,20 @@ def odometry_edge(
         both = last.cov_local + frame.cov_local
         return delta, se2.rotate_cov(both, -last.T_local[2]) + 1e-9 * np.eye(3)
     return delta, since.cov + np.diag(np.array(p.edge_variance_floor))
+
+
+def leaves_submap(last: Keyframe, frame: Frame, sigma: Array) -> bool:
+    """Whether the front end does not know where a frame is relative to the last keyframe.
+
+    So it is after a gap whose end matched nothing. What the pose became less certain by since
+    then, in the axes of the robot, is compared with the ``sigma`` (3,) of a keyframe in its
+    submap. The error of the heading that both have in common is no part of it.
+    """
+    delta = se2.between(last.T_local, frame.T_local_base)
+    J, _ = se2.compose_jacobians(last.T_local, delta)
+    grown = frame.cov_local - J @ last.cov_local @ J.T
+    grown = se2.rotate_cov(grown, -frame.T_local_base[2])
+    return bool((np.diag(grown) > (GATE * sigma) ** 2).any())
 
 
 def keyframe_of(index: int, frame: Frame, is_first: bool) -> Keyframe:

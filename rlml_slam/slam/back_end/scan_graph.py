@@ -16,9 +16,10 @@ from rlml_slam.matching.scans.scan_match import match
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
+from rlml_slam.slam.back_end.keyframe_selection import leaves_submap
 from rlml_slam.slam.closures.keyframe_submap import TURN, KeyframeSubmap, edge_of_match
 from rlml_slam.slam.keyframes import Keyframe
-from rlml_slam.types import EdgeKind
+from rlml_slam.types import EdgeKind, Frame
 
 COVERED = 0.8  # share of a submap's walls that a newer one must contain to replace it
 
@@ -53,6 +54,12 @@ class ScanGraph:
         if key.points is None or len(key.points) < p.min_points:
             return None
         return voxel_filter.thin(key.points.astype(np.float64), p.voxel_size, p.max_points)
+
+    def follow(self, last: Keyframe, frame: Frame) -> None:
+        """Finish the active submaps unless the way from the last keyframe to the next is known."""
+        sigma = np.array(self._p.back_end.match_sigma)
+        if frame.jumped or leaves_submap(last, frame, sigma):
+            self.finish_active()
 
     def finish_active(self) -> None:
         """Finish the submaps that are being built: the robot continues elsewhere."""

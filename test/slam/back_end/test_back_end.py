@@ -21,7 +21,7 @@ from made_worlds import (
 
 from rlml_slam import se2
 from rlml_slam.graph.model.factors import relative_information
-from rlml_slam.graph.model.graph import Graph
+from rlml_slam.graph.model.graph import EDGE_KINDS, Graph
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import BackEnd as BackEndParameters
 from rlml_slam.params import LoopClosure, Node, Parameters
@@ -453,6 +453,35 @@ def test_loop_is_closed_only_by_a_scan_that_holds_its_place(open_):
     else:
         at = se2.compose(m.T_anchor_grid, found.T_grid_key)
         np.testing.assert_allclose(at, pose, atol=0.03)
+
+
+def test_submaps_end_where_the_motion_after_them_is_not_known():
+    """After a gap whose end matches nothing, a submap of both sides would bind them wrongly."""
+    path = drive((0.6, 0.0, 6.0), (0.5, 0.3, 6.0))
+    frames = frames_along(path)
+    gap, lost = len(frames) // 2, np.diag([0.2, 0.7, 0.3]) ** 2
+
+    def widened(frame, cov):
+        """The error of the gap, carried along the way since then."""
+        J, _ = se2.compose_jacobians(path[gap], se2.between(path[gap], frame.T_local_base))
+        return replace(frame, cov_local=frame.cov_local + J @ cov @ J.T)
+
+    def starts(cov):
+        after = [widened(f, cov) for f in frames[gap:]]
+        back_end = BackEnd(Parameters())
+        for frame in (*frames[:gap], *after):
+            back_end.add(frame)
+        first = next(k for k in back_end.keyframes if k.stamp >= frames[gap].stamp)
+        edges = back_end.graph.edges
+        i, j = edges.nodes[edges.kinds == EDGE_KINDS[EdgeKind.SCAN]].T
+        crossing = bool(((i < first.index) & (j >= first.index)).any())
+        return len(back_end.scan_graph.finished), crossing
+
+    known, across = starts(1e-6 * EYE)
+    assert across
+    apart, across = starts(lost)
+    assert not across
+    assert apart > known
 
 
 def test_edge_of_a_scan_that_leaves_a_direction_open_enters_the_graph():
