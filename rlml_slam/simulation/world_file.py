@@ -115,7 +115,8 @@ class _Place:
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise self.refuse(key, f'= {value!r} is not a number')
         if not low <= value <= high:
-            raise self.refuse(key, f'= {value:g} is outside [{low:g}, {high:g}]')
+            shown = f'= {value:g}' if abs(value) < 1e300 else ''  # of any length
+            raise self.refuse(key, f'{shown} is outside [{low:g}, {high:g}]'.strip())
         return float(value)
 
     def array(self, key: str, shape: tuple[int, ...]) -> Array:
@@ -124,7 +125,7 @@ class _Place:
             raise self.refuse(key, 'is missing')
         try:
             value = np.array(self.tree[key], dtype=np.float64)
-        except (TypeError, ValueError) as e:
+        except (TypeError, ValueError, OverflowError) as e:
             raise self.refuse(key, 'is not an array of numbers') from e
         fits = value.ndim == len(shape) and all(
             want in (-1, have) for want, have in zip(shape, value.shape, strict=True)

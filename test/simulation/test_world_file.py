@@ -88,6 +88,8 @@ def test_a_world_file_is_loaded_by_its_path(tmp_path):
         (MINIMAL + 'boxes: [{at: [0, 0], size: [1, -1]}]', r'boxes\[0\]: size is not positive'),
         (MINIMAL + 'pillars: [{at: [0, 0]}]', r'pillars\[0\]: diameter is missing'),
         (MINIMAL + 'pillars: [{at: [0, 0], diameter: big}]', 'is not a number'),
+        (MINIMAL + f'pillars: [{{at: [0, 0], diameter: {10**400}}}]', r'diameter is outside \['),
+        (MINIMAL + f'pillars: [{{at: [0, {10**400}], diameter: 1}}]', 'at is not an array'),
         (MINIMAL + 'reflectors: [{at: [0, 0]}]', 'diameter or else width'),
         (MINIMAL + 'reflectors: [{at: [0, 0], width: 0.1}]', 'normal is missing'),
         (MINIMAL + 'reflectors: [{at: [0, 0], width: 0.1, normal: [0, 0]}]', 'normal is zero'),
