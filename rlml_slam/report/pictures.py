@@ -68,6 +68,14 @@ def dress(axes: Any, x: str = '', y: str = '') -> None:
         axes.spines[side].set_color(FAINT)
 
 
+def legend_above(axes: Any, **which: Any) -> None:
+    """The legend in one line above the axes, at the right: off the data."""
+    axes.legend(
+        loc='lower right', bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, ncols=3, frameon=False,
+        fontsize=8, **which,
+    )  # fmt: skip
+
+
 def map_picture(run: Run) -> bytes:
     """The map with trajectory, reflectors with 95 % ellipses and closures, to scale."""
     xy = run.trajectory.poses[:, :2]
@@ -223,7 +231,7 @@ def health_picture(run: Run) -> bytes:
         panels[2].plot(t, frames.seen, color=SOFT, linewidth=0.8, label='seen')
         panels[2].plot(t, frames.used, color=REFLECTOR, linewidth=0.8, label='used')
         panels[2].set_ylim(bottom=0)
-        panels[2].legend(loc='upper right', ncols=2, frameon=False, fontsize=8)
+        legend_above(panels[2])
     panels[-1].set_xlabel('time [s]', color=INK)
     panels[-1].margins(x=0.005)
     figure.align_ylabels()
@@ -247,10 +255,7 @@ def _health_strip(axes: Any, t: Array, levels: Sequence[int]) -> None:
         for level, colour in LEVELS.items()
         if (share := float(np.mean(values == level))) > 0.0
     ]
-    axes.legend(
-        handles=handles, loc='lower right', bbox_to_anchor=(1.0, 1.0), ncols=3,
-        frameon=False, fontsize=8,
-    )  # fmt: skip
+    legend_above(axes, handles=handles)
 
 
 def timing_picture(run: Run) -> bytes:
@@ -271,12 +276,12 @@ def timing_picture(run: Run) -> bytes:
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.xaxis.set_major_formatter('{x:g}')
-        axes.set_title(title, fontsize=9, color=INK, loc='left')
+        axes.set_title(title, fontsize=9, color=INK, loc='left', pad=18)
         for share, style in ((50, '-'), (99, '--')):
             value = float(np.percentile(ms, share))
             name = 'median' if share == 50 else f'p{share}'
             axes.axvline(
                 value, color=INK, linewidth=0.9, linestyle=style, label=f'{name} {value:.2f} ms'
             )
-        axes.legend(frameon=False, fontsize=8, loc='upper right')
+        legend_above(axes)
     return png(figure)
