@@ -157,8 +157,20 @@ class _Drive:
             self._killed.rates.append((len(stamps) - 1) / float(np.ptp(stamps) / SECOND))
 
     def _look_at(self, newest: int) -> None:
-        """What the journal of a killed back end gives, compared with the newest pose."""
-        for path in self._journals():
+        """What the journal of a killed back end gives, compared with the newest pose.
+
+        Just after a restart of the front end, the map until then is in a file of its own and the
+        new one may have no keyframe yet.
+        """
+        journals = self._journals()
+        if not journals:
+            self._killed.maps += 1
+            kept = sorted(self._maps.glob('map.lost-*.rlml'))
+            try:
+                map_file.load(kept[-1])
+            except (RlmlError, LookupError) as e:
+                self._killed.unreadable.append(f'no journal, and no map is kept: {e}')
+        for path in journals:
             self._killed.maps += 1
             try:
                 back_end, params = journal.recover(path)
