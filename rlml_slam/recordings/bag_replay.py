@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from rlml_slam.params import EkfParameters, Parameters
 from rlml_slam.recordings.bag_inputs import BagInputs
 from rlml_slam.recordings.estimate_bag import EstimateBag
 from rlml_slam.recordings.products import collect, fates, survey_figures
-from rlml_slam.ros.bags.bag import BagReader
+from rlml_slam.ros.bags.bag import BagReader, BagWriter
 from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.store import map_file
@@ -61,43 +61,45 @@ def replay(
     ``Run.problem`` says so. Raises BagError if there is nothing to use at all.
     """
     warm_up.compile_loaded()
-    with BagReader(path) as bag:
+    with BagReader(path) as bag, ExitStack() as files:
         inputs = BagInputs(bag, patient(params))
         params = inputs.params
         slam = _begin(system, params, given)
-        recording = None if mcap is None else EstimateBag(mcap, bag, inputs)
+        recording = None
+        if mcap is not None:
+            recording = EstimateBag(files.enter_context(BagWriter(mcap)), inputs)
+            recording.copy(path)
         log, problem = FrameLog(), ''
-        with recording or nullcontext():
-            began = time.perf_counter()
-            try:
-                _drive(slam, inputs, log, recording, (bag.start, bag.end), progress)
-            except BagError as e:
-                problem = str(e)
-            except InputError as e:
-                problem = f'{path}: {e}'
-            frames = slam.finish()
-            log.add(frames)
-            wall = time.perf_counter() - began
-            problem = problem or bag.damage
-            if not log.stamps:
-                why = problem or slam.synchronizer.inputs.last_error or 'no scan and no reflectors'
-                raise BagError(f'{path}: nothing in it could be used: {why}')
-            truth = truth or inputs.truth()
-            if truth is not None and given.surveyed is not None:
-                truth = replace(truth, is_map=False)  # the bag knows nothing of the survey
-            result = collect(slam, log, Path(path).resolve().name, truth)
-            if isinstance(slam, Slam) and given.known is None:
-                result.stored = map_file.content_of(slam.back_end, params, result.grid)
-                result.extra = survey_figures(slam.back_end)
-            result.inputs = fates(slam.counts, bag.skipped, inputs.topics)
-            result.topics = inputs.sources()
-            detected = str(slam.synchronizer.reflectors)
-            if detected and 'reflectors' not in result.topics:
-                result.topics['reflectors'] = f'intensities of the scans: {detected}'
-                result.inputs['reflectors'] = {'used': slam.synchronizer.reflectors.num_scans}
-            if recording is not None:
-                recording.add(bag.end, frames, slam)
-                recording.finish(slam, run_errors(result))
+        began = time.perf_counter()
+        try:
+            _drive(slam, inputs, log, recording, (bag.start, bag.end), progress)
+        except BagError as e:
+            problem = str(e)
+        except InputError as e:
+            problem = f'{path}: {e}'
+        frames = slam.finish()
+        log.add(frames)
+        wall = time.perf_counter() - began
+        problem = problem or bag.damage
+        if not log.stamps:
+            why = problem or slam.synchronizer.inputs.last_error or 'no scan and no reflectors'
+            raise BagError(f'{path}: nothing in it could be used: {why}')
+        truth = truth or inputs.truth()
+        if truth is not None and given.surveyed is not None:
+            truth = replace(truth, is_map=False)  # the bag knows nothing of the survey
+        result = collect(slam, log, Path(path).resolve().name, truth)
+        if isinstance(slam, Slam) and given.known is None:
+            result.stored = map_file.content_of(slam.back_end, params, result.grid)
+            result.extra = survey_figures(slam.back_end)
+        result.inputs = fates(slam.counts, bag.skipped, inputs.topics)
+        result.topics = inputs.sources()
+        detected = str(slam.synchronizer.reflectors)
+        if detected and 'reflectors' not in result.topics:
+            result.topics['reflectors'] = f'intensities of the scans: {detected}'
+            result.inputs['reflectors'] = {'used': slam.synchronizer.reflectors.num_scans}
+        if recording is not None:
+            recording.add(bag.end, frames, slam)
+            recording.finish(slam, run_errors(result))
     result.wall_s = wall
     ended = f'{problem}; the results hold what came before' if problem else ''
     result.problem = '; '.join(filter(None, (ended, result.problem)))

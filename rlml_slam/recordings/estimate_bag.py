@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterable
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 
@@ -24,31 +23,40 @@ from rlml_slam.ros.codecs.reflector_clouds import build_associated, build_reflec
 from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.types import Frame, Health, Level
 
-MARKERS, FLOAT = 'visualization_msgs/msg/MarkerArray', 'std_msgs/msg/Float64'
+MARKERS, CLOUD = 'visualization_msgs/msg/MarkerArray', 'sensor_msgs/msg/PointCloud2'
+FLOAT = 'std_msgs/msg/Float64'
 LATCHED = {
     '/map': 'nav_msgs/msg/OccupancyGrid',
     '/reflector_map': MARKERS,
-    '/reflector_map_points': 'sensor_msgs/msg/PointCloud2',
+    '/reflector_map_points': CLOUD,
     '/graph': MARKERS,
     '/tf_static': 'tf2_msgs/msg/TFMessage',
+}
+TOPICS = {
+    **LATCHED,
+    '/tf': 'tf2_msgs/msg/TFMessage',
+    '/pose': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    '/reflectors/statuses': MARKERS,
+    '/reflectors/associated': CLOUD,
+    '/front_end/health': 'diagnostic_msgs/msg/DiagnosticStatus',
+    '/rosout': 'rcl_interfaces/msg/Log',
 }
 FIRST, GROWTH = 16, 1.25  # frames before a picture of the map: all cost 5 times the last one
 LOG_LEVEL = {Level.OK: 20, Level.DEGRADED: 30, Level.LOST: 40}  # of rcl_interfaces/msg/Log
 
 
 class EstimateBag:
-    """Writes ``path`` as a context manager; two replays of one bag give the same bytes.
+    """Writes a replay to ``writer``; two replays of one bag give the same bytes.
 
     Messages have the log time of the input that caused them. ``/tf`` holds the recorded
     transforms, map to odom as estimated and, where the bag lacks it, odom to base of the
     odometry. Times of computing are left out.
     """
 
-    def __init__(self, path: Path, bag: BagReader, inputs: BagInputs) -> None:
-        self._bag, self._inputs, self._n = bag, inputs, inputs.params.node
-        self._writer = BagWriter(path)
-        for topic, kind in LATCHED.items():
-            self._writer.add_topic(topic, kind, latched=True)
+    def __init__(self, writer: BagWriter, inputs: BagInputs) -> None:
+        self._writer, self._inputs, self._n = writer, inputs, inputs.params.node
+        for topic, kind in TOPICS.items():
+            self._writer.add_topic(topic, kind, latched=topic in LATCHED)
         self._times: list[int] = []  # of the frames
         self._drawn_at = float(FIRST)
         self._updates, self._logs = 0, 0
@@ -57,48 +65,43 @@ class EstimateBag:
         self._last: tuple[int, Frame] | None = None
         self._has_odometry = inputs.has_odometry_on_tf or 'odom' in inputs.topics
 
-    def __enter__(self) -> EstimateBag:
-        with contextlib.suppress(BagError):  # the replay meets the damage again and reports it
-            self._copy_inputs()
-            self._copy_transforms()
-            if self._has_odometry and not self._inputs.has_odometry_on_tf:
-                self._copy_odometry()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._writer.__exit__(kind, error, trace)
-
     # --- inputs ----------------------------------------------------------------------------------
 
-    def _copy_inputs(self) -> None:
+    def copy(self, path: str | Path) -> None:
+        """The inputs, from the bag opened once more: the replay counts what cannot be read."""
+        copies = [self._copy_inputs, self._copy_transforms]
+        if self._has_odometry and not self._inputs.has_odometry_on_tf:
+            copies.append(self._copy_odometry)
+        with BagReader(path) as bag:
+            for copy in copies:
+                with contextlib.suppress(BagError):  # damaged: what comes before
+                    copy(bag)
+
+    def _copy_inputs(self, bag: BagReader) -> None:
+        """Those of standard types, but for one that has the name of an estimate."""
         known = bag_types().fielddefs
-        kinds = {t: self._bag.topics[t].msgtype for t in self._inputs.shown()}
-        kinds = {t: kind for t, kind in kinds.items() if kind in known}
+        kinds = {t: bag.topics[t].msgtype for t in self._inputs.shown()}
+        kinds = {t: k for t, k in kinds.items() if k in known and TOPICS.get(t, k) == k}
         for topic, kind in kinds.items():
-            self._writer.add_topic(topic, kind, self._bag.is_latched(topic))
-        for time, topic, data in self._bag.serialized(kinds):
+            self._writer.add_topic(topic, kind, bag.is_latched(topic))
+        for time, topic, data in bag.serialized(kinds):
             self._writer.write_serialized(topic, data, time)
 
-    def _copy_transforms(self) -> None:
+    def _copy_transforms(self, bag: BagReader) -> None:
         """The recorded transforms, without those that would give odom or base two parents."""
         base, odom = decode.frame(self._n.base_frame), decode.frame(self._n.odom_frame)
         ours = {odom} if self._inputs.has_odometry_on_tf else {odom, base}
         if not self._inputs.tf:
             return
-        for time, _, message in self._bag.messages([self._inputs.tf]):
+        for time, _, message in bag.messages([self._inputs.tf]):
             kept = [t for t in message.transforms if decode.frame(t.child_frame_id) not in ours]
             if kept:
                 self._writer.write('/tf', encode.tf_message(make, kept), time)
 
-    def _copy_odometry(self) -> None:
+    def _copy_odometry(self, bag: BagReader) -> None:
         """Odom to base as a transform."""
         frames, topic = (self._n.odom_frame, self._n.base_frame), self._inputs.topics['odom']
-        for time, _, message in self._bag.messages([topic]):
+        for time, _, message in bag.messages([topic]):
             with contextlib.suppress(InputError):  # the replay counts it
                 T = decode.planar_pose(message.pose.pose, topic)
                 moved = encode.transform(make, decode.stamp(message, topic), frames, T)

@@ -188,3 +188,29 @@ def test_filter_is_recorded_as_well(tmp_path):
     with BagReader(tmp_path / 'run.mcap') as bag:
         assert bag.topics['/pose'].count > 10
         assert '/reflector_map' in bag.topics
+
+
+@pytest.fixture
+def damaged(tmp_path):
+    """Broken messages on each topic, and an odometry with the name of an estimate."""
+    path = tmp_path / 'damaged'
+    with BagReader(ROOM) as bag, BagWriter(path) as out:
+        for k, (time, topic, message) in enumerate(bag.messages()):
+            name = '/pose' if topic == '/odom' else topic
+            out.write(name, message, time)
+            if k % 50 == 0:
+                out.write_serialized(name, b'\x00\x01\x00\x00\x07', time)
+    return path
+
+
+def test_recording_changes_no_figure_of_a_damaged_bag(damaged, tmp_path):
+    plain = replay(damaged, Parameters())
+    shown = replay(damaged, Parameters(), mcap=tmp_path / 'run.mcap')
+    assert shown.inputs == plain.inputs
+    assert sum(f.get('unreadable', 0) + f.get('invalid', 0) for f in plain.inputs.values()) > 0
+    assert np.array_equal(shown.trajectory.poses, plain.trajectory.poses)
+    with BagReader(tmp_path / 'run.mcap') as bag:
+        poses = [decode.pose_estimate(m) for _, _, m in bag.messages(['/pose'])]
+        assert not bag.skipped
+    assert len(poses) == len(plain.frames.stamps)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ['damaged', 'run.mcap']
