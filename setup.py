@@ -95,6 +95,8 @@ setup(
         # a machine without ROS 2 gets it from wheels
         'ros': ['ros-jazzy-common-interfaces', 'ros-jazzy-rclpy[fastrtps]'],
         'dev': ['hypothesis', 'mypy', 'pytest', 'pytest-xdist', 'ruff'],
+        # many recordings at once
+        'fleet': ['dask', 'distributed', 'fsspec', 'pyarrow'],
         'bench': ['evo', 'g2o-python', 'g2opy', 'gtsam', 'pyceres', 'yag-slam'],
     },
     zip_safe=False,

@@ -32,3 +32,7 @@ class NoMapError(MapError):
 
 class SolverError(RlmlError):
     """A graph is malformed, or its normal equations cannot be solved."""
+
+
+class ClusterError(RlmlError):
+    """A cluster cannot be reached, or its workers cannot be used."""

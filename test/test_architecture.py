@@ -23,7 +23,9 @@ ALLOWED = {
     'cli': {'core', 'ros', 'cli'},
 }
 # readers of data sets, figures and reports stand beside the commands; api is a façade over both
-CLI = ('cli', 'datasets', 'evaluation', 'recordings', 'report', 'api', '__init__')
+CLI = (
+    'cli', 'datasets', 'evaluation', 'fleet', 'recordings', 'report', 'api', '__init__',
+)  # fmt: skip
 # third-party modules of the core: numbers, and YAML for parameters, worlds and maps; llvmlite is
 # what numba itself is made with
 CORE_NEEDS = {'llvmlite', 'PIL', 'numba', 'numpy', 'scipy', 'yaml'}

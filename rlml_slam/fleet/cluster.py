@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cluster that works: a scheduler that runs already, or worker processes on this machine.
+
+Queue, retries and transport are those of Dask distributed.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from rlml_slam.errors import ClusterError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+Task = TypeVar('Task', bound=tuple[Any, ...])
+Result = TypeVar('Result')
+
+CONNECT_S = 30.0  # [s] within which a scheduler has to answer
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+@contextmanager
+def open_client(cluster: str | None, jobs: int = 0) -> Iterator[Client]:
+    """The client of the scheduler at ``cluster`` (tcp://HOST:PORT, tls://HOST:PORT).
+
+    Without an address: ``jobs`` worker processes on this machine, one per core where 0, each with
+    one thread, which end with the context. Raises ClusterError where there is no scheduler or the
+    packages of the extra ``fleet`` are missing.
+    """
+    try:
+        from distributed import Client, LocalCluster
+    except ModuleNotFoundError as e:
+        raise ClusterError(
+            f'a cluster needs the Python package {e.name!r}: pip install "rlml_slam[fleet]"'
+        ) from e
+    if cluster is not None:
+        try:
+            client = Client(cluster, timeout=CONNECT_S)
+        except (OSError, ValueError, TypeError) as e:
+            raise ClusterError(f'no scheduler of Dask answers at {cluster}: {e}') from e
+        with client:
+            yield client
+        return
+    with (
+        LocalCluster(
+            n_workers=jobs or cores(), threads_per_worker=1, host='127.0.0.1',
+            dashboard_address=None, silence_logs=logging.CRITICAL,
+        ) as local,
+        Client(local) as client,
+    ):  # fmt: skip
+        yield client
+
+
+def each(
+    client: Client, function: Callable[..., Result], tasks: Sequence[Task]
+) -> Iterator[tuple[Task, Result]]:
+    """(task, function(*task)) as they become ready; what a task raises is raised here."""
+    from distributed import as_completed
+
+    # each task is computed, equal ones too: Dask would find equal calls of a pure function again
+    pending = {client.submit(function, *task, pure=False): task for task in tasks}
+    for done in as_completed(list(pending)):
+        yield pending.pop(done), done.result()
