@@ -2,8 +2,8 @@
 """The command ``rlml``: a table of subcommands, each imported only when it is used.
 
 A subcommand is a module with ``add_parser(subparsers)`` and ``run(args) -> int``.
-An expected error is one line on stderr and exit code 1, a wrong command line is exit code 2, and
-a bug is a traceback.
+An expected error is one line on stderr and exit code 1, or ``ERROR_CODE`` of the module where 1 is
+an answer. A wrong command line is exit code 2, and a bug is a traceback.
 """
 
 from __future__ import annotations
@@ -119,6 +119,7 @@ def main(
     if '_ARGCOMPLETE' in os.environ:
         complete(table, prog)
     arguments = list(sys.argv[1:] if argv is None else argv)
+    module: ModuleType | None = None
     try:
         parser, module = build_parser(arguments, table, prog, description)
         args = parser.parse_args(arguments)
@@ -129,7 +130,7 @@ def main(
         return code
     except RlmlError as e:
         print(f'{prog}: {e}', file=sys.stderr)
-        return 1
+        return int(getattr(module, 'ERROR_CODE', 1))
     except KeyboardInterrupt:
         print(f'{prog}: interrupted', file=sys.stderr)
         return INTERRUPTED

@@ -9,12 +9,15 @@ xx, xy, xt, yy, yt, tt of x, y and heading.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.params import Reflector
+from rlml_slam.planning.driving import predicted, schur
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.polar import polar_covariance
 
@@ -50,9 +53,7 @@ def reflector_information(offsets: Array, cov: Array, p: Reflector) -> Array:
 def sigmas(information: Array) -> tuple[Array, Array]:
     """Position sigma [m] in the worst direction and heading sigma [rad], of rows (..., 6)."""
     xx, xy, xt, yy, yt, tt = np.moveaxis(information, -1, 0)
-    # of the position, with the heading unknown: Schur complement
-    inverse = 1.0 / np.maximum(tt, 1e-30)
-    a, b, c = xx - xt * xt * inverse, xy - xt * yt * inverse, yy - yt * yt * inverse
+    a, b, c = schur(information)
     mean, least = 0.5 * (a + c), OPEN * (xx + yy)
     weakest = mean - np.sqrt((0.5 * (a - c)) ** 2 + b * b)
     with np.errstate(divide='ignore', invalid='ignore'):
@@ -65,15 +66,21 @@ def sigmas(information: Array) -> tuple[Array, Array]:
 
 def bound(
     places: Array, seen: NDArray[np.bool_], reflectors: Array, cov: Array, p: Reflector,
-    also: Array | None = None,
+    also: Array | None = None, q: float = math.inf,
 ) -> Bound:  # fmt: skip
     """The bound at places (n, 2) that see (n, m) reflectors (m, 2) with covariances (m, 2, 2).
 
-    ``also`` (n, 6): information from elsewhere, such as the scan.
+    ``also`` (n, 6): information from elsewhere, such as the scan. ``q`` [m^2]: while driving, with
+    that variance of odometry from scan to scan; infinite for a single scan.
     """
     n = len(places)
-    total = np.zeros((n, 6)) if also is None else also.copy()
-    hidden = np.zeros((n, 2))
+    total, hidden = np.zeros((n, 6)), np.zeros((n, 2))
+    also = np.zeros((n, 6)) if also is None else also
+
+    def sigmas_at(rows: NDArray[np.int64] | slice, information: Array) -> tuple[Array, Array]:
+        more = predicted(information, q) if math.isfinite(q) else 0.0
+        return sigmas(information + more + also[rows])
+
     for first in range(0, n, CHUNK):
         rows, columns = np.nonzero(seen[first : first + CHUNK])
         rows += first
@@ -81,22 +88,25 @@ def bound(
         each = reflector_information(offsets, cov[columns], p)
         starts = np.flatnonzero(np.diff(rows, prepend=-1))
         if len(starts):
-            total[rows[starts]] += np.add.reduceat(each, starts)
-        _hide(total, rows, each, hidden)
-    position, heading = sigmas(total)
+            total[rows[starts]] = np.add.reduceat(each, starts)
+        _hide(total, rows, each, hidden, lambda at, left: sigmas_at(at, left)[0])
+    position, heading = sigmas_at(slice(None), total)
     few = seen.sum(axis=1)
+    nothing = sigmas(also)[0]
     for k in range(2):  # with fewer in view, all are hidden
-        rest = position if k == 0 else hidden[:, 0]
-        hidden[:, k] = np.where(few <= k, rest, hidden[:, k])
-    return Bound(position, heading, hidden, total)
+        hidden[:, k] = np.where(few <= k, nothing, hidden[:, k])
+    return Bound(position, heading, hidden, total + also)
 
 
-def _hide(total: Array, rows: NDArray[np.int64], each: Array, hidden: Array) -> None:
+def _hide(
+    total: Array, rows: NDArray[np.int64], each: Array, hidden: Array,
+    sigma: Callable[[NDArray[np.int64], Array], Array],
+) -> None:  # fmt: skip
     """Write the largest sigma without one, without two of the reflectors of each place."""
     left = total[rows] - each
-    np.maximum.at(hidden[:, 0], rows, sigmas(left)[0])
+    np.maximum.at(hidden[:, 0], rows, sigma(rows, left))
     for step in range(1, len(rows)):
         both = np.flatnonzero(rows[step:] == rows[:-step])
         if not len(both):
             break
-        np.maximum.at(hidden[:, 1], rows[both], sigmas(left[both] - each[both + step])[0])
+        np.maximum.at(hidden[:, 1], rows[both], sigma(rows[both], left[both] - each[both + step]))

@@ -6,6 +6,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -15,19 +16,22 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from rlml_slam.maps.atomic_file import write_atomically
+from rlml_slam.maps.occupancy import UNKNOWN, OccupancyGrid
 from rlml_slam.planning.plan import Plan, figures, scan_sigma
 from rlml_slam.report.outputs import make_folder
 from rlml_slam.report.pictures import REFLECTOR, SOFT, draw_grid, dress, png
 from rlml_slam.report.report import page, section
 from rlml_slam.se2 import Array
 
+PIXELS = 1000
 CAPTIONS = {
     'view': 'Reflectors in view',
-    'reflectors': 'Position sigma by reflectors alone',
-    'scan': 'Position sigma by the scan alone',
-    'both': 'Position sigma by reflectors and scan',
-    'one_hidden': 'Position sigma with the worst reflector hidden',
-    'two_hidden': 'Position sigma with the worst two reflectors hidden',
+    'reflectors': 'Position sigma of one scan, by reflectors alone',
+    'scan': 'Position sigma of one scan, by the scan alone',
+    'both': 'Position sigma of one scan, by reflectors and scan',
+    'driving': 'Position sigma while driving',
+    'one_hidden': 'Position sigma while driving with the worst reflector hidden',
+    'two_hidden': 'Position sigma while driving with the worst two reflectors hidden',
     'unique': 'Where reflectors alone find a lost robot (1: one pose fits)',
 }
 
@@ -44,10 +48,11 @@ def write_plan(plan: Plan, name: str, folder: Path) -> dict[str, Any]:
 
 
 def _values(plan: Plan) -> dict[str, Array]:
-    hidden = plan.both.hidden
+    hidden = plan.driving.hidden
     return {
-        'view': plan.in_view.astype(np.float64), 'both': plan.both.position,
+        'view': plan.in_view.astype(np.float64), 'driving': plan.driving.position,
         'reflectors': plan.reflectors.position, 'scan': scan_sigma(plan),
+        'both': plan.both.position,
         'one_hidden': hidden[:, 0], 'two_hidden': hidden[:, 1],
         'unique': plan.is_unique.astype(np.float64),
     }  # fmt: skip
@@ -60,11 +65,13 @@ def _map(plan: Plan, key: str, values: Array) -> bytes:
     width, height = high - low
     scale = 8.0 / max(width, height)
     size = (max(4.0, width * scale) + 1.8, max(3.0, height * scale) + 0.9)
-    figure = Figure(figsize=size, layout='constrained')
-    axes = figure.add_subplot()
+    figure = Figure(figsize=size)
+    axes = figure.add_axes(
+        (0.6 / size[0], 0.5 / size[1], 1.0 - 0.6 / size[0], 1.0 - 0.9 / size[1])
+    )
     dress(axes, 'x [m]', 'y [m]')
     axes.grid(False)
-    draw_grid(axes, plan.site.grid)
+    draw_grid(axes, _coarse(plan.site.grid))
     is_sigma = key not in ('view', 'unique')
     # the side of a marker in points, so that markers of neighbours touch
     side = 72.0 * scale * np.sqrt(width * height / len(places))
@@ -72,7 +79,7 @@ def _map(plan: Plan, key: str, values: Array) -> bytes:
     drawn = axes.scatter(
         places[:, 0], places[:, 1], c=100.0 * values if is_sigma else values,
         s=min(side, 8.0) ** 2, marker='s', linewidths=0.0, cmap=colours, vmin=0.0,
-        vmax=300.0 * plan.goal if is_sigma else max(float(values.max()), 1.0), zorder=2,
+        vmax=300.0 * plan.goal.sigma if is_sigma else max(float(values.max()), 1.0), zorder=2,
         plotnonfinite=True,
     )  # fmt: skip
     axes.plot(*plan.site.reflectors.points.T, 'D', color=REFLECTOR, mec='white', ms=5, zorder=3)
@@ -83,21 +90,34 @@ def _map(plan: Plan, key: str, values: Array) -> bytes:
     return png(figure)
 
 
+def _coarse(grid: OccupancyGrid) -> OccupancyGrid:
+    """A grid of at most PIXELS cells a side, the most occupied of each block: faster to draw."""
+    k = -(-max(grid.cells.shape) // PIXELS)
+    if k <= 1:
+        return grid
+    high, wide = (-(-n // k) for n in grid.cells.shape)
+    cells = np.full((high * k, wide * k), UNKNOWN, dtype=np.int8)
+    cells[: grid.cells.shape[0], : grid.cells.shape[1]] = grid.cells
+    blocks = cells.reshape(high, k, wide, k).max(axis=(1, 3))
+    return replace(grid, resolution=grid.resolution * k, cells=blocks)
+
+
 def cm(value: float | None) -> str:
     """A sigma for people."""
     return 'open' if value is None else f'{100.0 * value:.2f}'
 
 
-HEADER = ('area', 'in view', 'reflectors [cm]', 'scan [cm]', 'both [cm]', 'one hidden [cm]',
-          'two hidden [cm]', 'goal', 'unique')  # fmt: skip
+HEADER = ('area', 'in view', 'reflectors [cm]', 'scan [cm]', 'both [cm]', 'driving [cm]',
+          'one hidden [cm]', 'two hidden [cm]', 'goal', 'unique')  # fmt: skip
+
+SIGMAS = ('reflectors', 'scan', 'both', 'driving', 'one_hidden', 'two_hidden')
 
 
 def table_rows(found: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """The table: the whole, then each area; largest sigmas."""
     rows: list[tuple[str, ...]] = [HEADER]
     for row in [{'area': 'all', **found}, *found['areas']]:
-        sigmas = [cm(row[f'{k}_sigma_m']['max'])
-                  for k in ('reflectors', 'scan', 'both', 'one_hidden', 'two_hidden')]  # fmt: skip
+        sigmas = [cm(row[f'{k}_sigma_m']['max']) for k in SIGMAS]
         unique = '' if row['unique_share'] is None else f'{row["unique_share"]:.0%}'
         view = f'{row["in_view_min"]} to {row["in_view_median"]:g}'
         rows.append((row['area'], view, *sigmas, f'{row["goal_share"]:.1%}', unique))

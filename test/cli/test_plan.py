@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import json
 
+import pytest
+
 from rlml_slam.cli.main import main
 from rlml_slam.maps import nav2_map
 from rlml_slam.planning import site as sites
@@ -27,7 +29,7 @@ def test_symmetric_hall_reaches_two_centimetres(tmp_path, capsys):
     assert found['goal_share'] == 1.0
     assert found['unique_share'] == 0.0
     assert '<h1>Layout of symmetric</h1>' in (tmp_path / 'plan.html').read_text(encoding='utf-8')
-    assert len(list(tmp_path.glob('*.png'))) == 7
+    assert len(list(tmp_path.glob('*.png'))) == 8
 
 
 def test_missed_goal_is_exit_code_1(tmp_path, capsys):
@@ -54,10 +56,65 @@ def test_bad_input_is_one_line(tmp_path, capsys):
         (('hall', '--area', '0,0 1'), '--area'),
         (('hall', '--area', '0,0 1,1'), 'at least three points'),
         (('hall', '--goal', 0), '--goal'),
+        (('hall', '--speed', -1), '--speed'),
         (('hall', '--reflectors', tmp_path / 'none.csv'), 'cannot be read'),
         (('hall', '--path', tmp_path / 'none.tum'), 'none.tum'),
     ):
         code, _, err = plan(capsys, *arguments, '--out', tmp_path)
-        assert code == 1
+        assert code == 2
         assert reason in err
         assert err.count('\n') == 1
+
+
+def test_layout_as_imk_gives_the_plan_of_the_same_layout_as_csv(tmp_path, capsys):
+    points = load_world('symmetric').reflectors.points[:7]
+    rows = [f'{x:.3f},{y:.3f},0.08' for x, y in points.tolist()]
+    (tmp_path / 'a.csv').write_text('\n'.join(['x,y,diameter', *rows]), encoding='utf-8')
+    lines = [f'{k} {1e3 * x:.0f} {1e3 * y:.0f} 1 1 80 1' for k, (x, y) in enumerate(points)]
+    header = 'globID x/mm y/mm type subtype size/mm layer1'
+    (tmp_path / 'a.imk').write_text('\n'.join([header, *lines]), encoding='utf-8')
+    found = []
+    for name in ('a.csv', 'a.imk'):
+        code, out, _ = plan(
+            capsys, 'symmetric', '--reflectors', tmp_path / name, '--out', tmp_path / 'out',
+            '--spacing', 1, '--goal', 0.05, '--json',
+        )  # fmt: skip
+        assert code == 0
+        found.append(json.loads(out))
+    assert found[0]['reflectors'] == found[1]['reflectors'] == 7
+    for key in ('in_view_median', 'unique_share'):
+        assert found[0][key] == found[1][key]
+    for key in ('reflectors_sigma_m', 'driving_sigma_m', 'one_hidden_sigma_m'):
+        assert found[0][key] == pytest.approx(found[1][key], rel=1e-9)
+
+
+def test_sensor_file_has_the_noise_the_laser_and_the_range(tmp_path, capsys):
+    common = ('symmetric', '--out', tmp_path / 'out', '--spacing', 1, '--goal', 1, '--json')
+    sections = {
+        'noise': 'front_end: {ros__parameters: {reflector.sigma_range: 0.04, '
+        'reflector.sigma_bearing: 0.006}}',
+        'range': 'simulator: {ros__parameters: {markers.max_range: 8.0}}',
+        'both': 'front_end: {ros__parameters: {reflector.sigma_range: 0.04, '
+        'reflector.sigma_bearing: 0.006}}\nsimulator: {ros__parameters: {markers.max_range: 8.0}}',
+    }
+    found = {'none': json.loads(plan(capsys, *common)[1])}
+    for name, text in sections.items():
+        (tmp_path / f'{name}.yaml').write_text(text, encoding='utf-8')
+        found[name] = json.loads(plan(capsys, *common, '--sensor', tmp_path / f'{name}.yaml')[1])
+    sigma = {k: v['reflectors_sigma_m']['median'] for k, v in found.items()}
+    assert sigma['noise'] == pytest.approx(2.0 * sigma['none'], rel=1e-6)
+    assert found['range']['in_view_median'] < found['none']['in_view_median']
+    assert found['both']['in_view_median'] == found['range']['in_view_median']
+    assert sigma['both'] == pytest.approx(2.0 * sigma['range'], rel=1e-6)
+
+
+def test_slower_drives_are_more_accurate_and_hidden_reflectors_count(tmp_path, capsys):
+    common = ('symmetric', '--out', tmp_path, '--spacing', 1, '--json')
+    slow, fast, single, hidden = (
+        json.loads(plan(capsys, *common, *more)[1])
+        for more in (('--speed', 0.3), (), ('--speed', 0), ('--redundant', 1))
+    )
+    sigma = [f['driving_sigma_m']['median'] for f in (slow, fast, single)]
+    assert sigma == sorted(sigma)
+    assert single['driving_sigma_m'] == single['both_sigma_m']
+    assert hidden['goal_share'] < fast['goal_share']

@@ -14,15 +14,19 @@ from rlml_slam.errors import MapError
 from rlml_slam.maps.survey import Survey
 from rlml_slam.matching.reflectors.constellation import locate
 from rlml_slam.matching.reflectors.innovations import expected
-from rlml_slam.params import Parameters, Reflector, SimulatorParameters
+from rlml_slam.params import Detector, Parameters, Reflector, SimulatorParameters
 from rlml_slam.planning import site as sites
 from rlml_slam.planning.bound import bound, reflector_information, sigmas
-from rlml_slam.planning.plan import figures, make_plan
-from rlml_slam.planning.visibility import close_pairs, visible
+from rlml_slam.planning.plan import Goal, figures, make_plan
+from rlml_slam.planning.visibility import close_pairs, remove_merged, visible
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.polar import polar_covariance
+from rlml_slam.sensing.reflectors.reflector_detector import detect
 from rlml_slam.simulation.ray_cast import cast
-from rlml_slam.simulation.world import REFLECTOR
+from rlml_slam.simulation.robot import Track
+from rlml_slam.simulation.sensors import LaserSensor
+from rlml_slam.simulation.simulation import START
+from rlml_slam.simulation.world import REFLECTOR, Geometry, ReflectorSet
 from rlml_slam.simulation.world_file import load_world
 from rlml_slam.slam.front_end.joint_state import JointState
 from rlml_slam.slam.front_end.reflector_update import use_reflectors
@@ -146,7 +150,7 @@ def test_view_is_that_of_the_simulator(name):
 
 def test_symmetric_hall_is_nowhere_unique_and_its_symmetry_is_named():
     site = sites.of_world(load_world('symmetric'))
-    plan = make_plan(site, sites.places(site, 1.0, 0.3), P, SENSOR, 0.02)
+    plan = make_plan(site, sites.places(site, 1.0, 0.3), P, SENSOR, Goal(0.02))
     assert not plan.is_unique.any()
     assert any('turned by 180°' in note for note in plan.notes)
     other = plan.rivals[np.isfinite(plan.rivals[:, 0])][:, :2]
@@ -157,8 +161,8 @@ def test_narrow_laser_sees_less():
     site = sites.of_world(load_world('hall'))
     places = sites.places(site, 4.0, 0.3)
     narrow = replace(SENSOR, laser=replace(SENSOR.laser, field_of_view=math.pi))
-    a = make_plan(site, places, P, SENSOR, 0.02)
-    b = make_plan(site, places, P, narrow, 0.02)
+    a = make_plan(site, places, P, SENSOR, Goal(0.02))
+    b = make_plan(site, places, P, narrow, Goal(0.02))
     assert (b.in_view <= a.in_view).all()
     assert (b.in_view < a.in_view).any()
     assert (b.reflectors.position >= a.reflectors.position - 1e-12).all()
@@ -177,7 +181,7 @@ def test_reflectors_of_a_survey_replace_those_of_the_map():
     points = np.array([[1.0, 1.0], [1.1, 1.0], [9.0, 3.0]])
     found = site.with_reflectors(Survey(np.full(3, -1), points, np.full(3, np.nan)))
     assert close_pairs(found.reflectors.points, P.reflector.min_separation) == [(0, 1)]
-    plan = make_plan(found, np.array([[2.0, 2.0]]), P, SENSOR, 0.02)
+    plan = make_plan(found, np.array([[2.0, 2.0]]), P, SENSOR, Goal(0.02))
     assert plan.in_view[0] <= 2
     assert 'closer than' in plan.notes[0]
     assert figures(plan)['reflectors'] == 3
@@ -186,7 +190,7 @@ def test_reflectors_of_a_survey_replace_those_of_the_map():
 def test_area_without_a_free_place_is_an_error():
     site = sites.of_world(load_world('hall'))
     with pytest.raises(MapError, match='no free place'):
-        make_plan(site, np.zeros((0, 2)), P, SENSOR, 0.02)
+        make_plan(site, np.zeros((0, 2)), P, SENSOR, Goal(0.02))
 
 
 def test_inside_a_polygon():
@@ -200,7 +204,7 @@ def test_no_place_that_is_planned_unique_is_answered_wrongly(name):
     """Relocalization with noise, 2 % misses and 0.3 ghosts per scan, against the plan."""
     site, rng = sites.of_world(load_world(name)), np.random.default_rng(7)
     places, points = sites.places(site, 1.0, 0.3), site.reflectors.points
-    plan = make_plan(site, places, P, SENSOR, 0.02)
+    plan = make_plan(site, places, P, SENSOR, Goal(0.02))
     seen = visible(site, places, P, SENSOR)[plan.sampled]
     agree = []
     for place, row, planned in zip(places[plan.sampled], seen, plan.is_unique, strict=True):
@@ -215,3 +219,37 @@ def test_no_place_that_is_planned_unique_is_answered_wrongly(name):
             assert np.hypot(*(found.candidates[0].pose[:2] - place)) < 0.3
     # misses make a few places with three or four in view ambiguous
     assert np.mean(agree) > 0.9
+
+
+@pytest.mark.parametrize('distance', [2.0, 5.0, 10.0, 14.0, 18.0])
+def test_neighbours_are_merged_where_the_detector_merges_them(distance):
+    """Two cylinders side by side, 0.3 m apart, in scans of the simulator's laser."""
+    pair = np.array([[distance, -0.15], [distance, 0.15]])
+    surface = np.array([[0.5, 0.0, 1.0, k] for k in range(2)])
+    discs = np.concatenate([pair, np.full((2, 1), 0.04), np.zeros((2, 2))], -1)
+    wall = np.array([[25.0, -25.0, 25.0, 25.0, 0.0, 0.0]])
+    geometry = Geometry(wall, discs, np.concatenate([np.array([sites.WALLS]), surface]))
+    track = Track(START, np.zeros(3))
+    track.advance()
+    generators = np.random.default_rng(0).spawn(20)
+    lasers = [
+        LaserSensor(SENSOR.laser, np.zeros(3), 'laser', lambda _, g=g: g) for g in generators
+    ]
+    scans = [n.measure(track, START, geometry, START + n.sweep // 2) for n in lasers]
+    found = [len(detect(scan, Detector())) for scan in scans]
+    r = ReflectorSet(pair, np.full(2, 0.08), np.full(2, np.nan), np.arange(2))
+    seen = np.ones((1, 2), dtype=np.bool_)
+    remove_merged(seen, np.zeros((1, 2)), r, SENSOR)
+    if seen.all():
+        assert np.mean(np.array(found) == 2) >= 0.9
+    else:
+        assert not seen.any()
+        assert np.mean(np.array(found) == 2) < 0.9
+
+
+def test_neighbours_one_behind_the_other_are_not_merged():
+    r = ReflectorSet(np.array([[5.0, 0.0], [5.3, 0.2]]), np.full(2, 0.08), np.full(2, np.nan),
+                     np.arange(2))  # fmt: skip
+    seen = np.ones((1, 2), dtype=np.bool_)
+    remove_merged(seen, np.zeros((1, 2)), r, SENSOR)
+    assert seen.all()

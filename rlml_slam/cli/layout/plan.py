@@ -17,12 +17,14 @@ from rlml_slam.maps import saved_map, survey
 from rlml_slam.params import Parameters, SimulatorParameters, from_mapping, read_yaml
 from rlml_slam.plain_yaml import parse_yaml
 from rlml_slam.planning import site as sites
-from rlml_slam.planning.plan import make_plan
+from rlml_slam.planning.plan import Goal, make_plan
 from rlml_slam.planning.site import Site
 from rlml_slam.report.plan_page import table_rows, write_plan
 from rlml_slam.se2 import Array
 from rlml_slam.simulation.world_file import load_world, world_names
 from rlml_slam.slam.store import map_file
+
+ERROR_CODE = 2  # 1: the goal is missed
 
 
 def add_parser(subparsers: Any) -> None:
@@ -32,7 +34,7 @@ def add_parser(subparsers: Any) -> None:
         help='accuracy and uniqueness that a layout of reflectors gives',
         description='For each place of a map: reflectors in view, the bound of the position by '
         'reflectors, by the scan and by both, the same with one or two reflectors hidden, and '
-        'whether a lost robot finds itself. Exit code 1 where the goal is missed.',
+        'whether a lost robot finds itself. Exit code 1 where the goal is missed, 2 for an error.',
     )
     parser.add_argument('map', metavar='MAP', help='.rlml, map of nav2 (.yaml) or world file')
     parser.add_argument('--reflectors', type=Path, metavar='FILE', help='.csv, .json or .imk in '
@@ -45,7 +47,13 @@ def add_parser(subparsers: Any) -> None:
     where = parser.add_mutually_exclusive_group()
     where.add_argument('--area', metavar='POLYGON', help='"x,y x,y x,y …" [m]: places inside')
     where.add_argument('--path', type=Path, metavar='TUM', help='places along a trajectory')
-    parser.add_argument('--goal', type=float, default=0.01, help='sigma of the position [m]')
+    parser.add_argument(
+        '--goal', type=float, default=0.01, help='position sigma while driving [m]'
+    )
+    parser.add_argument('--speed', type=float, default=1.0, help='of the drive [m/s]; 0: the goal '
+                        'is for a single scan')  # fmt: skip
+    parser.add_argument('--redundant', type=int, default=0, choices=(0, 1, 2), metavar='K',
+                        help='the goal holds with the worst K reflectors hidden')  # fmt: skip
     parser.add_argument('--spacing', type=float, default=0.25, help='between places [m]')
     parser.add_argument('--clearance', type=float, default=0.3, help='of places to walls [m]')
     parser.add_argument('--json', action='store_true', help='print plan.json and no more')
@@ -56,6 +64,8 @@ def run(args: argparse.Namespace) -> int:
     for name in ('goal', 'spacing'):
         if not 1e-4 < getattr(args, name) < 1e3:
             raise ParameterError(f'--{name} is not between 0.1 mm and 1 km')
+    if not 0.0 <= args.speed <= 100.0:
+        raise ParameterError('--speed is not between 0 and 100 m/s')
     site = load_site(args.map)
     if args.reflectors is not None:
         site = site.with_reflectors(survey.load(args.reflectors))
@@ -63,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
             site = sites.with_walls_of_grid(site)
     p, sensor = sensor_of(args.sensor)
     places = _places(args, site)
-    plan = make_plan(site, places, p, sensor, args.goal)
+    plan = make_plan(site, places, p, sensor, Goal(args.goal, args.speed, args.redundant))
     found = write_plan(plan, Path(args.map).stem, args.out)
     if args.json:
         print(json.dumps(found))
