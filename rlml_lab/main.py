@@ -67,6 +67,9 @@ COMMANDS: Table = {
                 'rlml_lab.studies.study_store',
                 'map files that are cut off, flipped, or killed while saved',
             ),
+            'lifecycle': Command(
+                'rlml_lab.studies.study_lifecycle', 'transitions at random instants, over DDS'
+            ),
             'live-load': Command(
                 'rlml_lab.studies.study_live_load',
                 'load a map while driving, over DDS',

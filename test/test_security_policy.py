@@ -11,6 +11,14 @@ from rlml_slam.cli.support.interface import IN, OUT, SERVICES, TOPICS
 POLICY = Path(__file__).resolve().parents[1] / 'config' / 'security_policy.xml'
 NODES = sorted({topic.node for topic in TOPICS})
 
+LIFECYCLE = {
+    f'~/{name}'
+    for name in (
+        'change_state', 'get_state', 'get_available_states', 'get_available_transitions',
+        'get_transition_graph',
+    )
+}  # fmt: skip
+
 
 def allowed(node, what):
     """Names of a node's profile that are published, subscribed to or answered."""
@@ -24,7 +32,7 @@ def allowed(node, what):
 @pytest.mark.parametrize(('direction', 'what'), [(IN, 'subscribe'), (OUT, 'publish')])
 def test_topics_of_a_node_are_allowed(node, direction, what):
     used = {t.name for t in TOPICS if t.node == node and t.direction == direction}
-    own = {'/clock', 'parameter_events', 'rosout'}
+    own = {'/clock', 'parameter_events', 'rosout', '~/transition_event'}
     assert used <= allowed(node, what) <= used | own
 
 
@@ -33,4 +41,5 @@ def test_services_of_a_node_are_allowed(node):
     offered = {s.name for s in SERVICES if s.node == node}
     extra = allowed(node, 'reply') - offered
     assert offered <= allowed(node, 'reply')
-    assert all('parameter' in name for name in extra)
+    assert extra >= (set() if node == 'simulator' else LIFECYCLE)
+    assert all('parameter' in name for name in extra - LIFECYCLE)

@@ -8,13 +8,9 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
-from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import PointCloud2
 
-from rlml_slam.params import Parameters
 from rlml_slam.ros.back_end.back_end_figures import figures
 from rlml_slam.ros.back_end.map_services import MapServices
 from rlml_slam.ros.back_end.mapper import Mapper
@@ -22,9 +18,9 @@ from rlml_slam.ros.back_end.user_requests import UserRequests
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.codecs.frame_messages import POINT, FrameAssembler, read_points, read_record
 from rlml_slam.ros.codecs.reflector_clouds import ASSOCIATED, read_associated
-from rlml_slam.ros.declare import declare, pace
+from rlml_slam.ros.declare import pace
 from rlml_slam.ros.diagnostics import HealthPublisher
-from rlml_slam.ros.kernels import prepare
+from rlml_slam.ros.managed_node import ManagedNode
 from rlml_slam.ros.message_guard import SMALL, Listener
 from rlml_slam.ros.run import run
 from rlml_slam.slam.conversation import FrontEndCommand, SessionFrame
@@ -34,29 +30,29 @@ DEPTH = 200  # of the front end's answers: none may be lost while the map is dra
 SETTLE_PERIOD = 0.1  # [s] between two looks whether the input has fallen silent
 
 
-class BackEndNode(Node):
+class BackEndNode(ManagedNode):
     """Gives frames to the mapper, which come by messages or, in the same process, by ``take``."""
 
     def __init__(self, command: Take | None = None, **options: Any) -> None:
+        self._command = command
         super().__init__('back_end', **options)
-        checks: dict[str, Any] = {}
-        self.params: Parameters = declare(self, checks=checks)
-        self.mapper, n = Mapper(self, self.params, command), self.params.node
-        path = checks['map_file_name'] = self.mapper.archive.folder.path
+
+    def build(self) -> None:
+        """The mapper with its topics and services; a saved map is read and checked."""
+        n, command = self.params.node, self._command
+        self.mapper = Mapper(self, self.params, command)
+        self.exits.callback(self.mapper.close)
+        path = self.checks['map_file_name'] = self.mapper.archive.folder.path
         self.get_logger().info(f'{n.mode}; the map is {path(n.map_file_name)}')
         self.requests = UserRequests(self.mapper, self.params, self.get_logger())
-        prepare(self)
         self.join = FrameAssembler()
         self.health = HealthPublisher(self, None, self.figures, self.mapper.problems)
         self.map_services = MapServices(self, self.params, self.mapper, self.requests)
         if command is None:
             self._subscribe()
-        timer = self._every(n.transform_publish_period or 0.1, self.mapper.send_transform)
-        checks['transform_publish_period'] = pace(timer)
-        self._every(SETTLE_PERIOD, self.mapper.settle)
-
-    def _every(self, period: float, act: Callable[[], None]) -> Any:
-        return self.create_timer(period, act, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        timer = self.every(n.transform_publish_period or 0.1, self.mapper.send_transform)
+        self.checks['transform_publish_period'] = pace(timer)
+        self.every(SETTLE_PERIOD, self.mapper.settle)
 
     def _subscribe(self) -> None:
         join, n = self.join, self.params.node
@@ -76,6 +72,8 @@ class BackEndNode(Node):
 
     def take(self, record: SessionFrame) -> None:
         """Give a whole frame to the mapper."""
+        if not self.is_active:
+            return
         self.mapper.add(record)
         self.health.update(record.frame)
 
@@ -84,10 +82,13 @@ class BackEndNode(Node):
         own = {'frames without their points or detections': self.join.incomplete}
         return {**figures(self.mapper), **self.map_services.figures(), **own}
 
-    def destroy_node(self) -> None:
-        """Finish the running jobs first."""
-        self.mapper.close()
-        super().destroy_node()
+    def begin(self) -> None:
+        """Announce the mode and the map; later, draw what came in before the pause."""
+        self.requests.begin()
+
+    def rest(self) -> None:
+        """Write down what the journal has not yet."""
+        self.mapper.worker.submit(self.mapper.journal.flush)
 
 
 def main() -> int:

@@ -9,14 +9,12 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from rclpy.node import Node
 
 from rlml_slam.deformable.slam import DeformableSlam
 from rlml_slam.params import DeformableParameters, Parameters
 from rlml_slam.ros.codecs import decode
-from rlml_slam.ros.declare import declare
 from rlml_slam.ros.diagnostics import HealthPublisher
-from rlml_slam.ros.kernels import prepare
+from rlml_slam.ros.managed_node import ManagedNode
 from rlml_slam.ros.message_guard import Listener
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensor_input import STREAMS
@@ -28,17 +26,19 @@ from rlml_slam.types import Observation
 KEPT = 6000  # updates whose cost the diagnostics report: 10 minutes at 10 Hz
 
 
-class DeformableSlamNode(Node):
+class DeformableSlamNode(ManagedNode):
     """Drives a DeformableSlam with detections; all stamps are those of the input."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__('deformable_slam', **options)
-        p: DeformableParameters = declare(self, DeformableParameters)
+        super().__init__('deformable_slam', DeformableParameters, **options)
+
+    def build(self) -> None:
+        """The estimator with its topics."""
+        p: DeformableParameters = self.params
         self.slam = DeformableSlam(p)
         self._map_frame = p.node.map_frame
         self._cost = np.zeros((KEPT, 2))  # wall and CPU time of an update [s]
         self._updates = 0
-        prepare(self)
         self.answers = EstimatePublisher(self, p)
         self.velocity = VelocityInput(self, p.node, self.slam.announce)
         shared = Parameters(node=p.node, motion=p.motion, reflector=p.reflector)

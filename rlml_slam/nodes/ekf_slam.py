@@ -8,19 +8,16 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
-from rclpy.node import Node
 
 from rlml_slam.ekf.estimator import Estimator
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import EkfParameters
 from rlml_slam.ros.back_end.map_transform import MapTransform
 from rlml_slam.ros.codecs import decode
-from rlml_slam.ros.declare import declare, pace
+from rlml_slam.ros.declare import pace
 from rlml_slam.ros.diagnostics import HealthPublisher
 from rlml_slam.ros.front_end.frame_publisher import FramePublisher
-from rlml_slam.ros.kernels import prepare
+from rlml_slam.ros.managed_node import ManagedNode
 from rlml_slam.ros.map_publisher import TOPICS, MapPublisher
 from rlml_slam.ros.message_guard import Listener
 from rlml_slam.ros.run import run
@@ -32,23 +29,22 @@ from rlml_slam.slam.conversation import ANY, SessionFrame
 from rlml_slam.types import Observation
 
 
-class EkfSlamNode(Node):
+class EkfSlamNode(ManagedNode):
     """Drives an Estimator with the robot's sensors; all stamps are those of the input."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__('ekf_slam', **options)
-        checks: dict[str, Any] = {}
-        self.params: EkfParameters = declare(self, EkfParameters, checks)
+        super().__init__('ekf_slam', EkfParameters, **options)
+
+    def build(self) -> None:
+        """The filter with its topics and services; a saved map is read."""
         n = self.params.node
         self.estimator = Estimator(self.params)
         self.map_services = EkfServices(self, n, self.estimator, self.restart_in)
-        prepare(self)
         self.answers = FramePublisher(self, n)
         self.products = MapPublisher(self, n, TOPICS)
         self.tf = MapTransform(self, n)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        timer = self.create_timer(n.transform_publish_period or 0.1, self.tf.repeat, clock=steady)
-        checks['transform_publish_period'] = pace(timer)
+        timer = self.every(n.transform_publish_period or 0.1, self.tf.repeat)
+        self.checks['transform_publish_period'] = pace(timer)
         self.sensors = Sensors(self, self.params, STREAMS, self.process, self.restart)
         self.health = HealthPublisher(self, self.sensors)
         Listener(self, PoseWithCovarianceStamped, 'initialpose', self.start_at, RELIABLE)

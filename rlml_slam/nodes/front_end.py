@@ -8,43 +8,53 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from rclpy.node import Node
-
-from rlml_slam.params import Parameters
-from rlml_slam.ros.declare import declare
 from rlml_slam.ros.diagnostics import HealthPublisher
 from rlml_slam.ros.front_end.frame_publisher import FramePublisher
 from rlml_slam.ros.front_end.front_end_control import FrontEndControl
-from rlml_slam.ros.kernels import prepare
+from rlml_slam.ros.managed_node import ManagedNode
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensor_input import STREAMS
 from rlml_slam.ros.sensors import Sensors
-from rlml_slam.slam.conversation import SessionFrame
+from rlml_slam.slam.conversation import FrontEndCommand, LocalizeIn, SessionFrame
 from rlml_slam.slam.front_end.front_end import FrontEnd
 from rlml_slam.types import Frame, Observation
 
 
-class FrontEndNode(Node):
+class FrontEndNode(ManagedNode):
     """Drives a FrontEnd with the robot's sensors; all stamps are those of the input.
 
-    With a back end in the same process, ``take`` gets its frames, and ``control.command`` is for
-    that back end's commands.
+    With a back end in the same process, ``take`` gets its frames, and ``command`` is for that
+    back end's commands.
     """
 
     def __init__(self, has_back_end: bool = False, **options: Any) -> None:
-        super().__init__('front_end', **options)
-        self.params: Parameters = declare(self)
-        prepare(self)
-        self.answers = FramePublisher(self, self.params.node)
         self.take: Callable[[SessionFrame], None] | None = None
-        began = self.answers.begin_session
+        self._has_back_end = has_back_end
+        self.back_end_is_active: Callable[[], bool] = lambda: True
+        self._map: LocalizeIn | None = None
+        super().__init__('front_end', **options)
+
+    def build(self) -> None:
+        """The estimator with its topics."""
+        self.answers = FramePublisher(self, self.params.node)
+        began, has_back_end = self.answers.begin_session, self._has_back_end
         self.control = FrontEndControl(self, self.params, began, self.publish, has_back_end)
         self.sensors = Sensors(self, self.params, STREAMS, self.process, self.control.restart)
         self.health = HealthPublisher(self, self.sensors, problems=self.problems)
+        if self._map is not None:
+            self.control.command(self._map)
+
+    def command(self, command: FrontEndCommand) -> None:
+        """A command of the back end in this process, from any thread."""
+        if isinstance(command, LocalizeIn):
+            self._map = command  # for a front end that is configured again
+        if self.is_configured:
+            self.control.command(command)
 
     def problems(self) -> tuple[str, ...]:
         """What is wrong around the estimate."""
-        return (*self.control.problems(), *self.sensors.problems())
+        alone = () if self.back_end_is_active() else ('back_end is not active',)
+        return (*alone, *self.control.problems(), *self.sensors.problems())
 
     @property
     def front_end(self) -> FrontEnd:

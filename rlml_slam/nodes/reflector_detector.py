@@ -7,13 +7,10 @@ import sys
 from dataclasses import replace
 from typing import Any
 
-from rclpy.node import Node
-
 from rlml_slam.params import DetectorParameters, Parameters
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
-from rlml_slam.ros.declare import declare
-from rlml_slam.ros.kernels import prepare
+from rlml_slam.ros.managed_node import ManagedNode
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensors import SENSOR, Sensors
 from rlml_slam.ros.systems.detector_diagnostics import DetectorHealth
@@ -22,20 +19,21 @@ from rlml_slam.sensing.reflectors.reflector_detector import detect
 from rlml_slam.types import Observation
 
 
-class ReflectorDetectorNode(Node):
+class ReflectorDetectorNode(ManagedNode):
     """Answers every scan with its reflectors, in the scan's frame and at its stamp.
 
     Odometry and IMU, where there are, take out the robot's motion during the sweep.
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__('reflector_detector', **options)
-        self.params: DetectorParameters = declare(self, DetectorParameters)
+        super().__init__('reflector_detector', DetectorParameters, **options)
+
+    def build(self) -> None:
+        """The topics."""
         n = replace(self.params.node, use_scan=True, detect_reflectors='off')
         self._publisher = self.create_publisher(
             rclpy_class('sensor_msgs/msg/PointCloud2'), n.reflectors_topic, SENSOR
         )
-        prepare(self)
         shared = Parameters(node=n, motion=self.params.motion)
         streams = ('scan', 'odom', 'imu')
         self.sensors = Sensors(self, shared, streams, self.process, self.restart)

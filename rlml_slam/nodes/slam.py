@@ -16,8 +16,9 @@ from rlml_slam.ros.run import run
 
 def connected(front_end: FrontEndNode, **options: Any) -> BackEndNode:
     """A back end for a front end that was made with ``has_back_end``."""
-    back_end = BackEndNode(front_end.control.command, **options)
+    back_end = BackEndNode(front_end.command, **options)
     front_end.take = back_end.take
+    front_end.back_end_is_active = lambda: back_end.is_active
     return back_end
 
 

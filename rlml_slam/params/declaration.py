@@ -60,14 +60,18 @@ class Group:
         for f in dataclasses.fields(self):
             object.__setattr__(self, f.name, _checked(self._prefix, f, getattr(self, f.name)))
 
-    def change(self, name: str, value: Any) -> None:
-        """Give a live parameter another value, for all that read it from now on.
+    def change(self, name: str, value: Any, is_running: bool = True) -> None:
+        """Give a parameter another value, for all that read it from now on.
 
-        Raises ParameterError for one that is not live, or a value outside of its declaration.
+        Raises ParameterError for a value outside of its declaration, and while the node is running
+        for a parameter that is not live.
         """
         f = next(f for f in dataclasses.fields(self) if f.name == name)
-        if not f.metadata['live']:
-            raise ParameterError(f'{self._prefix}{name} is read when the node starts: restart it')
+        if is_running and not f.metadata['live']:
+            raise ParameterError(
+                f'{self._prefix}{name} is read when the node starts: '
+                'restart it, or clean it up first'
+            )
         object.__setattr__(self, name, _checked(self._prefix, f, value))
 
 

@@ -70,6 +70,9 @@ class Node(Group, prefix=''):
         'something is far brighter than all that is diffuse; always, by detector.*; never',
         choices=('auto', 'on', 'off'),
     )
+    autostart: bool = param(
+        True, 'become active at start; false: a lifecycle manager does it, such as that of nav2'
+    )
     mode: str = param(
         'mapping', 'build a map, or localize in a saved one', choices=('mapping', 'localization')
     )

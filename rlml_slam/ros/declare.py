@@ -3,7 +3,7 @@
 
 rclpy ignores names in a YAML file that nobody declares, and refuses a whole number where a
 fraction is expected. Here an unknown name is warned about and numbers are numbers. Live parameters
-may be set while the node runs; of the others, the answer says that they need a restart.
+may be set while the node runs, all others while it is unconfigured; the answer says so.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from rlml_slam.params import (
     declarations,
     from_mapping,
 )
-from rlml_slam.ros.shadow import enter_shadow
 
 Check = Callable[[Any], object]
 
@@ -45,8 +44,7 @@ def declare(
     new value before it is taken, and raises RlmlError against it.
 
     Raises ParameterError for a value that its field refuses. A name that no node of this package
-    knows is warned about: one YAML file may serve them all. With the parameter ``shadow``, the
-    node enters shadow mode.
+    knows is warned about: one YAML file may serve them all.
     """
     given = {name: p.value for name, p in node._parameter_overrides.items()}
     known = {d.name: d for d in declarations(of)}
@@ -61,23 +59,20 @@ def declare(
         value = getattr(getattr(parameters, d.group), d.field)
         node.declare_parameter(d.name, _ros_value(value), descriptor(d), ignore_override=True)
     node.add_on_set_parameters_callback(
-        lambda given: _change(
-            node.get_logger(), parameters, known, given, {} if checks is None else checks
-        )
+        lambda given: _change(node, parameters, known, given, {} if checks is None else checks)
     )
-    enter_shadow(node, getattr(parameters.node, 'shadow', False))
     return parameters
 
 
 def _change(
-    logger: Any,
+    node: Any,
     parameters: Any,
     known: Mapping[str, Declaration],
     given: list[Any],
     checks: Mapping[str, Check],
 ) -> SetParametersResult:
     """Take new values of live parameters, or none and say why."""
-    before = []
+    before, is_running = [], getattr(node, 'is_configured', True)
     try:
         for p in given:
             d = known.get(p.name)
@@ -85,14 +80,14 @@ def _change(
                 continue  # rclpy's own
             group = getattr(parameters, d.group)
             before.append((group, d.field, getattr(group, d.field)))
-            group.change(d.field, p.value)
+            group.change(d.field, p.value, is_running)
             checks.get(p.name, lambda _: None)(p.value)
     except RlmlError as e:
         for group, field, value in before:
             object.__setattr__(group, field, value)
         return SetParametersResult(successful=False, reason=str(e))
     for group, field, value in before:
-        logger.info(f'{field}: {value} is now {getattr(group, field)}')
+        node.get_logger().info(f'{field}: {value} is now {getattr(group, field)}')
     return SetParametersResult(successful=True)
 
 

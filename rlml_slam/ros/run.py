@@ -77,8 +77,6 @@ def run(*factories: Callable[[], Any]) -> int:
         return int(e.code or 0)
     finally:
         for node in nodes:
-            if hasattr(node, 'health'):
-                node.get_logger().info(node.health.summary())
             node.destroy_node()
         executor.shutdown(timeout_sec=1.0)
         rclpy.utilities.try_shutdown()

@@ -7,6 +7,7 @@ import heapq
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 from rclpy.clock import Clock
@@ -31,7 +32,7 @@ from rlml_slam.ros.sensor_input import (
 )
 from rlml_slam.ros.tf import TF_MESSAGE, Extrinsics, subscribe_static
 from rlml_slam.sensing.synchronization.synchronizer import Synchronizer
-from rlml_slam.types import Detections, Observation
+from rlml_slam.types import Observation
 from rlml_slam.version import __version__
 
 TF_PATIENCE = 1_000_000_000  # [ns] of stamps that a sensor's place on /tf_static is waited for
@@ -94,7 +95,7 @@ class Sensors:
         self._frames: defaultdict[str, set[str]] = defaultdict(set)  # of sensors, by stream
         self._topics: Counter[str] = Counter()  # by stream
         self._queues: list[tuple[str, Listener]] = []
-        self._heard = self._began = time.monotonic()
+        self._heard, self._began = time.monotonic(), 0.0  # the latter of being active
         self._told: set[str] = set()
         for stream in streams:
             # without scan matching, a scan still asks for a pose at its stamp
@@ -112,7 +113,7 @@ class Sensors:
 
     def _listen(self, node: Any, stream: str, topic: str, kind: str) -> None:
         index = len(self._queues)
-        found, use = rclpy_class(kind), lambda msg: self.receive(index, msg)
+        found, use = rclpy_class(kind), partial(self.receive, index)
         if found is None:
             return  # of a package that is not installed
         self._topics[stream] += 1
@@ -140,7 +141,8 @@ class Sensors:
         The executor serves the queues in turn. After a pause, scans would overtake the odometry
         that is more frequent and lies in the queue beside theirs.
         """
-        self._take({index: self._plain(self._queues[index][0], msg)})
+        if self._node.is_active:
+            self._take({index: self._plain(self._queues[index][0], msg)})
 
     def _take(self, first: dict[int, list[tuple[str, Any]]]) -> int:
         """Use all that has arrived, ``first`` of each queue before the rest; how many.
@@ -158,6 +160,7 @@ class Sensors:
 
     def flush_if_silent(self) -> None:
         """Where nothing has come for a while: a pose for the scan that waits for odometry."""
+        self._began = self._began or time.monotonic()
         self._tell_of_missing()
         if self._take({}) or time.monotonic() - self._heard < SILENCE:
             return
@@ -175,7 +178,7 @@ class Sensors:
         return (*out, *self._feed.odometry_problems())
 
     def _tell_of_missing(self) -> None:
-        """Say once which scans and odometry have never come, PATIENCE after the start."""
+        """Say once which scans and odometry have never come, PATIENCE after it became active."""
         if self._missing and time.monotonic() - self._began > PATIENCE:
             missing = [
                 f'{self._queues[k][0]} on {self._queues[k][1].topic_name}'
@@ -296,10 +299,6 @@ class Sensors:
         )
         if use is REFUSED:
             self._count_invalid(stream, self._guard.last)
-
-    def add_detections(self, detections: Detections) -> None:
-        """Detections that are converted already."""
-        self._observe(lambda: self.synchronizer.add_detections(detections))
 
     def _observe(self, add: Callable[[], list[Observation]]) -> None:
         try:

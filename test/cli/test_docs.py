@@ -128,7 +128,9 @@ def test_topics_are_those_of_the_node(nodes, name, direction):
         (topic, kinds[0].replace('/msg/', '/'), quality(info))
         for topic, kinds in of_node(name, '/')
         for info in of_topic(topic)
-        if info.node_name == name and topic not in OF_EVERY_NODE
+        if info.node_name == name
+        and topic not in OF_EVERY_NODE
+        and not kinds[0].startswith('lifecycle_msgs')
     }
     documented = {
         ('/' + t.name.replace('~', name).lstrip('/'), t.type, t.qos)
@@ -146,7 +148,9 @@ def test_services_are_those_of_the_node(nodes, name):
     found = {
         (service, kinds[0].replace('/srv/', '/'))
         for service, kinds in nodes[name].get_service_names_and_types_by_node(name, '/')
-        if not kinds[0].startswith(('rcl_interfaces', 'type_description_interfaces'))
+        if not kinds[0].startswith(
+            ('rcl_interfaces', 'type_description_interfaces', 'lifecycle_msgs')
+        )
     }
     documented = {
         ('/' + s.name.replace('~', name).lstrip('/'), s.type) for s in SERVICES if s.node == name

@@ -56,6 +56,7 @@ def make(folder):
         ear = Ear()
         made.append(Mapper(ear, p))
         made[-1].requests = UserRequests(made[-1], p, ear.get_logger())
+        made[-1].requests.begin()
         searched(made[-1])
         return made[-1], ear
 

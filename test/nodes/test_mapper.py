@@ -82,6 +82,7 @@ def make(ear, monkeypatch, tmp_path_factory):
         p = dataclasses.replace(p, node=dataclasses.replace(p.node, **node))
         made.append(Mapper(ear, p))
         made[-1].requests = UserRequests(made[-1], p, ear.get_logger())
+        made[-1].requests.begin()
         made[-1].worker.submit(lambda: None).result()
         return made[-1]
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import math
 import time
 from pathlib import Path
 from typing import IO, Any
@@ -78,6 +79,11 @@ class MapJournal:
         except MapError as e:
             self._stop(f'cannot be written: {e}')
         self._due = time.monotonic()
+
+    def flush(self) -> None:
+        """Write what has come, due or not."""
+        self._due = -math.inf
+        self.write()
 
     def _open(self) -> IO[bytes]:
         """A new file, locked for as long as this process lives."""

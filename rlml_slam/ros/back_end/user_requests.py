@@ -22,8 +22,8 @@ from rlml_slam.slam.store import map_file
 class UserRequests:
     """Methods are called in the mapper's worker; files are read and checked before they act.
 
-    At once, it does what the parameters ask for at the start: then it raises MapError or
-    FileFormatError where a map cannot be used.
+    At once, it reads what the parameters ask for at the start: then it raises MapError or
+    FileFormatError where a map cannot be used. ``begin`` acts.
     """
 
     def __init__(self, mapper: Mapper, params: Parameters, logger: Any) -> None:
@@ -32,7 +32,14 @@ class UserRequests:
         self._p = params
         self._logger = logger
         self._is_loaded = False  # whether the map that is localized in came from the folder
-        mapper.submit(self._begin())
+        self._first = self._begin()
+
+    def begin(self) -> None:
+        """Do what the parameters ask for; later, send the map as it is now."""
+        first, self._first = self._first, []
+        self._mapper.submit(first)
+        if self._mapper.stamp > 1:
+            self._mapper.worker.submit(self._mapper.publish_map)
 
     def _begin(self) -> list[Command]:
         node, system = self._p.node, self._mapper.system

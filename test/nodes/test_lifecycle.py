@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Managed nodes: what each state has, takes and publishes, and what a transition must not lose."""
+
+from __future__ import annotations
+
+import gc
+
+import pytest
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from live import room
+from rclpy.parameter import Parameter
+
+from rlml_slam.errors import MapError
+from rlml_slam.nodes.back_end import BackEndNode
+from rlml_slam.nodes.deformable_slam import DeformableSlamNode
+from rlml_slam.nodes.ekf_slam import EkfSlamNode
+from rlml_slam.nodes.front_end import FrontEndNode
+from rlml_slam.nodes.reflector_detector import ReflectorDetectorNode
+from rlml_slam.nodes.slam import connected
+from rlml_slam.ros.managed_node import KINDS
+from rlml_slam.slam.store import map_file
+
+POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+STATES = {1: 'unconfigured', 2: 'inactive', 3: 'active', 4: 'finalized'}
+BY_NAME = {
+    'configure': Transition.TRANSITION_CONFIGURE,
+    'cleanup': Transition.TRANSITION_CLEANUP,
+    'activate': Transition.TRANSITION_ACTIVATE,
+    'deactivate': Transition.TRANSITION_DEACTIVATE,
+    'unconfigured shutdown': Transition.TRANSITION_UNCONFIGURED_SHUTDOWN,
+    'inactive shutdown': Transition.TRANSITION_INACTIVE_SHUTDOWN,
+    'active shutdown': Transition.TRANSITION_ACTIVE_SHUTDOWN,
+}
+
+
+def change(live, node, name):
+    """Whether a client's transition succeeded, and the state that the node answers with."""
+    request = ChangeState.Request(transition=Transition(id=BY_NAME[name]))
+    answer = live.call(ChangeState, f'{node.get_name()}/change_state', request)
+    state = live.call(GetState, f'{node.get_name()}/get_state', GetState.Request())
+    return answer.success, STATES[state.current_state.id]
+
+
+def feed(front, since, until):
+    """Messages of the room between two seconds of it, as subscriptions give them."""
+    index = {stream: k for k, (stream, _) in enumerate(front.sensors._queues)}
+    for stream, msg in room(seconds=until):
+        stamp = msg.header.stamp.sec + 1e-9 * msg.header.stamp.nanosec - 1.0
+        if stamp >= since:
+            front.sensors.receive(index[stream], msg)
+
+
+def pair(live, **values):
+    front = live.start(FrontEndNode, **values)
+    front.take = None
+    back = connected(front, context=live.context)
+    live.add(back)
+    front.sensors.stop_waiting()
+    live.spin_until(lambda: back.mapper.worker.backlog == 0)
+    live.spin_until(lambda: front.control.session.mode)
+    return front, back
+
+
+def entities(node):
+    return {kind: len(list(getattr(node, kind))) for kind in KINDS}
+
+
+@pytest.mark.parametrize(
+    'kind', [FrontEndNode, BackEndNode, EkfSlamNode, DeformableSlamNode, ReflectorDetectorNode]
+)
+def test_client_walks_through_every_transition(live, kind):
+    node = live.start(kind, autostart=False)
+    bare = entities(node)
+    for name, after in (
+        ('activate', (False, 'unconfigured')),
+        ('configure', (True, 'inactive')),
+        ('configure', (False, 'inactive')),
+        ('deactivate', (False, 'inactive')),
+        ('activate', (True, 'active')),
+        ('cleanup', (False, 'active')),
+        ('deactivate', (True, 'inactive')),
+        ('activate', (True, 'active')),
+        ('deactivate', (True, 'inactive')),
+        ('cleanup', (True, 'unconfigured')),
+    ):
+        assert change(live, node, name) == after, name
+    assert entities(node) == bare  # nothing of the work is left
+    for name, after in (('configure', 'inactive'), ('inactive shutdown', 'finalized')):
+        assert change(live, node, name) == (True, after)
+    assert entities(node) == bare
+
+
+@pytest.mark.parametrize('state', ['unconfigured', 'active'])
+def test_shutdown_ends_the_work_in_every_state(live, state):
+    node = live.start(BackEndNode, autostart=state == 'active')
+    assert change(live, node, f'{state} shutdown') == (True, 'finalized')
+    assert not node.is_configured
+
+
+def test_unconfigured_node_has_parameters_that_all_may_change(live):
+    node = live.start(BackEndNode, autostart=False)
+    assert not hasattr(node, 'mapper')
+    (answer,) = node.set_parameters([Parameter('map_directory', value='elsewhere')])
+    assert answer.successful
+    assert change(live, node, 'configure') == (True, 'inactive')
+    assert node.mapper.archive.folder.root.name == 'elsewhere'
+    (answer,) = node.set_parameters([Parameter('map_directory', value='again')])
+    assert not answer.successful
+    assert 'restart it, or clean it up first' in answer.reason
+
+
+def test_configure_fails_in_words_and_may_be_tried_again(live):
+    node = live.start(BackEndNode, autostart=False, mode='localization', map_file_name='none')
+    bare = entities(node)
+    assert change(live, node, 'configure') == (False, 'unconfigured')
+    assert entities(node) == bare
+    node.set_parameters([Parameter('mode', value='mapping')])
+    assert change(live, node, 'configure') == (True, 'inactive')
+
+
+def test_autostart_raises_what_prevents_it(live):
+    with pytest.raises(MapError, match='none'):
+        live.start(BackEndNode, mode='localization', map_file_name='none')
+
+
+def test_error_of_our_own_leads_to_unconfigured(live, monkeypatch):
+    node = live.start(BackEndNode, autostart=False)
+    monkeypatch.setattr(node, 'build', lambda: 1 / 0)
+    assert change(live, node, 'configure') == (False, 'unconfigured')
+
+
+def test_inactive_front_end_takes_and_publishes_nothing_and_goes_on_in_its_session(live):
+    front, _ = pair(live)
+    live.listen('pose', POSE)
+    live.spin_until(lambda: front.count_subscribers('pose') == 1)
+    feed(front, 0.0, 3.0)
+    live.drain()
+    frames, session, heard = (
+        front.last.stamp,
+        front.control.session.session,
+        len(live.heard['pose']),
+    )
+    assert heard > 5
+    assert change(live, front, 'deactivate') == (True, 'inactive')
+    feed(front, 3.0, 4.0)
+    live.drain()
+    assert front.last.stamp == frames
+    assert len(live.heard['pose']) == heard
+    assert change(live, front, 'activate') == (True, 'active')
+    feed(front, 4.0, 6.0)
+    live.drain()
+    assert front.last.stamp > frames + 2_000_000_000
+    assert front.control.session.session == session
+    assert len(live.heard['pose']) > heard + 5
+
+
+def test_back_end_goes_on_with_its_map_after_a_pause(live):
+    front, back = pair(live)
+    feed(front, 0.0, 4.0)
+    live.spin_until(lambda: back.mapper.worker.backlog == 0)
+    before = [k.stamp for k in back.mapper.back_end.keyframes]
+    assert change(live, back, 'deactivate') == (True, 'inactive')
+    live.spin_until(lambda: back.mapper.worker.backlog == 0)
+    assert back.mapper.journal._file is not None  # what was mapped is on the disk
+    feed(front, 4.0, 5.0)
+    assert change(live, back, 'activate') == (True, 'active')
+    feed(front, 5.0, 8.0)
+    live.spin_until(lambda: back.mapper.worker.backlog == 0)
+    after = [k.stamp for k in back.mapper.back_end.keyframes]
+    assert after[: len(before)] == before
+    assert len(after) > len(before)
+    assert back.mapper.system.session == front.control.session.session
+
+
+def test_inactive_back_end_is_reported_by_the_front_end_beside_it(live):
+    front, back = pair(live)
+    feed(front, 0.0, 2.0)
+    assert change(live, back, 'deactivate') == (True, 'inactive')
+    assert any('back_end is not active' in p for p in front.problems())
+    assert change(live, back, 'activate') == (True, 'active')
+    assert front.problems() == ()
+
+
+def test_cleanup_saves_the_map_and_frees_it(live, tmp_path):
+    front, back = pair(live)
+    feed(front, 0.0, 8.0)
+    live.spin_until(lambda: back.mapper.worker.backlog == 0)
+    keys = len(back.mapper.back_end.keyframes)
+    assert keys > 5
+    for name in ('deactivate', 'cleanup'):
+        assert change(live, back, name)[0]
+    (saved,) = (tmp_path / 'maps').glob('*.rlml')
+    assert len(map_file.load(saved).arrays['pose']) == keys
+    assert gc.get_freeze_count() == 0
+    for name in ('configure', 'activate'):
+        assert change(live, back, name)[0]
+    assert back.mapper.back_end.keyframes == []
+
+
+def test_localization_goes_on_after_a_front_end_was_configured_again(live, tmp_path):
+    front, back = pair(live)
+    feed(front, 0.0, 8.0)
+    live.spin_until(lambda: back.mapper.worker.backlog == 0)
+    back.mapper.worker.submit(lambda: back.requests.save('map')).result()
+    back.mapper.worker.submit(lambda: back.requests.localize(True)).result()
+    live.spin_until(lambda: front.control.session.map is not None)
+    for name in ('deactivate', 'cleanup', 'configure', 'activate'):
+        assert change(live, front, name)[0]
+    front.sensors.stop_waiting()
+    live.spin_until(lambda: front.control.session.map is not None)
+
+
+def test_process_waits_for_its_manager_and_ends_cleanly(live, start):
+    process = start('slam', '--ros-args', '-p', 'autostart:=false')
+    services = [
+        live.ear.create_client(GetState, f'{n}/get_state') for n in ('front_end', 'back_end')
+    ]
+    live.spin_until(lambda: all(s.service_is_ready() for s in services), timeout=120.0)
+    for name in ('front_end', 'back_end'):
+        for transition, after in (('configure', 2), ('activate', 3)):
+            request = ChangeState.Request(transition=Transition(id=BY_NAME[transition]))
+            assert live.call(ChangeState, f'{name}/change_state', request).success
+            state = live.call(GetState, f'{name}/get_state', GetState.Request())
+            assert state.current_state.id == after
+    live.listen('front_end/health', 'diagnostic_msgs/msg/DiagnosticStatus')
+    live.spin_until(lambda: live.heard['front_end/health'])
+    process.interrupt()
+    code, out = process.finish()
+    assert code == 0
+    assert 'Traceback' not in out
