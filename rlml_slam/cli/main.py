@@ -85,6 +85,19 @@ COMMANDS: Table = {
     'plan': Command(
         'rlml_slam.cli.layout.plan', 'accuracy and uniqueness that a layout of reflectors gives'
     ),
+    'fleet': Group(
+        'many bags at once, on this machine or a cluster',
+        {
+            'replay': Command(
+                'rlml_slam.cli.fleet.fleet_replay',
+                'many bags through the system, against the run before',
+            ),
+            'sweep': Command(
+                'rlml_slam.cli.fleet.fleet_sweep',
+                'what values of parameters change, over many bags',
+            ),
+        },
+    ),
     'compare': Command(
         'rlml_slam.cli.compare', 'from a bag of both, how far two localizations were apart'
     ),

@@ -53,7 +53,7 @@ def open_client(cluster: str | None, jobs: int = 0) -> Iterator[Client]:
     with (
         LocalCluster(
             n_workers=jobs or cores(), threads_per_worker=1, host='127.0.0.1',
-            dashboard_address=None, silence_logs=logging.CRITICAL,
+            dashboard_address='127.0.0.1:0', silence_logs=logging.CRITICAL,
         ) as local,
         Client(local) as client,
     ):  # fmt: skip

@@ -21,12 +21,13 @@ from rlml_slam.maps.occupancy import UNKNOWN, OccupancyGrid
 from rlml_slam.slam.landmarks.reflector_states import state_table
 
 
-def write_outputs(run: Run, folder: str | Path) -> dict[str, Any]:
+def write_outputs(run: Run, folder: str | Path, report: bool = True) -> dict[str, Any]:
     """Write all results and pictures of a run into a folder; the figures of metrics.json.
 
     trajectory.tum, front_end.tum, map.rlml, map.pgm, map.yaml, reflectors.csv,
     reflector_states.csv and closures.csv depend on the data alone: two replays give the same
-    bytes. Raises MapError if the folder cannot be written.
+    bytes. Without ``report`` there are no pictures and no report.html. Raises MapError if the
+    folder cannot be written.
     """
     folder = make_folder(folder)
     write_tum(folder / 'trajectory.tum', run.trajectory)
@@ -43,7 +44,8 @@ def write_outputs(run: Run, folder: str | Path) -> dict[str, Any]:
     errors = run_errors(run)
     figures = metrics(run, errors)
     write_atomically(folder / 'metrics.json', (json.dumps(figures, indent=2) + '\n').encode())
-    write_report(run, errors, figures, folder)
+    if report:
+        write_report(run, errors, figures, folder)
     return figures
 
 

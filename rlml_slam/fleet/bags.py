@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the bags of a fleet are: this machine, or any store that fsspec knows."""
+
+from __future__ import annotations
+
+import hashlib
+import posixpath
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fsspec.core import url_to_fs
+
+from rlml_slam.errors import BagError
+
+METADATA = 'metadata.yaml'
+FILES = ('.bag', '.mcap')  # bags of one file
+CHUNK = 1 << 22  # [bytes] that are read at once
+
+
+@dataclass(frozen=True)
+class Bag:
+    """A bag of a fleet: its name, which is its folder in the results, and its fsspec URL."""
+
+    name: str
+    url: str
+
+    @property
+    def relations_url(self) -> str:
+        """Where its relations are, if it has some."""
+        return f'{self.url}.relations'
+
+
+def find_bags(urls: Sequence[str]) -> list[Bag]:
+    """All bags in or below folders, files and globs, by name.
+
+    A bag is named by its path below the folder that was given, or below the fixed part of the
+    glob. Raises BagError where a place has none, or two bags have one name.
+    """
+    found: dict[str, Bag] = {}
+    for url in urls:
+        below = _bags_below(url)
+        if not below:
+            raise BagError(f'{url}: no bag there')
+        for bag in below:
+            if found.setdefault(bag.name, bag) != bag:
+                raise BagError(
+                    f'{found[bag.name].url} and {bag.url} would both be named {bag.name}; '
+                    'give the folder above them'
+                )
+    return [found[name] for name in sorted(found)]
+
+
+def _bags_below(url: str) -> list[Bag]:
+    """The bags of one place."""
+    try:
+        fs, path = url_to_fs(url)
+        path = path.rstrip('/')
+        fixed = re.split(r'[*?[]', path, maxsplit=1)[0]
+        places = [path] if fixed == path else [p.rstrip('/') for p in fs.glob(path)]
+        found = {bag for place in places for bag in _bags_in(fs, place)}
+    except (ImportError, OSError, ValueError) as e:
+        raise BagError(f'{url}: cannot be read: {e}') from e
+    root = posixpath.dirname(fixed) if fixed != path or path in found else path
+    return [Bag(posixpath.relpath(p, root), _url(fs, p)) for p in found]
+
+
+def _url(fs: Any, path: str) -> str:
+    """A path with its protocol; without one where it is on this machine."""
+    return path if 'file' in _protocols(fs) else str(fs.unstrip_protocol(path))
+
+
+def _protocols(fs: Any) -> tuple[str, ...]:
+    return (fs.protocol,) if isinstance(fs.protocol, str) else tuple(fs.protocol)
+
+
+def _bags_in(fs: Any, place: str) -> set[str]:
+    """Folders with rosbag2 files, and bags of one file that are in none of them."""
+    files = [place] if fs.isfile(place) else fs.find(place)
+    folders = {
+        posixpath.dirname(f)
+        for f in files
+        if posixpath.basename(f) == METADATA or f.endswith('.db3')
+    }
+    alone = {f for f in files if f.endswith(FILES) and posixpath.dirname(f) not in folders}
+    return alone | {f for f in folders if fs.isdir(place)}
+
+
+def local_copy(url: str, into: Path) -> Path:
+    """The path of a bag on this machine: where it is, or a copy below ``into``."""
+    fs, path = url_to_fs(url)
+    if 'file' in _protocols(fs):
+        return Path(path)
+    target = into / posixpath.basename(path)
+    if fs.isfile(path):
+        fs.get_file(path, str(target))
+        return target
+    for file in fs.find(path):
+        here = target / posixpath.relpath(file, path)
+        here.parent.mkdir(parents=True, exist_ok=True)
+        fs.get_file(file, str(here))
+    return target
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of the names and bytes of a file, or of all files of a folder."""
+    seen = hashlib.sha256()
+    for file in sorted(path.rglob('*')) if path.is_dir() else [path]:
+        if file.is_file():
+            seen.update(f'{file.relative_to(path).as_posix()}\0{file.stat().st_size}\0'.encode())
+            with file.open('rb') as f:
+                while chunk := f.read(CHUNK):
+                    seen.update(chunk)
+    return seen.hexdigest()

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What counts as worse, bag by bag and on average."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rlml_slam.errors import ParameterError
+from rlml_slam.fleet.comparison import LIMITS, compare, effects, limits_with
+from rlml_slam.fleet.page import fleet_page
+from rlml_slam.fleet.results import Record
+
+ROW = {
+    'name': 'a', 'status': 'ok', 'problem': '', 'bag': 'b', 'results': 'r', 'frames': 100,
+    'lost_s': 0.0, 'closures': 10, 'live_ate_rmse_m': 0.02, 'relations_trans_mean_m': 0.03,
+}  # fmt: skip
+
+
+def record(key='k', **changes) -> Record:
+    return Record(key, ROW | changes)
+
+
+def worse(new: Record, **options) -> tuple[str, ...]:
+    (verdict,) = compare([record()], [new], **options)
+    return verdict.worse
+
+
+@pytest.mark.parametrize(
+    ('change', 'what'),
+    [
+        ({'frames': 94}, 'poses'), ({'lost_s': 1.1}, 'LOST'), ({'closures': 6}, 'closures'),
+        ({'live_ate_rmse_m': 0.031}, 'live error'), ({'live_ate_rmse_m': None}, 'none'),
+        ({'relations_trans_mean_m': 0.034}, 'relations'),
+        ({'status': 'failed', 'problem': 'broken'}, 'broken'),
+    ],
+)  # fmt: skip
+def test_worse_figure_is_named(change, what):
+    (why, *_) = worse(record('other', results='s', **change))
+    assert what in why
+
+
+@pytest.mark.parametrize(
+    'change',
+    [{'frames': 95}, {'lost_s': 0.9}, {'closures': 8}, {'live_ate_rmse_m': 0.029},
+     {'relations_trans_mean_m': 0.031}, {'lost_s': -5.0}, {'closures': 100}],
+)  # fmt: skip
+def test_small_or_good_change_is_not_worse(change):
+    assert worse(record('other', results='s', **change)) == ()
+
+
+def test_other_bytes_are_worse_only_where_they_must_not_be():
+    assert worse(record('k', results='s')) == ('other bytes',)  # same bag, parameters, code
+    assert worse(record('other', results='s')) == ()
+    assert worse(record('other', results='s'), same_bytes=True) == ('other bytes',)
+    assert worse(record('other', results='s', bag='c'), same_bytes=True) == ()
+    assert worse(record()) == ()
+
+
+def test_limits_can_be_changed():
+    limits = limits_with(['lost_s=3', 'closures=0,0'])
+    assert worse(record('o', lost_s=2.9), limits=limits) == ()
+    assert worse(record('o', closures=9), limits=limits)
+    assert limits['lost_s'].share == LIMITS['lost_s'].share
+    for wrong in ('lost_s', 'nothing=1', 'lost_s=x', 'lost_s=nan', 'lost_s=-1', 'lost_s='):
+        with pytest.raises(ParameterError, match='--limit'):
+            limits_with([wrong])
+
+
+def test_interval_of_an_effect_holds_it():
+    """95 % of the intervals should; of 100, fewer than 85 has a probability below 1e-4."""
+    rng = np.random.default_rng(0)
+    holds = 0
+    for _ in range(100):
+        base = rng.normal(0.05, 0.02, 40)
+        old = [record(name=str(k), live_ate_rmse_m=float(x)) for k, x in enumerate(base)]
+        new = [record(name=str(k), live_ate_rmse_m=float(x + rng.normal(0.004, 0.01)))
+               for k, x in enumerate(base)]  # fmt: skip
+        (e,) = effects(old, new, ['live_ate_rmse_m'])
+        holds += e.low <= 0.004 <= e.high
+        assert e.bags == 40
+    assert holds >= 85
+
+
+def test_page_names_what_got_worse_and_needs_no_network():
+    old, new = [record()], [record('o', name='a', lost_s=9.0)]
+    new += [Record('', {'name': '<b>', 'status': 'failed', 'problem': 'x & y'})]
+    html = fleet_page(new, compare(old, new), effects(old, new))
+    assert 'LOST [s] 0 → 9' in html
+    assert '&lt;b&gt;' in html
+    assert '<b>' not in html.replace('<b>0', '')
+    assert 'http' not in html.replace('http-equiv', '')
