@@ -1,63 +1,98 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``rlml map merge``: two saved maps as one, aligned by the reflectors that both have."""
+"""``rlml map merge``: the saved maps of many sessions become the map of one site."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from rlml_slam import warm_up
-from rlml_slam.maps import map_container
+from rlml_slam.fleet.cluster import open_client
+from rlml_slam.maps import map_container, survey
 from rlml_slam.params import Parameters, from_mapping, read_yaml
-from rlml_slam.slam.store import map_file
-from rlml_slam.slam.store.map_merging import merge_maps
+from rlml_slam.slam.merging.map_merging import merge_files
+from rlml_slam.slam.merging.site_tree import Mapper, in_this_process
 
 
 def add_parser(subparsers: Any) -> None:
     """Declare ``rlml map merge``."""
     parser = subparsers.add_parser(
         'merge',
-        help='two saved maps as one',
-        description='Puts the second map where its reflectors fit those of the first, matches its '
-        'scans there, and solves the whole graph. Refused where the reflectors fit in several '
-        'places or in none.',
+        help='saved maps of many sessions as one',
+        description='Places each map by a survey, the constellation of its reflectors or its '
+        'scans, ties what several have seen, and solves the whole graph. A map that fits in '
+        'several places or in none is left out, with the reason.',
     )
-    parser.add_argument('first', metavar='A', type=Path, help='map.rlml; its frame is kept')
-    parser.add_argument('second', metavar='B', type=Path, help='map.rlml')
-    parser.add_argument('--out', metavar='C', type=Path, required=True, help='the map of both')
+    parser.add_argument(
+        'maps', metavar='MAP', type=Path, nargs='+', help='map.rlml; the first frame is kept'
+    )
+    parser.add_argument('--out', metavar='SITE', type=Path, required=True, help='the map of all')
+    parser.add_argument('--survey', metavar='FILE', type=Path, help='.csv, .json or SICK .imk')
     parser.add_argument('--config', metavar='YAML', type=Path, help='ROS parameter file')
+    parser.add_argument(
+        '--jobs', metavar='N', type=int, default=1,
+        help='worker processes of Dask, 0 for one per core; 1: this process (default)',
+    )  # fmt: skip
+    parser.add_argument('--cluster', metavar='tcp://HOST:PORT', help='scheduler of Dask')
     parser.add_argument('--json', action='store_true', help='print one JSON object and no more')
 
 
 def run(args: argparse.Namespace) -> int:
     """Merge, save, and say what came of it."""
     params = from_mapping(read_yaml(args.config)) if args.config else Parameters()
+    surveyed = survey.load(args.survey) if args.survey else None
     warm_up.compile_loaded()
-    first, second = map_file.load(args.first), map_file.load(args.second)
-    merged = merge_maps(first, second, params)
+    with mapper(args.cluster, args.jobs) as workers:
+        merged, placed = merge_files(args.maps, params, surveyed, workers)
     map_container.write(args.out, merged.content)
     figures = {
-        'T_first_second': merged.T_first_second.tolist(),
-        'why': merged.why,
+        'sessions': [
+            {'map': s.name, 'T_map_session': T.tolist(), 'why': placed.why[s.name]}
+            for s, T in zip(placed.site.sessions, merged.poses, strict=True)
+        ],
+        'left_out': {name: doubt.why for name, doubt in placed.left_out.items()},
+        'in_survey_frame': placed.is_in_survey_frame,
         'keyframes': len(merged.back_end.keyframes),
         'reflectors': len(merged.back_end.reflector_graph.keys()),
-        'reflectors_in_both': merged.joined,
+        'reflectors_joined': merged.joined,
         'closures_between': merged.closures,
     }
     print(json.dumps(figures) if args.json else text(figures, args.out))
     return 0
 
 
+@contextmanager
+def mapper(cluster: str | None, jobs: int) -> Iterator[Mapper]:
+    """What runs a function over many arguments: this process, or the workers of Dask."""
+    if cluster is None and jobs == 1:
+        yield in_this_process
+        return
+    with open_client(cluster, jobs) as client:
+
+        def on_workers(function: Any, *arguments: Any) -> list[Any]:
+            done: list[Any] = client.gather(client.map(function, *arguments, pure=False))
+            return done
+
+        yield on_workers
+
+
 def text(f: dict[str, Any], out: Path) -> str:
     """The figures for people."""
-    x, y, theta = f['T_first_second']
-    return (
-        f'the second map lies at x = {x:.3f} m, y = {y:.3f} m, {math.degrees(theta):.2f}°: '
-        f'{f["why"]}\n'
-        f'{f["reflectors_in_both"]} reflectors in both, {f["closures_between"]} loop closures '
-        f'between them\n'
-        f'{out}: {f["keyframes"]} keyframes, {f["reflectors"]} reflectors'
-    )
+    lines = []
+    for session in f['sessions']:
+        x, y, theta = session['T_map_session']
+        place = f'x = {x:.3f} m, y = {y:.3f} m, {math.degrees(theta):.2f}°'
+        lines.append(f'{session["map"]}: {place}: {session["why"]}')
+    lines += [f'{name}: LEFT OUT: {why}' for name, why in f['left_out'].items()]
+    lines += [
+        f'{f["reflectors_joined"]} reflectors in both of two sessions, '
+        f'{f["closures_between"]} loop closures between sessions',
+        f'{out}: {len(f["sessions"])} of {len(f["sessions"]) + len(f["left_out"])} sessions, '
+        f'{f["keyframes"]} keyframes, {f["reflectors"]} reflectors',
+    ]
+    return '\n'.join(lines)

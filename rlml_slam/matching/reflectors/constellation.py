@@ -51,7 +51,8 @@ class Candidate:
     ``pose`` (3,) of base with ``cov`` (3, 3); ``match`` (k,) is each detection's reflector, -1
     for none. ``score`` is the log of the likelihood against one of all detections being ghosts;
     ``chi2`` the squared Mahalanobis distance of the ``num_matches`` matches. Of the reflectors
-    within ``max_range``, ``num_near`` match a detection and ``num_unseen`` do not.
+    within ``max_range``, ``num_near`` match a detection and ``num_unseen`` do not. ``chance`` is
+    how many poses are expected to match as many among reflectors that stand at random.
     """
 
     pose: Array
@@ -61,6 +62,7 @@ class Candidate:
     chi2: float
     num_near: int
     num_unseen: int
+    chance: float = float('inf')
 
     @property
     def num_matches(self) -> int:
@@ -82,12 +84,14 @@ class Constellation:
 
     One candidate where unique, none where impossible or not searched. ``chance`` is how many poses
     are expected to match as many detections as the best one does by chance, infinite without one.
+    ``rivals`` are all other poses found, whatever the verdict.
     """
 
     verdict: Verdict
     why: str
     candidates: tuple[Candidate, ...] = ()
     chance: float = float('inf')
+    rivals: tuple[Candidate, ...] = ()
 
 
 def locate(
@@ -124,11 +128,17 @@ def locate(
         if best.chi2 > gate(1.0 - params.false_positive_probability, dof):
             scale = best.chi2 / dof
             result = _Search(z, scale * z_cov, p, scale * p_cov, params, max_tests).run(prior)
-    match = np.full((len(result.candidates), len(points)), -1, dtype=np.int64)
-    for row, c in zip(match, result.candidates, strict=True):
-        row[used] = c.match
-    candidates = (replace(c, match=row) for c, row in zip(result.candidates, match, strict=True))
-    return replace(result, candidates=tuple(candidates))
+
+    def of_all(c: Candidate) -> Candidate:
+        match = np.full(len(points), -1, dtype=np.int64)
+        match[used] = c.match
+        return replace(c, match=match)
+
+    return replace(
+        result,
+        candidates=tuple(map(of_all, result.candidates)),
+        rivals=tuple(map(of_all, result.rivals)),
+    )
 
 
 class _Search:
@@ -154,7 +164,11 @@ class _Search:
         if not searched:
             return _not_searched(len(self._z), len(self._p))
         if found:
-            return self._judged(found, proposals)
+            found = [
+                replace(c, chance=self._chance([c.num_matches], proposals)) for c in found
+            ]  # fmt: skip
+            result = self._judged(found, proposals)
+            return replace(result, rivals=tuple(found[len(result.candidates) :]))
         why = f'no pose matches three of the {len(self._z)} detections with the map'
         return Constellation(Verdict.IMPOSSIBLE, why)
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maps as files: save, load, merge."""
+"""Maps as files: save and load."""

@@ -218,6 +218,12 @@ def fill(graph: Graph, a: Arrays) -> None:
         table.enabled[:] = enabled
 
 
+def keyframes_of(content: Content) -> list[Keyframe]:
+    """The keyframes of a map, with their scans. Raises FileFormatError."""
+    with consistent():
+        return _keyframes(content.arrays)
+
+
 def _keyframes(a: Arrays) -> list[Keyframe]:
     counts = a['key_points']
     ends = np.cumsum(np.maximum(counts, 0))

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two maps are merged where their reflectors determine the relative pose, and only there."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_worlds import ROOM, drive, errors, messages
+from made_worlds import OTHER_ROOM, ROOM, drive, errors, messages
 
 from rlml_slam import se2
 from rlml_slam.cli.main import main
@@ -15,9 +16,10 @@ from rlml_slam.matching.reflectors.constellation import locate
 from rlml_slam.params import Parameters, Relocalization
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.back_end.trajectory import poses_of
+from rlml_slam.slam.merging.map_merging import merge_files, merge_maps
+from rlml_slam.slam.merging.placement import UNMATCHED_SHARE
 from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.store import map_file
-from rlml_slam.slam.store.map_merging import UNMATCHED_SHARE, merge_maps
 from rlml_slam.types import Detections, Odometry, Scan, Verdict
 
 PARAMS = Parameters(back_end=replace(Parameters().back_end, submap_size=10))
@@ -50,7 +52,7 @@ def merged(two):
 
 def test_second_map_is_put_where_it_lies(two, merged):
     a, b = (len(c.arrays['pose']) for c in two)
-    np.testing.assert_allclose(merged.T_first_second, START, atol=0.05)
+    np.testing.assert_allclose(merged.poses[1], START, atol=0.05)
     poses = merged.back_end.graph.poses
     assert len(poses) == a + b
     stamps = (two[1].arrays['key_stamp'] - 1_000_000_000) // 100_000_000
@@ -170,3 +172,43 @@ def test_maps_that_overlap_by_a_few_reflectors_are_placed_by_these(shared, uniqu
     assert (stars.verdict is Verdict.UNIQUE) == unique, stars.why
     if unique:
         np.testing.assert_allclose(stars.candidates[0].pose, START, atol=0.03)
+
+
+def test_command_merges_sessions_on_workers_as_in_this_process(two, tmp_path, capsys):
+    """A stranger and a broken file are left out, with the reason, and cost nothing else."""
+    pytest.importorskip('distributed')
+    other = replace(ROOM, reflectors=np.random.default_rng(2).uniform(-2.0, 3.0, (5, 2)))
+    contents = [*two, map_file.content_of(mapped(other, AGAIN, 3), PARAMS, None)]
+    names = [str(map_container.write(tmp_path / f'{k}.rlml', c)) for k, c in enumerate(contents)]
+    (tmp_path / 'broken.rlml').write_bytes(b'RLMLMAP')
+    names.append(str(tmp_path / 'broken.rlml'))
+    written = []
+    for jobs in ('1', '2'):
+        out = tmp_path / f'site-{jobs}.rlml'
+        assert main(['map', 'merge', *names, '--out', str(out), '--jobs', jobs, '--json']) == 0
+        figures = json.loads(capsys.readouterr().out)
+        assert [s['map'] for s in figures['sessions']] == names[:2]
+        assert set(figures['left_out']) == set(names[2:])
+        assert 'pose' in figures['left_out'][names[2]]
+        written.append(out.read_bytes())
+    assert written[0] == written[1]
+
+
+def test_nothing_is_written_where_no_two_maps_fit(two, tmp_path, capsys):
+    name = str(map_container.write(tmp_path / 'a.rlml', two[0]))
+    (tmp_path / 'broken.rlml').write_bytes(b'RLMLMAP')
+    for names in ([name], [name, name], [name, str(tmp_path / 'broken.rlml')]):
+        assert main(['map', 'merge', *names, '--out', str(tmp_path / 'c.rlml')]) != 0
+        assert not (tmp_path / 'c.rlml').exists()
+
+
+def test_session_without_reflectors_is_placed_by_its_scans(two, tmp_path):
+    """And one whose scans fit nowhere is left out."""
+    bare = [mapped(replace(w, reflectors=np.zeros((0, 2))), AGAIN, 6) for w in (ROOM, OTHER_ROOM)]
+    contents = [two[0], *(map_file.content_of(b, PARAMS, None) for b in bare)]
+    paths = [map_container.write(tmp_path / f'{k}.rlml', c) for k, c in enumerate(contents)]
+    merged, placed = merge_files(paths, PARAMS)
+    assert placed.site.names == [str(p) for p in paths[:2]]
+    assert list(placed.left_out) == [str(paths[2])]
+    np.testing.assert_allclose(merged.poses[1], START, atol=0.1)
+    assert merged.closures > 0

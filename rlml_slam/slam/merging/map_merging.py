@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Maps of several sessions as one: placed, tied by reflectors and closures, solved as a whole.
+
+Each map is put where its session lies (site_tree). Reflectors that are the same are merged, the
+scans are matched with the submaps of the maps before, and the whole graph is solved. One map at
+a time is read; what stays in memory is the merged one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlml_slam import se2
+from rlml_slam.errors import MapError, RlmlError
+from rlml_slam.graph import relative_information
+from rlml_slam.maps.map_container import Content
+from rlml_slam.maps.survey import Survey, same
+from rlml_slam.params import Parameters
+from rlml_slam.se2 import Array
+from rlml_slam.slam.back_end.back_end import BackEnd
+from rlml_slam.slam.keyframes import JUMP_SIGMA
+from rlml_slam.slam.merging.placement import Placement
+from rlml_slam.slam.merging.site_map import Session, Site, session_of
+from rlml_slam.slam.merging.site_tree import Mapper, Placed, in_this_process, place_sessions
+from rlml_slam.slam.store import map_file
+from rlml_slam.types import EdgeKind
+
+Arrays = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Merged:
+    """Merged map; ``poses`` (n, 3) of the maps in its frame before the solve.
+
+    ``content`` is to be saved, with the trajectories of all maps. ``joined`` reflectors were found
+    to be one with another, ``closures`` accepted between maps.
+    """
+
+    back_end: BackEnd
+    content: Content
+    poses: Array
+    joined: int
+    closures: int
+
+
+def merge_maps(first: Content, second: Content, params: Parameters) -> Merged:
+    """One map, in the frame of the first. Raises MapError if their reflectors do not match."""
+    contents = {'the first map': first, 'the second map': second}
+    sessions = [session_of(name, content) for name, content in contents.items()]
+    survey = survey_of_all(sessions)
+    placed = place_sessions(sessions, params, survey)
+    for doubt in placed.left_out.values():
+        raise MapError(f'the reflectors of the maps do not match at exactly one pose: {doubt.why}')
+    return assemble(placed, lambda s: contents[s.name], params, survey)
+
+
+def merge_files(
+    paths: Sequence[Path], params: Parameters, survey: Survey | None = None,
+    run: Mapper = in_this_process,
+) -> tuple[Merged, Placed]:  # fmt: skip
+    """The map of many files, and which of them are in it. Raises MapError where no two fit."""
+    if len({str(path) for path in paths}) < len(paths) or len(paths) < 2:
+        raise MapError('two maps at least, and none twice, are needed to merge')
+    read = run(read_session, paths)
+    sessions = [s for s in read if isinstance(s, Session)]
+    broken = {
+        str(path): Placement(None, why)
+        for path, why in zip(paths, read, strict=True)
+        if isinstance(why, str)
+    }
+    own = survey_of_all(sessions)
+    if survey is not None and own is not None and not same(survey, own):
+        raise MapError('a map was made with another survey than the one given')
+    survey = own if survey is None else survey
+    placed = place_sessions(sessions, params, survey, run) if sessions else None
+    if placed is None or len(placed.site.sessions) < 2:
+        doubts = broken if placed is None else placed.left_out | broken
+        why = '; '.join(f'{name}: {doubt.why}' for name, doubt in doubts.items())
+        raise MapError(f'no two of the maps fit together at exactly one pose: {why}')
+    placed.left_out.update(broken)
+    return assemble(placed, _loaded, params, survey), placed
+
+
+def read_session(path: Path) -> Session | str:
+    """What placing needs of a map's file, or what is wrong with the file."""
+    try:
+        return session_of(str(path), map_file.load(path), path)
+    except RlmlError as e:
+        return str(e)
+
+
+def _loaded(session: Session) -> Content:
+    assert session.path is not None
+    return map_file.load(session.path)
+
+
+def survey_of_all(sessions: Iterable[Session]) -> Survey | None:
+    """The survey in whose frame maps were made, if any was; MapError where there are several."""
+    surveys = [s.survey for s in sessions if s.survey is not None]
+    if not all(same(surveys[0], other) for other in surveys):
+        raise MapError('the maps were made with different surveys')
+    return surveys[0] if surveys else None
+
+
+def assemble(
+    placed: Placed, read: Callable[[Session], Content], params: Parameters,
+    survey: Survey | None = None,
+) -> Merged:  # fmt: skip
+    """The map of all sessions of a site, each read by ``read``.
+
+    Its frame is that of the survey, if a session was placed by it, else that of the first session.
+    """
+    site = placed.site
+    poses = site.poses
+    if not placed.is_in_survey_frame:
+        poses = se2.between(poses[0], poses)
+    arrays: Arrays = {}
+    description: Any = {}
+    first_pose: list[int] = []
+    offsets: list[int] = []
+    for session, T in zip(site.sessions, poses, strict=True):
+        content = read(session)
+        first_pose.append(len(arrays['pose']) if arrays else 0)
+        offsets.append(1 + int(max(_keys(arrays), default=-1)) if arrays else 0)
+        own = _moved(dict(content.arrays), T, is_first=not arrays)
+        arrays = _joined(arrays, own, offsets[-1]) if arrays else own
+        description = description or content.description
+    if survey is not None and placed.is_in_survey_frame:
+        arrays |= {f'survey_{name}': array for name, array in survey._asdict().items()}
+    back_end = BackEnd(params, survey)
+    map_file.restore(Content(arrays, description), back_end)
+    for begin in first_pose[1:]:
+        _connect(back_end, begin)
+    joined = _tie(back_end, site, offsets)
+    back_end.optimize_after_join()
+    accepted = 0
+    if params.loop_closure.enabled:
+        accepted = _close(back_end, first_pose, params.loop_closure.keyframe_interval)
+    back_end.optimize(final=True)
+    made = map_file.content_of(back_end, params, back_end.occupancy_grid())
+    paths = {name: arrays[name] for name in ('path', 'path_motion')}
+    content = Content({**made.arrays, **paths}, made.description)
+    return Merged(back_end, content, poses, joined, accepted)
+
+
+def _tie(back_end: BackEnd, site: Site, offsets: list[int]) -> int:
+    """Reflectors that several sessions have seen become one; how many were joined to another."""
+    known: dict[int, int] = {}
+    joined = 0
+    for session, rows, offset in zip(site.sessions, site.rows, offsets, strict=True):
+        for key, row in zip((session.keys + offset).tolist(), rows.tolist(), strict=True):
+            if known.setdefault(row, key) != key:
+                back_end.reflector_graph.join(known[row], key)
+                joined += 1
+    return joined
+
+
+def _connect(back_end: BackEnd, begin: int) -> None:
+    """Weak edge to the first keyframe of another map, as over a jump."""
+    graph = back_end.graph
+    delta = se2.between(graph.poses[begin - 1], graph.poses[begin])
+    information = relative_information(delta, np.diag(JUMP_SIGMA**2))
+    graph.add_edge(EdgeKind.ODOMETRY, begin - 1, begin, delta, information)
+
+
+def _close(back_end: BackEnd, first_pose: list[int], every: int) -> int:
+    """Loop closures of each map's keyframes with the submaps of the maps before; how many."""
+    accepted = 0
+    for begin, end in zip(first_pose[1:], [*first_pose[2:], None], strict=True):
+        submaps = [m for m in back_end.scan_graph.finished if m.anchor.index < begin]
+        for key in back_end.keyframes[begin:end:every]:
+            points = back_end.scan_graph.thinned(key)
+            if points is not None:
+                closures = back_end.loop_closer.match(key, points, submaps)
+                accepted += sum(c.accepted for c in closures)
+    return accepted
+
+
+def _keys(a: Any) -> list[int]:
+    return [*a['reflector_key'].tolist(), *a['reflector_alias'].ravel().tolist(),
+            *a['reflector_removed']['key'].tolist()]  # fmt: skip
+
+
+def _moved(a: Arrays, T: Array, is_first: bool) -> Arrays:
+    """Arrays of a map moved by T (3,); what is relative to keyframes does not change."""
+    if is_first and not T.any():
+        return a
+    R = se2.rotation(T[2])
+    removed = a['reflector_removed'].copy()
+    removed['place'] = se2.transform(T, removed['place'])
+    jumped = a['key_jumped'].copy()
+    jumped[:1] |= not is_first  # no motion leads there from the map before
+    return a | {
+        'pose': se2.compose(T, a['pose']),
+        'landmark': se2.transform(T, a['landmark']),
+        'landmark_prior_measured': se2.transform(T, a['landmark_prior_measured']),
+        'landmark_prior_information': R @ a['landmark_prior_information'] @ R.T,
+        'key_jumped': jumped,
+        'reflector_removed': removed,
+        'reflector_view': a['reflector_view'][:0],  # the cells are others
+        'pose_fixed': a['pose_fixed'] & is_first,
+    }
+
+
+def _joined(a: Arrays, b: Arrays, keys: int) -> Arrays:
+    """Arrays of both maps, the indices of the second after those of the first."""
+    poses, landmarks = len(a['pose']), len(a['landmark'])
+    edges, sightings = len(a['edge_nodes']), len(a['sighted_nodes'])
+    numbers = 1 + int(a['closure_state'][:, 0].max(initial=-1))
+    sighting, removed, state, path = (
+        b[n].copy() for n in ('sighting', 'reflector_removed', 'closure_state', 'path')
+    )
+    path['key'] += poses
+    sighting['pose'] += poses
+    sighting['factor'] = _after(sighting['factor'], sightings)
+    removed['key'] += keys
+    state[:, 0] = _after(state[:, 0], numbers)
+    shifted: Arrays = {
+        'edge_nodes': b['edge_nodes'] + poses,
+        'sighted_nodes': b['sighted_nodes'] + (poses, landmarks),
+        'pose_prior_nodes': b['pose_prior_nodes'] + poses,
+        'landmark_prior_nodes': b['landmark_prior_nodes'] + landmarks,
+        'submap_anchor': b['submap_anchor'] + poses,
+        'closure': np.column_stack(
+            [b['closure'][:, :2] + poses, _after(b['closure'][:, 2], edges)]
+        ),
+        'closure_state': state,
+        'reflector_key': b['reflector_key'] + keys,
+        'reflector_node': _after(b['reflector_node'], landmarks),
+        'reflector_seen_together': b['reflector_seen_together'] + keys,
+        'reflector_alias': b['reflector_alias'] + keys,
+        'reflector_removed': removed,
+        'sighting': sighting,
+    }  # fmt: skip
+    skipped = ('grid', 'path', 'path_motion', 'closures_tried', 'reflector_num_added')
+    out: Arrays = {
+        name: np.concatenate([array, shifted.get(name, b[name])])
+        for name, array in a.items()
+        if name not in skipped and not name.startswith(('survey_', 'reflector_map'))
+    }
+    path = np.concatenate([a['path'], path])
+    between = se2.between(a['pose'][-1:], b['pose'][:1])
+    return {
+        **out,
+        'path': path[np.argsort(path['stamp'], kind='stable')],
+        'path_motion': np.concatenate([a['path_motion'], between, b['path_motion']]),
+        'closures_tried': a['closures_tried'] + b['closures_tried'],
+    }
+
+
+def _after(index: NDArray[np.int64], offset: int) -> NDArray[np.int64]:
+    """Indices after others; those below 0 stand for none."""
+    return np.where(index >= 0, index + offset, index)
