@@ -76,11 +76,12 @@ class LiveNodes:
         """Messages heard so far."""
         return sum(len(m) for m in self.heard.values())
 
-    def call(self, kind, name, request):
+    def call(self, kind, name, request, timeout=20.0):
         client = self.ear.create_client(kind, name)
-        self.spin_until(client.service_is_ready, what=f'{name} is not offered')
+        self.spin_until(client.service_is_ready, timeout, f'{name} is not offered')
         future = client.call_async(request)
-        self.spin_until(future.done, what=f'{name} does not answer')
+        self.spin_until(future.done, timeout, f'{name} does not answer')
+        self.ear.destroy_client(client)
         return future.result()
 
     def close(self):

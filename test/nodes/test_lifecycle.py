@@ -213,14 +213,12 @@ def test_localization_goes_on_after_a_front_end_was_configured_again(live, tmp_p
 
 def test_process_waits_for_its_manager_and_ends_cleanly(live, start):
     process = start('slam', '--ros-args', '-p', 'autostart:=false')
-    services = [
-        live.ear.create_client(GetState, f'{n}/get_state') for n in ('front_end', 'back_end')
-    ]
-    live.spin_until(lambda: all(s.service_is_ready() for s in services), timeout=120.0)
     for name in ('front_end', 'back_end'):
         for transition, after in (('configure', 2), ('activate', 3)):
             request = ChangeState.Request(transition=Transition(id=BY_NAME[transition]))
-            assert live.call(ChangeState, f'{name}/change_state', request).success
+            # it answers once the kernels are there
+            answer = live.call(ChangeState, f'{name}/change_state', request, timeout=300.0)
+            assert answer.success
             state = live.call(GetState, f'{name}/get_state', GetState.Request())
             assert state.current_state.id == after
     live.listen('front_end/health', 'diagnostic_msgs/msg/DiagnosticStatus')
