@@ -51,7 +51,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument('--processes', type=int, nargs='+', default=[1, 2], choices=[1, 2])
     parser.add_argument('--rate', type=float, default=1.0, help='of the simulator')
-    parser.add_argument('--log', type=Path, default=Path('live_load_log'), help='folder of logs')
+    parser.add_argument('--log', type=Path, help='folder of logs (default: kept nowhere)')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -72,11 +72,10 @@ def study(processes: int, delay: float, args: argparse.Namespace) -> int:
         'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
         DELAY: str(delay),
     }  # fmt: skip
-    log = args.log / f'{processes}_{delay:g}'
     with (
         tempfile.TemporaryDirectory(prefix='rlml_map_') as maps,
         own_domain(domain, environment),
-        Processes(log, environment) as children,
+        Processes(Path(args.log or maps) / f'log_{processes}_{delay:g}', environment) as children,
     ):
         values = {'map_directory': maps, 'laser_pose': list(Simulator().laser_pose)}
         for name in SYSTEMS[processes]:

@@ -102,7 +102,7 @@ def test_scans_outside_the_last_trajectory_have_their_live_poses(recorder):
         recorder.on_pose(pose(k, 10.0 * k))
     stamps = [2 * SECOND, 3 * SECOND]
     path = serialized_path(1, 'map', np.array(stamps), np.array([[2.0, 0, 0], [3.0, 0, 0]]))
-    recorder.on_trajectory(deserialize_message(path, Path))
+    recorder.map.use_path(deserialize_message(path, Path))
     t = recorder.trajectory()
     assert_array_equal(t.stamps, SECOND * np.arange(1, 6))
     assert_allclose(t.poses[:, 0], [10.0, 2.0, 3.0, 40.0, 50.0])
@@ -111,7 +111,7 @@ def test_scans_outside_the_last_trajectory_have_their_live_poses(recorder):
 def test_products_of_the_back_end_are_kept(recorder):
     cells = np.array([[-1, 0, 100], [0, 0, 0]], dtype=np.int8)
     grid = OccupancyGrid(0.05, (-1.0, 2.0), cells)
-    recorder.on_map(encode.occupancy_grid(make, 1, 'map', grid))
+    recorder.map.use_grid(encode.occupancy_grid(make, 1, 'map', grid))
     known = reflectors([[1.0, 2.0], [3.0, 4.0]])
     recorder.on_reflectors(build_reflector_map(make, 1, 'map', known))
     points = np.array([[1.0, 2.0]])
@@ -155,7 +155,7 @@ def test_recorder_waits_for_poses_and_for_the_map(recorder):
     assert not recorder.has_caught_up(now)
     for stamp, done in ((9 * SECOND, False), (10 * SECOND + 7, True)):
         path = serialized_path(stamp, 'map', np.array([stamp]), np.zeros((1, 3)))
-        recorder.on_product('trajectory', path)
+        recorder.map.take('trajectory', path)
         recorder.on_diagnostics(encode.diagnostics(make, stamp - 1, 'front_end', Health(), {}))
         assert not recorder.has_caught_up(now)
         recorder.on_diagnostics(encode.diagnostics(make, stamp, 'front_end', Health(), {}))

@@ -5,24 +5,20 @@ from __future__ import annotations
 
 import struct
 import time
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
-from visualization_msgs.msg import MarkerArray
 
+from rlml_slam.cli.support.heard_map import KINDS, HeardMap
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.evaluation.run_record import FrameLog, Run, Truth
-from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Parameters
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.codecs.frame_messages import read_record
@@ -67,12 +63,9 @@ class Recorder(Node):
         self._updates: list[UpdateSummary] = []
         self._began: float | None = None
         self._heard = 0.0
-        self._path = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)))
-        self._products: dict[str, bytes] = {}
-        self._grid: OccupancyGrid | None = None
+        self.map = HeardMap()
         self._reflectors = NO_REFLECTORS
         self._true_reflectors: Detections | None = None
-        self._keyframes, self._closures = np.zeros((0, 3)), np.zeros((0, 2, 2))
         self._last_true: Array | None = None
         self._listener: Any = None
         self._settled = time.monotonic() + SETTLE
@@ -85,17 +78,8 @@ class Recorder(Node):
         listen(PointCloud2, TRUE_REFLECTORS, self.on_true_reflectors, LATCHED)
         listen(PointCloud2, 'reflector_map_points', self.on_reflectors, LATCHED)
         listen(DiagnosticArray, '/diagnostics', self.on_diagnostics, DEEP)
-        for topic, (kind, _) in self._large().items():
-            # bytes: only the last one of each is ever looked into
-            listen(kind, topic, partial(self.on_product, topic), LATCHED, raw=True)
-
-    def _large(self) -> dict[str, tuple[Any, Callable[[Any], None]]]:
-        """Products that are large: topic, type and callback."""
-        return {
-            'map': (OccupancyGridMsg, self.on_map),
-            'trajectory': (Path, self.on_trajectory),
-            'graph': (MarkerArray, self.on_graph),
-        }
+        for topic, kind in KINDS.items():
+            listen(kind, topic, partial(self.map.take, topic), LATCHED, raw=True)
 
     def is_ready(self) -> bool:
         """Whether front end and back end are there; from then on the sensor is listened to.
@@ -159,35 +143,9 @@ class Recorder(Node):
         """Where the reflectors really are."""
         self._true_reflectors = decode.detections(msg, Parameters().reflector, TRUE_REFLECTORS)
 
-    def on_product(self, topic: str, data: bytes) -> None:
-        """The newest map, trajectory or graph, serialized."""
-        self._products[topic] = data
-
-    def on_map(self, msg: OccupancyGridMsg) -> None:
-        """The newest map."""
-        info = msg.info
-        cells = np.frombuffer(msg.data, dtype=np.int8).reshape(info.height, info.width)
-        x, y, yaw = decode.planar_pose(info.origin, 'map').tolist()
-        self._grid = OccupancyGrid(round(info.resolution, 6), (x, y), cells, yaw)
-
-    def on_trajectory(self, msg: Path) -> None:
-        """The newest optimised trajectory."""
-        stamps = [decode.stamp(p, 'trajectory') for p in msg.poses]
-        poses = [decode.planar_pose(p.pose, 'trajectory') for p in msg.poses]
-        self._path = Trajectory(np.array(stamps, np.int64), np.array(poses).reshape(-1, 3))
-
     def on_reflectors(self, msg: PointCloud2) -> None:
         """The newest reflector map."""
         self._reflectors = read_reflector_map(msg)
-
-    def on_graph(self, msg: MarkerArray) -> None:
-        """The newest keyframes and closures."""
-        for marker in msg.markers:
-            points = np.array([[p.x, p.y] for p in marker.points]).reshape(-1, 2)
-            if marker.ns == 'keyframes':
-                self._keyframes = np.column_stack([points, np.zeros(len(points))])
-            elif marker.ns == 'closure':
-                self._closures = points.reshape(-1, 2, 2)
 
     def on_diagnostics(self, msg: DiagnosticArray) -> None:
         """Health of the front end, and the figures of both nodes."""
@@ -232,7 +190,7 @@ class Recorder(Node):
         if time.monotonic() - since > PATIENCE:
             return True
         newest = max(self._sensor_heard, default=0)
-        path = self._products.get('trajectory')
+        path = self.map.newest.get('trajectory')
         mapped = stamp_of(path) if path is not None else 0
         answered = self.frames.stamps[-1] if self.frames.stamps else 0
         reported = max(self._healths, default=0)
@@ -251,9 +209,7 @@ class Recorder(Node):
 
     def run(self, name: str) -> Run:
         """Everything that was heard."""
-        for topic, (kind, take) in self._large().items():
-            if topic in self._products:
-                take(deserialize_message(self._products[topic], kind))
+        self.map.read()
         stamps = np.array(sorted(self.true), dtype=np.int64)
         truth = None
         if len(stamps):
@@ -264,8 +220,8 @@ class Recorder(Node):
             )
         wall = 0.0 if self._began is None else self._heard - self._began
         return Run(
-            name, self._log(), self.trajectory(), self._reflectors, self._grid,
-            self._keyframes, self._closures, sum(u.rejected for u in self._updates),
+            name, self._log(), self.trajectory(), self._reflectors, self.map.grid,
+            self.map.keyframes, self.map.closures, sum(u.rejected for u in self._updates),
             np.array([u.wall_ms for u in self._updates]),
             inputs=self.inputs(), truth=truth, wall_s=wall,
         )  # fmt: skip
@@ -295,7 +251,7 @@ class Recorder(Node):
 
     def trajectory(self) -> Trajectory:
         """The newest trajectory, and for the scans before and after it the live poses."""
-        live, path = self.frames.trajectory(), self._path
+        live, path = self.frames.trajectory(), self.map.path
         if not len(path):
             return live
         head, tail = live.stamps < path.stamps[0], live.stamps > path.stamps[-1]
