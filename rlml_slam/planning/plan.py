@@ -93,18 +93,14 @@ def make_plan(
     seen, points = visible(site, places, p, sensor), site.reflectors.points
     n, fov = len(places), sensor.laser.field_of_view
     chosen = spread(n, MAX_SAMPLES)
-    nearest = chosen[cKDTree(places[chosen]).query(places)[1]]
     whole = fov > 2.0 * math.pi - 1e-6
     alone: list[Bound] = []
     both: list[Bound] = []
     driving: list[Bound] = []
     scans, counts = [], []
     for heading in np.arange(1 if whole else HEADINGS) * (2.0 * np.pi / HEADINGS):
-        in_view = seen if whole else seen & _within(places, points, heading, fov)
-        scan = np.zeros((n, 6))
-        for k in chosen:
-            scan[k] = scan_information(site, places[k], heading, p, sensor.laser)
-        scan = scan[nearest]
+        in_view = seen if whole else seen & within(places, points, heading, fov)
+        scan = scans_at(site, places, heading, p, sensor)
         alone.append(bound(places, in_view, points, site.cov, p.reflector))
         both.append(bound(places, in_view, points, site.cov, p.reflector, scan))
         q = goal.variance(p, sensor)
@@ -116,7 +112,7 @@ def make_plan(
     answers = []
     for k in chosen:
         heading = fewest[k] * (2.0 * np.pi / HEADINGS)
-        row = seen[k] if whole else seen[k] & _within(places[[k]], points, heading, fov)[0]
+        row = seen[k] if whole else seen[k] & within(places[[k]], points, heading, fov)[0]
         answers.append(rival(site, places[k], row, p))
     rivals = np.array([other for _, other in answers])
     close = [
@@ -137,7 +133,17 @@ def spread(n: int, most: int) -> NDArray[np.int64]:
     return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(np.int64))
 
 
-def _within(places: Array, points: Array, heading: float, fov: float) -> NDArray[np.bool_]:
+def scans_at(
+    site: Site, places: Array, heading: float, p: Parameters, sensor: SimulatorParameters
+) -> Array:
+    """Information (n, 6) of the scan: at MAX_SAMPLES places, elsewhere of the nearest one."""
+    chosen = spread(len(places), MAX_SAMPLES)
+    found = [scan_information(site, places[k], heading, p, sensor.laser) for k in chosen]
+    nearest: Array = np.array(found)[cKDTree(places[chosen]).query(places)[1]]
+    return nearest
+
+
+def within(places: Array, points: Array, heading: float, fov: float) -> NDArray[np.bool_]:
     """Whether a laser at places (n, 2) with one heading has points (m, 2) in its view."""
     d = points - places[:, None]
     bearing = se2.wrap(np.arctan2(d[..., 1], d[..., 0]) - heading)

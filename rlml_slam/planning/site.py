@@ -44,6 +44,16 @@ class Site:
         found = ReflectorSet(survey.points, widths, np.full(n, np.nan), ids)
         return replace(self, reflectors=found, cov=np.zeros((n, 2, 2)))
 
+    def with_posts(self, points: Array) -> Site:
+        """The same site with cylinders (k, 2) added; they do not hide places."""
+        r, k = self.reflectors, len(points)
+        first = int(r.ids.max(initial=0)) + 1
+        added = ReflectorSet(
+            np.concatenate([r.points, points]), np.append(r.widths, np.full(k, DIAMETER)),
+            np.append(r.normals, np.full(k, np.nan)), np.append(r.ids, first + np.arange(k)),
+        )  # fmt: skip
+        return replace(self, reflectors=added, cov=np.concatenate([self.cov, np.zeros((k, 2, 2))]))
+
 
 def of_world(world: World) -> Site:
     """The site of a world without what moves; free is what can be reached from its start."""

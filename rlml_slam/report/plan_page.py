@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from html import escape
 from pathlib import Path
@@ -14,16 +14,21 @@ from typing import Any
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.figure import Figure
+from scipy.spatial import cKDTree
 
+from rlml_slam.maps import survey_writer
 from rlml_slam.maps.atomic_file import write_atomically
 from rlml_slam.maps.occupancy import UNKNOWN, OccupancyGrid
+from rlml_slam.maps.survey import Survey
 from rlml_slam.planning.plan import Plan, figures, scan_sigma
+from rlml_slam.planning.suggest import Suggestion
 from rlml_slam.report.outputs import make_folder
-from rlml_slam.report.pictures import REFLECTOR, SOFT, draw_grid, dress, png
+from rlml_slam.report.pictures import LIVE, REFLECTOR, SOFT, draw_grid, dress, png
 from rlml_slam.report.report import page, section
 from rlml_slam.se2 import Array
 
 PIXELS = 1000
+MANY = 20_000  # places from which they are drawn as an image
 CAPTIONS = {
     'view': 'Reflectors in view',
     'reflectors': 'Position sigma of one scan, by reflectors alone',
@@ -36,10 +41,21 @@ CAPTIONS = {
 }
 
 
-def write_plan(plan: Plan, name: str, folder: Path) -> dict[str, Any]:
-    """Write plan.json, the pictures and plan.html, each whole or not at all; the figures."""
+def write_plan(
+    plan: Plan, name: str, folder: Path, suggestion: Suggestion | None = None
+) -> dict[str, Any]:
+    """Write plan.json, the pictures and plan.html, each whole or not at all; the figures.
+
+    With a suggestion, whose mounts are the plan's last reflectors, the layout as well.
+    """
     folder, found = make_folder(folder), figures(plan)
-    pictures = {k: _map(plan, k, v) for k, v in _values(plan).items()}
+    added = 0
+    if suggestion is not None:
+        r, added = plan.site.reflectors, len(suggestion.mounts)
+        found['suggested'] = _suggested(suggestion, r.ids[len(r) - added :].tolist())
+        layout = Survey(r.ids, r.points, r.widths)
+        survey_writer.save(layout, plan.site.walls.segments[:, :4], len(r) - added, folder)
+    pictures = {k: _map(plan, k, v, added) for k, v in _values(plan).items()}
     for key, image in pictures.items():
         write_atomically(folder / f'{key}.png', image)
     write_atomically(folder / 'plan.json', (json.dumps(found, indent=2) + '\n').encode())
@@ -58,8 +74,42 @@ def _values(plan: Plan) -> dict[str, Array]:
     }  # fmt: skip
 
 
-def _map(plan: Plan, key: str, values: Array) -> bytes:
-    """The places, coloured by a value; sigmas in cm up to three goals."""
+def _suggested(suggestion: Suggestion, ids: list[int]) -> dict[str, Any]:
+    """What each mount brings to the places that were compared, in this order."""
+    steps = [{'goal_share': s.goal_share, 'sigma_m': s.sigma if np.isfinite(s.sigma) else None,
+              'unique_share': s.unique_share} for s in suggestion.steps]  # fmt: skip
+    mounts = [{'id': k, 'x_m': x, 'y_m': y, **step} for k, (x, y), step
+              in zip(ids, suggestion.mounts.tolist(), steps[1:], strict=True)]  # fmt: skip
+    return {'before': steps[0], 'mounts': mounts, 'at_least': suggestion.at_least,
+            'is_complete': suggestion.is_complete, 'is_fewest': suggestion.is_fewest}  # fmt: skip
+
+
+def suggestion_rows(found: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """A row per suggested reflector, with what is reached with it and those before."""
+    rows: list[tuple[str, ...]] = [('add', 'x [m]', 'y [m]', 'goal', 'worst [cm]', 'unique')]
+    for row in [found['suggested']['before'], *found['suggested']['mounts']]:
+        place = [f'{row[k]:.2f}' if k in row else '' for k in ('x_m', 'y_m')]
+        unique = '' if row['unique_share'] is None else f'{row["unique_share"]:.1%}'
+        rows.append((str(row.get('id', 'none')), *place, f'{row["goal_share"]:.1%}',
+                     cm(row['sigma_m']), unique))  # fmt: skip
+    return rows
+
+
+def suggestion_notes(found: Mapping[str, Any]) -> list[str]:
+    """Whether the fewest are known, and whether the goal can be reached at all."""
+    s = found['suggested']
+    if not s['is_fewest']:
+        return []
+    if s['at_least'] is None:
+        return ['no more reflectors at the places that were tried reach it']
+    count = len(s['mounts'])
+    if s['at_least'] >= count:
+        return [f'no fewer than {count} reach the goal']
+    return [f'{count} reach the goal; fewer than {s["at_least"]} do not']
+
+
+def _map(plan: Plan, key: str, values: Array, added: int) -> bytes:
+    """The places, coloured by a value; sigmas in cm up to three goals. The ``added`` in orange."""
     places = plan.places[plan.sampled] if key == 'unique' else plan.places
     low, high = plan.places.min(axis=0) - 1.5, plan.places.max(axis=0) + 1.5
     width, height = high - low
@@ -73,21 +123,44 @@ def _map(plan: Plan, key: str, values: Array) -> bytes:
     axes.grid(False)
     draw_grid(axes, _coarse(plan.site.grid))
     is_sigma = key not in ('view', 'unique')
-    # the side of a marker in points, so that markers of neighbours touch
-    side = 72.0 * scale * np.sqrt(width * height / len(places))
-    colours = colormaps['viridis_r' if is_sigma else 'viridis'].with_extremes(bad='#d9534f')
-    drawn = axes.scatter(
-        places[:, 0], places[:, 1], c=100.0 * values if is_sigma else values,
-        s=min(side, 8.0) ** 2, marker='s', linewidths=0.0, cmap=colours, vmin=0.0,
-        vmax=300.0 * plan.goal.sigma if is_sigma else max(float(values.max()), 1.0), zorder=2,
-        plotnonfinite=True,
-    )  # fmt: skip
-    axes.plot(*plan.site.reflectors.points.T, 'D', color=REFLECTOR, mec='white', ms=5, zorder=3)
+    colours = colormaps['viridis_r' if is_sigma else 'viridis'].with_extremes(
+        bad='#d9534f', under=(0.0, 0.0, 0.0, 0.0)
+    )
+    most = 300.0 * plan.goal.sigma if is_sigma else max(float(values.max()), 1.0)
+    limits: Any = {'cmap': colours, 'vmin': 0.0, 'vmax': most, 'zorder': 2}
+    values = 100.0 * values if is_sigma else values
+    if len(places) > MANY:
+        image, extent = _image(places, values)
+        drawn: Any = axes.imshow(
+            image, origin='lower', extent=extent, interpolation='nearest', **limits
+        )
+    else:
+        # the side of a marker in points, so that markers of neighbours touch
+        side = 72.0 * scale * np.sqrt(width * height / len(places))
+        limits |= {'s': min(side, 8.0) ** 2, 'marker': 's', 'linewidths': 0.0}
+        drawn = axes.scatter(places[:, 0], places[:, 1], c=values, plotnonfinite=True, **limits)
+    points = plan.site.reflectors.points
+    for part, colour in ((points[: len(points) - added], REFLECTOR),
+                         (points[len(points) - added :], LIVE)):  # fmt: skip
+        axes.plot(*part.T, 'D', color=colour, mec='white', ms=6, zorder=3)
     label = 'sigma [cm], red: not held' if is_sigma else CAPTIONS[key]
     figure.colorbar(drawn, ax=axes, label=label, extend='max' if is_sigma else 'neither')
     axes.set(aspect='equal', xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axes.set_title(CAPTIONS[key], fontsize=10, color='black' if is_sigma else SOFT)
     return png(figure)
+
+
+def _image(places: Array, values: Array) -> tuple[Any, tuple[float, float, float, float]]:
+    """Values of many places as an image, open ones masked, -1 where there is no place; extent."""
+    gap = cKDTree(places).query(places[:MANY], k=2)[0][:, 1]
+    side, low = float(np.median(gap)), places.min(axis=0)
+    cell = np.rint((places - low) / side).astype(np.int64)
+    wide, high = cell.max(axis=0) + 1
+    image = np.full((high, wide), -1.0)
+    image[cell[:, 1], cell[:, 0]] = values
+    corner = low - 0.5 * side
+    far = corner + side * np.array([wide, high])
+    return np.ma.masked_invalid(image), (corner[0], far[0], corner[1], far[1])
 
 
 def _coarse(grid: OccupancyGrid) -> OccupancyGrid:
@@ -133,14 +206,18 @@ def _page(name: str, found: Mapping[str, Any], pictures: Mapping[str, bytes]) ->
     if found['notes']:
         items = ''.join(f'<li>{escape(n)}</li>' for n in found['notes'])
         parts.append(section('Notes', f'<ul>{items}</ul>', 'problem'))
+    if 'suggested' in found:
+        notes = ''.join(f'<p>{escape(n)}</p>' for n in suggestion_notes(found))
+        parts.append(section('Suggested reflectors', _table(suggestion_rows(found)) + notes))
     for key, image in pictures.items():
         data = base64.b64encode(image).decode('ascii')
         body = f'<img alt="{escape(CAPTIONS[key])}" src="data:image/png;base64,{data}">'
         parts.append(section(CAPTIONS[key], body))
-    cells = ''.join(
-        '<tr>' + ''.join(f'<td>{escape(c)}</td>' for c in row) + '</tr>'
-        for row in table_rows(found)
-    )
     size = found['area_size_m']
-    parts.append(section(f'Areas of {size:g} m, largest sigmas', f'<table>{cells}</table>'))
+    parts.append(section(f'Areas of {size:g} m, largest sigmas', _table(table_rows(found))))
     return page(f'Layout of {name}', parts)
+
+
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    cells = (''.join(f'<td>{escape(c)}</td>' for c in row) for row in rows)
+    return '<table>' + ''.join(f'<tr>{row}</tr>' for row in cells) + '</table>'

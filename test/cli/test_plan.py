@@ -89,7 +89,7 @@ def test_layout_as_imk_gives_the_plan_of_the_same_layout_as_csv(tmp_path, capsys
 
 
 def test_sensor_file_has_the_noise_the_laser_and_the_range(tmp_path, capsys):
-    common = ('symmetric', '--out', tmp_path / 'out', '--spacing', 1, '--goal', 1, '--json')
+    common = ('symmetric', '--out', tmp_path / 'out', '--spacing', 3, '--goal', 1, '--json')
     sections = {
         'noise': 'front_end: {ros__parameters: {reflector.sigma_range: 0.04, '
         'reflector.sigma_bearing: 0.006}}',
@@ -109,7 +109,7 @@ def test_sensor_file_has_the_noise_the_laser_and_the_range(tmp_path, capsys):
 
 
 def test_slower_drives_are_more_accurate_and_hidden_reflectors_count(tmp_path, capsys):
-    common = ('symmetric', '--out', tmp_path, '--spacing', 1, '--json')
+    common = ('symmetric', '--out', tmp_path, '--spacing', 3, '--goal', 0.008, '--json')
     slow, fast, single, hidden = (
         json.loads(plan(capsys, *common, *more)[1])
         for more in (('--speed', 0.3), (), ('--speed', 0), ('--redundant', 1))
@@ -118,3 +118,41 @@ def test_slower_drives_are_more_accurate_and_hidden_reflectors_count(tmp_path, c
     assert sigma == sorted(sigma)
     assert single['driving_sigma_m'] == single['both_sigma_m']
     assert hidden['goal_share'] < fast['goal_share']
+
+
+def test_suggested_layout_is_written_and_plans_the_same(tmp_path, capsys):
+    common = ('--spacing', 1, '--goal', 0.011, '--json')
+    code, out, _ = plan(capsys, 'symmetric', '--out', tmp_path / 'a', *common, '--suggest', 2)
+    found = json.loads(out)
+    assert code == 1  # two are not enough for a unique pose everywhere
+    mounts = found['suggested']['mounts']
+    assert [m['id'] for m in mounts] == [11, 12]
+    assert found['suggested']['before']['unique_share'] == 0.0
+    assert mounts[-1]['unique_share'] > 0.0
+    assert 'Suggested reflectors' in (tmp_path / 'a' / 'plan.html').read_text(encoding='utf-8')
+    for name in ('layout.csv', 'layout.imk'):
+        layout = tmp_path / 'a' / name
+        _, out, _ = plan(
+            capsys, 'symmetric', '--reflectors', layout, '--out', tmp_path / 'b', *common
+        )
+        again = json.loads(out)
+        assert again['reflectors'] == 12
+        assert again['driving_sigma_m']['max'] == pytest.approx(
+            found['driving_sigma_m']['max'], rel=1e-3
+        )
+
+
+def test_fewest_on_given_poles(tmp_path, capsys):
+    poles = [(1.0, 1.0), (39.0, 1.0), (39.0, 29.0), (1.0, 29.0), (20.0, 15.0), (20.0, 1.0)]
+    rows = '\n'.join(f'{x},{y}' for x, y in poles)
+    (tmp_path / 'poles.csv').write_text(f'x,y\n{rows}\n', encoding='utf-8')
+    code, out, _ = plan(
+        capsys, 'yard', '--out', tmp_path, '--spacing', 2, '--minimum', '--need', 'accuracy',
+        '--area', '2,2 38,2 38,28 2,28', '--goal', 0.012, '--mountable', tmp_path / 'poles.csv',
+    )  # fmt: skip
+    found = json.loads((tmp_path / 'plan.json').read_text(encoding='utf-8'))
+    assert code == 0
+    assert found['goal_share'] == 1.0
+    mounts = found['suggested']['mounts']
+    assert {(m['x_m'], m['y_m']) for m in mounts} <= set(poles)
+    assert 'reach the goal' in out

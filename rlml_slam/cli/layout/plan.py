@@ -17,9 +17,11 @@ from rlml_slam.maps import saved_map, survey
 from rlml_slam.params import Parameters, SimulatorParameters, from_mapping, read_yaml
 from rlml_slam.plain_yaml import parse_yaml
 from rlml_slam.planning import site as sites
+from rlml_slam.planning.mounts import thin, wall_mounts
 from rlml_slam.planning.plan import Goal, make_plan
 from rlml_slam.planning.site import Site
-from rlml_slam.report.plan_page import table_rows, write_plan
+from rlml_slam.planning.suggest import Wanted, suggested
+from rlml_slam.report.plan_page import suggestion_notes, suggestion_rows, table_rows, write_plan
 from rlml_slam.se2 import Array
 from rlml_slam.simulation.world_file import load_world, world_names
 from rlml_slam.slam.store import map_file
@@ -56,6 +58,16 @@ def add_parser(subparsers: Any) -> None:
                         help='the goal holds with the worst K reflectors hidden')  # fmt: skip
     parser.add_argument('--spacing', type=float, default=0.25, help='between places [m]')
     parser.add_argument('--clearance', type=float, default=0.3, help='of places to walls [m]')
+    more = parser.add_mutually_exclusive_group()
+    more.add_argument('--suggest', type=int, metavar='N', help='add N reflectors where they help '
+                      'most; layout.csv, .imk and .dxf')  # fmt: skip
+    more.add_argument('--minimum', action='store_true', help='add the fewest that reach the goal')
+    parser.add_argument('--mountable', type=Path, metavar='FILE', help='.csv, .json or .imk of '
+                        'poles; without it, all walls and pillars')  # fmt: skip
+    parser.add_argument('--mount-spacing', type=float, default=1.0, metavar='M',
+                        help='between places on walls that are tried [m]')  # fmt: skip
+    parser.add_argument('--need', choices=('both', 'accuracy', 'unique'), default='both',
+                        help='what suggestions reach (default: %(default)s)')  # fmt: skip
     parser.add_argument('--json', action='store_true', help='print plan.json and no more')
 
 
@@ -64,6 +76,10 @@ def run(args: argparse.Namespace) -> int:
     for name in ('goal', 'spacing'):
         if not 1e-4 < getattr(args, name) < 1e3:
             raise ParameterError(f'--{name} is not between 0.1 mm and 1 km')
+    if args.suggest is not None and not 1 <= args.suggest <= 1000:
+        raise ParameterError('--suggest is not between 1 and 1000')
+    if not 0.05 <= args.mount_spacing <= 1e3:
+        raise ParameterError('--mount-spacing is not between 5 cm and 1 km')
     if not 0.0 <= args.speed <= 100.0:
         raise ParameterError('--speed is not between 0 and 100 m/s')
     site = load_site(args.map)
@@ -72,18 +88,47 @@ def run(args: argparse.Namespace) -> int:
         if not _is_world(args.map):
             site = sites.with_walls_of_grid(site)
     p, sensor = sensor_of(args.sensor)
-    places = _places(args, site)
-    plan = make_plan(site, places, p, sensor, Goal(args.goal, args.speed, args.redundant))
-    found = write_plan(plan, Path(args.map).stem, args.out)
+    places, goal = _places(args, site), Goal(args.goal, args.speed, args.redundant)
+    suggestion = None
+    if args.suggest is None and not args.minimum:
+        plan = make_plan(site, places, p, sensor, goal)
+    else:
+        wanted = Wanted(args.suggest, goal, args.need != 'unique', args.need != 'accuracy')
+        suggestion, plan = suggested(site, _mounts(args, site), places, p, sensor, wanted)
+    found = write_plan(plan, Path(args.map).stem, args.out, suggestion)
     if args.json:
         print(json.dumps(found))
     else:
-        print(aligned(table_rows(found)))
-        for note in found['notes']:
-            print(note)
-        print(f'{args.goal:g} m is reached at {found["goal_share"]:.1%} of {found["places"]} '
-              f'places; {args.out / "plan.html"}')  # fmt: skip
-    return 0 if found['goal_share'] == 1.0 else 1
+        _print(found, args)
+    return 0 if _is_reached(found, args) else 1
+
+
+def _is_reached(found: dict[str, Any], args: argparse.Namespace) -> bool:
+    """Whether the goal is; suggestions also make places unique, unless --need says otherwise."""
+    is_unique = found['unique_share'] == 1.0
+    if 'suggested' not in found:
+        return bool(found['goal_share'] == 1.0)
+    needs = {'accuracy': found['goal_share'] == 1.0, 'unique': is_unique}
+    return all(needs.values()) if args.need == 'both' else bool(needs[args.need])
+
+
+def _print(found: dict[str, Any], args: argparse.Namespace) -> None:
+    print(aligned(table_rows(found)))
+    for note in found['notes']:
+        print(note)
+    if 'suggested' in found:
+        print(aligned(suggestion_rows(found)))
+        for line in suggestion_notes(found):
+            print(line)
+    print(f'{args.goal:g} m is reached at {found["goal_share"]:.1%} of {found["places"]} '
+          f'places; {args.out / "plan.html"}')  # fmt: skip
+
+
+def _mounts(args: argparse.Namespace, site: Site) -> Array:
+    """Where reflectors may be mounted (c, 2)."""
+    if args.mountable is not None:
+        return thin(survey.load(args.mountable).points, 0.0, site.reflectors.points)
+    return wall_mounts(site, args.mount_spacing)
 
 
 def _is_world(name: str) -> bool:

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where to add reflectors: greedy choice among mounts, exchanges, and fewest by exact covering."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rlml_slam.errors import MapError
+from rlml_slam.params import Parameters, SimulatorParameters
+from rlml_slam.planning.bound import reflector_information, sigmas
+from rlml_slam.planning.coverage import Choice, Coverage, start
+from rlml_slam.planning.driving import predicted
+from rlml_slam.planning.exact_cover import fewest
+from rlml_slam.planning.mounts import thin
+from rlml_slam.planning.plan import HEADINGS, Goal, Plan, make_plan, scans_at, spread, within
+from rlml_slam.planning.site import DIAMETER, Site
+from rlml_slam.planning.visibility import in_sight
+from rlml_slam.se2 import Array
+from rlml_slam.simulation.world import ReflectorSet
+
+MOST_ROWS = 1500  # places at which mounts are compared
+MOST_VALUES = 1_000_000  # places times reflectors
+MOST_LOST = 150  # places at which uniqueness is compared
+TRIED = 3  # best mounts that an exchange evaluates
+ROUNDS = 3
+GAIN = 1e-9
+MOST_MORE, ATTEMPTS = 40, 4  # places that count too after each attempt; attempts
+TIME = 15.0  # [s] for attempts with one less
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """How many to add, or the fewest that reach the goal: None. What counts."""
+
+    number: int | None
+    goal: Goal
+    is_accurate: bool = True
+    is_unique: bool = True
+
+
+@dataclass(frozen=True)
+class Step:
+    """What is reached with the mounts until one (2,), NaN for none: shares and largest sigma."""
+
+    mount: Array
+    goal_share: float
+    sigma: float
+    unique_share: float | None
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """``mounts`` (k, 2) in order of what they bring, and the ``steps``, the first without any.
+
+    ``at_least``: no choice of fewer mounts reaches the goal, where that was shown.
+    ``is_fewest``: they were asked for. ``is_complete``: nothing lacks at the places compared.
+    """
+
+    mounts: Array
+    steps: tuple[Step, ...]
+    at_least: int | None
+    is_complete: bool
+    is_fewest: bool
+
+
+def suggested(
+    site: Site, mounts: Array, places: Array, p: Parameters, sensor: SimulatorParameters,
+    wanted: Wanted,
+) -> tuple[Suggestion, Plan]:  # fmt: skip
+    """Where to add reflectors, and the plan with them at all places (n, 2).
+
+    Mounts are compared at some places. Where the fewest miss the goal at others, these count too;
+    where it is because posts hide reflectors behind them, more are added.
+    """
+    also = np.zeros((0, 2))
+    found = suggest(coverage(site, mounts, places, p, sensor, wanted, also), wanted)
+    for attempt in range(ATTEMPTS + 1):
+        plan = make_plan(site.with_posts(found.mounts), places, p, sensor, wanted.goal)
+        lacks = _lacking(plan, wanted)
+        if attempt == ATTEMPTS or wanted.number is not None or not len(lacks):
+            break
+        also = np.concatenate([also, lacks[spread(len(lacks), MOST_MORE)]])
+        if attempt < ATTEMPTS // 2:
+            found = suggest(coverage(site, mounts, places, p, sensor, wanted, also), wanted)
+            continue
+        left = thin(mounts, 0.0, plan.site.reflectors.points)
+        if not len(left):
+            break
+        more = suggest(coverage(plan.site, left, places, p, sensor, wanted, also), wanted)
+        found = replace(found, mounts=np.concatenate([found.mounts, more.mounts]),
+                        steps=found.steps + more.steps[1:],
+                        is_complete=more.is_complete)  # fmt: skip
+    return found, plan
+
+
+def _lacking(plan: Plan, wanted: Wanted) -> Array:
+    """Places (k, 2) that miss what is wanted."""
+    short = plan.places[~plan.is_reached] if wanted.is_accurate else plan.places[:0]
+    if not wanted.is_unique:
+        return short
+    return np.concatenate([short, plan.places[plan.sampled][~plan.is_unique]])
+
+
+def coverage(
+    site: Site, mounts: Array, places: Array, p: Parameters, sensor: SimulatorParameters,
+    wanted: Wanted, also: Array,
+) -> Coverage:  # fmt: skip
+    """The coverage of some of the places (n, 2), and ``also`` (k, 2).
+
+    Each with all headings if the laser does not see all around.
+    """
+    present = site.reflectors
+    m, fov = len(present), sensor.laser.field_of_view
+    count = m + len(mounts)
+    headings = 1 if fov > 2.0 * np.pi - 1e-6 else HEADINGS
+    most = max(min(MOST_ROWS, MOST_VALUES // max(count, 1)) // headings, 1)
+    places = np.concatenate([also, places[spread(len(places), most)]])
+    none = np.full(len(mounts), np.nan)
+    posts = ReflectorSet(mounts, np.full(len(mounts), DIAMETER), none, np.arange(len(mounts)))
+    geometry = site.walls.joined(present.geometry())
+    known, seen = (in_sight(places, r, geometry, p, sensor) for r in (present, posts))
+    useful = seen.any(axis=0)
+    seen, mounts = np.concatenate([known, seen[:, useful]], axis=1), mounts[useful]
+    points = np.concatenate([present.points, mounts])
+    angles = np.arange(headings) * (2.0 * np.pi / HEADINGS)
+    if headings > 1:
+        seen = np.concatenate([seen & within(places, points, a, fov) for a in angles])
+    scan = np.concatenate([scans_at(site, places, a, p, sensor) for a in angles])
+    places = np.tile(places, (headings, 1))
+    cov = np.concatenate([site.cov, np.zeros((len(mounts), 2, 2))])
+    information = np.zeros((*seen.shape, 6))
+    rows, columns = np.nonzero(seen)
+    offsets = points[columns] - places[rows]
+    information[rows, columns] = reflector_information(offsets, cov[columns], p.reflector)
+    lost = np.union1d(np.arange(len(also)), spread(len(places), MOST_LOST))
+    lost = lost if wanted.is_unique else lost[:0]
+    return Coverage(
+        places, seen, points, cov, m, information, scan, wanted.goal.variance(p, sensor),
+        wanted.goal, wanted.is_accurate, lost, p,
+    )  # fmt: skip
+
+
+def suggest(of: Coverage, wanted: Wanted) -> Suggestion:
+    """The mounts to add to what is present; MapError without any mount."""
+    if len(of.points) == of.num_present:
+        raise MapError('there is no place to mount a reflector; see --mountable')
+    choice, at_least = start(of), None
+    if wanted.number is not None:
+        choice = exchanged(grown(choice, wanted.number))
+    else:
+        choice = pruned(grown(choice, len(of.points)))
+        if choice.is_complete:
+            choice, at_least = fewest(start(of), choice)
+            if at_least < len(choice.added):
+                choice = reduced(choice)
+    return _described(start(of), choice, at_least, wanted.number is None)
+
+
+def grown(choice: Choice, number: int) -> Choice:
+    """At most ``number`` mounts more, each the one that lowers the loss most."""
+    for _ in range(number):
+        gains = choice.gains()
+        if choice.is_complete or not len(gains) or gains.max() <= GAIN:
+            break
+        choice = choice.changed(choice.of.num_present + int(np.argmax(gains)))
+    return choice
+
+
+def pruned(choice: Choice) -> Choice:
+    """Without those mounts that lower the loss no more."""
+    for mount in choice.added:
+        fewer = choice.changed(mount)
+        if fewer.loss <= choice.loss + GAIN:
+            choice = fewer
+    return choice
+
+
+def reduced(choice: Choice) -> Choice:
+    """Fewer mounts that still lack nothing: one less, and the others exchanged."""
+    began = time.monotonic()
+    for mount in choice.added:
+        if time.monotonic() - began > TIME:
+            break
+        if choice.chosen[mount]:
+            fewer = exchanged(choice.changed(mount))
+            choice = fewer if fewer.is_complete else choice
+    return choice
+
+
+def exchanged(choice: Choice) -> Choice:
+    """Each mount replaced by a better one, until none is."""
+    for _ in range(ROUNDS):
+        before = choice.loss
+        for mount in choice.added:
+            if choice.is_complete:
+                return choice
+            fewer = choice.changed(mount)
+            gains = fewer.gains()
+            for k in np.argsort(-gains, kind='stable')[:TRIED]:
+                other = choice.of.num_present + int(k)
+                if other == mount or fewer.loss - gains[k] >= choice.loss - GAIN:
+                    continue
+                swapped = fewer.changed(other)
+                if swapped.loss < choice.loss - GAIN:
+                    choice = swapped
+                    break
+        if choice.loss >= before - GAIN:
+            break
+    return choice
+
+
+def _described(empty: Choice, choice: Choice, at_least: int | None, is_fewest: bool) -> Suggestion:
+    """The mounts in the order in which each lowers the loss most, with what they bring."""
+    left, now = set(choice.added), empty
+    order: list[int] = []
+    steps = [_step(now, np.full(2, np.nan))]
+    while left:
+        gains = now.gains()
+        best = max(sorted(left), key=lambda k: gains[k - now.of.num_present])
+        left.discard(best)
+        now = now.changed(best)
+        order.append(best)
+        steps.append(_step(now, now.of.points[best]))
+    mounts = choice.of.points[order]
+    return Suggestion(mounts, tuple(steps), at_least, choice.is_complete, is_fewest)
+
+
+def _step(choice: Choice, mount: Array) -> Step:
+    of = choice.of
+    everywhere = np.arange(len(of.places))
+    only = replace(of, goal=replace(of.goal, hidden=0))
+    members = of.members(choice.chosen, everywhere)
+    total = np.where((members >= 0)[..., None],
+                     only.information[everywhere[:, None], members], 0.0).sum(axis=1)  # fmt: skip
+    if np.isfinite(of.q):
+        total = total + predicted(total, of.q)
+    unique = [not len(r.lacking) for r in choice.rivals]
+    reached = of.costs(everywhere, members) == 0.0
+    return Step(mount, float(reached.mean()), float(sigmas(total + of.scan)[0].max()),
+                float(np.mean(unique)) if unique else None)  # fmt: skip
