@@ -30,7 +30,7 @@ FILES: dict[str, tuple[type[Any], str]] = {
 UNREAD: dict[str, tuple[str, ...]] = {
     'ekf_slam.yaml': (
         'continue_map', 'restore_pose',
-        'scan_match', 'loop_closure', 'relocalization', 'solver',
+        'scan_match', 'loop_closure', 'relocalization', 'solver', 'incident',
     ),
     'deformable_slam.yaml': ('motion.scale_error_sigma', 'motion.scale_error_time'),
     'reflector_detector.yaml': (

@@ -16,6 +16,7 @@ SWITCH = {'on': True, 'off': False}
 SERVICES = {
     'save_map': ('std_srvs', 'Trigger', None),
     'load_map': ('nav_msgs', 'LoadMap', 'map_url'),
+    'save_incident': ('std_srvs', 'Trigger', None),
     'reset': ('std_srvs', 'Trigger', None),
     'relocalize': ('std_srvs', 'Trigger', None),
     'set_localization_mode': ('std_srvs', 'SetBool', 'data'),
@@ -37,8 +38,8 @@ def add_parser(subparsers: Any) -> None:
         'one; of the two that switch something on or off',
     )  # fmt: skip
     parser.add_argument(
-        '--node', metavar='NAME', default='/back_end',
-        help='the running node (default: %(default)s)',
+        '--node', metavar='NAME',
+        help='the running node (default: /back_end, of save_incident /front_end)',
     )  # fmt: skip
 
 
@@ -48,11 +49,12 @@ def run(args: argparse.Namespace) -> int:
     fields = {} if field is None else {field: value_of(args.service, field, args.argument)}
     if field is None and args.argument is not None and args.service != 'save_map':
         raise InputError(f'{args.service} takes no argument')
+    node = args.node or ('/front_end' if args.service == 'save_incident' else '/back_end')
     kind = getattr(importlib.import_module(f'{package}.srv'), name)
     with asking() as asker:
         if args.service == 'save_map' and args.argument is not None:
-            rename(asker, args.node, args.argument)
-        answer = answer_of(asker, args.node, args.service, kind, fields)
+            rename(asker, node, args.argument)
+        answer = answer_of(asker, node, args.service, kind, fields)
         if name != 'LoadMap':
             print(message_of(answer))
         elif answer.result != kind.Response.RESULT_SUCCESS:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from rlml_slam.ros.diagnostics import HealthPublisher
+from rlml_slam.ros.front_end.black_box import BlackBox
 from rlml_slam.ros.front_end.frame_publisher import FramePublisher
 from rlml_slam.ros.front_end.front_end_control import FrontEndControl
 from rlml_slam.ros.managed_node import ManagedNode
@@ -36,6 +37,8 @@ class FrontEndNode(ManagedNode):
 
     def build(self) -> None:
         """The estimator with its topics."""
+        self.black_box = BlackBox(self, self.params)
+        self.tap = self.black_box.tap
         self.answers = FramePublisher(self, self.params.node)
         began, has_back_end = self.answers.begin_session, self._has_back_end
         self.control = FrontEndControl(self, self.params, began, self.publish, has_back_end)
@@ -54,7 +57,8 @@ class FrontEndNode(ManagedNode):
     def problems(self) -> tuple[str, ...]:
         """What is wrong around the estimate."""
         alone = () if self.back_end_is_active() else ('back_end is not active',)
-        return (*alone, *self.control.problems(), *self.sensors.problems())
+        around = self.control, self.sensors, self.black_box
+        return sum((part.problems() for part in around), alone)
 
     @property
     def front_end(self) -> FrontEnd:
@@ -79,6 +83,7 @@ class FrontEndNode(ManagedNode):
         if self.take is not None:
             self.take(record)
         self.health.update(record.frame)
+        self.black_box.follow(record.frame)
 
 
 def main() -> int:

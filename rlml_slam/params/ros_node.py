@@ -156,6 +156,31 @@ class Node(Group, prefix=''):
 
 
 @dataclass(frozen=True)
+class Incident(Group, prefix='incident.'):
+    """The black box of the front end: what it keeps, and when it writes."""
+
+    record: bool = param(
+        True, 'write what came before and after the robot is LOST, DEGRADED for long, or jumps'
+    )
+    before: float = param(60.0, 'time before an incident that is written', 's', 1.0, 600.0)
+    after: float = param(10.0, 'time after it that is written', 's', 0.0, 60.0)
+    degraded_time: float = param(30.0, 'DEGRADED for longer is an incident', 's', 1.0, 3600.0)
+    min_period: float = param(
+        60.0, 'between two incidents, unless a user asks for one', 's', 0.0, 86_400.0
+    )
+    max_memory: float = param(
+        64.0, 'of the messages kept; beyond it, less time is kept', 'MB', 1.0, 4000.0
+    )
+    max_disk: float = param(
+        500.0,
+        'of all incidents in map_directory/incidents; the oldest are removed',
+        'MB',
+        1.0,
+        1e6,
+    )
+
+
+@dataclass(frozen=True)
 class Player(Group, prefix=''):
     """The bag that bag_player publishes, and at which rate."""
 

@@ -12,7 +12,7 @@ from rlml_slam.params.deformable import Deformable
 from rlml_slam.params.detector import Detector
 from rlml_slam.params.ekf import Ekf, Ransac, Spikes
 from rlml_slam.params.front_end import HealthLimits, MotionNoise, Reflector, ScanMatch, Submap
-from rlml_slam.params.ros_node import Node, PlayerParameters
+from rlml_slam.params.ros_node import Incident, Node, PlayerParameters
 from rlml_slam.params.simulator import SimulatorParameters
 
 
@@ -31,6 +31,7 @@ class Parameters:
     loop_closure: LoopClosure = field(default_factory=LoopClosure)
     relocalization: Relocalization = field(default_factory=Relocalization)
     solver: Solver = field(default_factory=Solver)
+    incident: Incident = field(default_factory=Incident)
 
 
 @dataclass(frozen=True)

@@ -94,6 +94,7 @@ class Listener:
         self._guard = guard_of(node)
         self._kind, self._topic, self._use, self._largest = kind, topic, use, largest
         self._depth = qos.depth
+        self._tap: Callable[[str, Any, bytes], None] | None = getattr(node, 'tap', None)
         self._subscription = node.create_subscription(
             kind, topic, self.receive, qos, raw=True, **options
         )
@@ -105,7 +106,12 @@ class Listener:
 
     def receive(self, data: bytes) -> None:
         """Use one serialized message, or count it as refused."""
+        self._note(data)
         self._guard.pass_on(self._topic, lambda: self._use(self._decoded(data)))
+
+    def _note(self, data: bytes) -> None:
+        if self._tap is not None and len(data) <= self._largest:
+            self._tap(self.topic_name, self._kind, data)
 
     def accept(self, msg: Any) -> None:
         """The same for a message."""
@@ -120,6 +126,7 @@ class Listener:
                 taken = handle.take_message(self._kind, True)
                 if taken is None:
                     break
+                self._note(taken[0])
                 msg = self._guard.pass_on(self._topic, partial(self._decoded, taken[0]))
                 if msg is not None:
                     out.append(msg)

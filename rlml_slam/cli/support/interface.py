@@ -173,6 +173,8 @@ TOPICS = (
 )  # fmt: skip
 
 SERVICES = (
+    Service('front_end', '~/save_incident', 'std_srvs/Trigger',
+            'write the last minute of inputs and outputs, and what comes in the next seconds'),
     Service('back_end', '~/save_map', 'std_srvs/Trigger',
             'write `map_directory`/`map_file_name`: everything as `.rlml`, reflectors and grid'),
     Service('back_end', '~/load_map', 'nav_msgs/LoadMap',

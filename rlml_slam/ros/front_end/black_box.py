@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The black box: the last minute of inputs and outputs, written when something went wrong."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from std_srvs.srv import Trigger
+
+from rlml_slam.errors import BagError
+from rlml_slam.params import Parameters
+from rlml_slam.ros.back_end.worker import Worker
+from rlml_slam.ros.front_end import incident_file
+from rlml_slam.ros.front_end.incident_file import Published, Received
+from rlml_slam.ros.message_guard import guard_of
+from rlml_slam.types import Frame, Level
+
+FOLDER = 'incidents'  # in map_directory
+STATIC = 'tf_static'
+MAX_STATIC = 100
+MB = 1_000_000
+SECOND = 1_000_000_000
+
+
+class Triggers:
+    """Says of each frame whether something went wrong with it, once for each episode."""
+
+    def __init__(self, degraded_time: float) -> None:
+        self._patience = degraded_time
+        self._was_good = False  # the robot knew where it was
+        self._degraded: float | None = None
+
+    def reason(self, frame: Frame, now: float) -> str:
+        """``lost``, ``degraded``, ``jump``, or nothing. ``now`` [s] is of any clock."""
+        level, was_good = frame.health.level, self._was_good
+        self._was_good = level < Level.LOST
+        if level is Level.OK:
+            self._degraded = None
+        elif self._degraded is None:
+            self._degraded = now
+        if level is Level.LOST:
+            return 'lost' if was_good else ''
+        if frame.jumped and was_good:
+            return 'jump'
+        if self._degraded is not None and now - self._degraded > self._patience:
+            self._degraded = float('inf')  # said once
+            return 'degraded' if was_good else ''
+        return ''
+
+
+class BlackBox:
+    """Keeps what came in the last ``incident.before`` seconds, within ``incident.max_memory``.
+
+    After a trigger it waits ``incident.after`` seconds more, and a thread of its own writes the
+    file: no pose waits for it.
+    """
+
+    def __init__(self, node: Any, params: Parameters) -> None:
+        self._p, self._logger = params, node.get_logger()
+        self._i = params.incident
+        self._folder = Path(params.node.map_directory) / FOLDER
+        self._received: deque[Received] = deque()
+        self._static: deque[Received] = deque(maxlen=MAX_STATIC)
+        self._published: deque[Published] = deque()
+        self._bytes = 0
+        self._triggers = Triggers(self._i.degraded_time)
+        self._last = float('-inf')  # [s] of the newest incident
+        self._pending: tuple[float, Path, str] | None = None
+        self._problem = ''
+        guard = guard_of(node)
+        self._worker = Worker(lambda error: guard.report('incident', error))
+        node.every(1.0, self.write_if_due)
+        node.create_service(Trigger, '~/save_incident', self.on_request)
+        node.exits.callback(self.close)
+
+    def tap(self, topic: str, kind: type[Any], data: bytes) -> None:
+        """A message of a sensor, as it came."""
+        if not self._i.record or '/rlml/' in topic:  # what the ends say to each other
+            return
+        package = kind.__module__.partition('.')[0]
+        name = f'{package}/msg/{kind.__name__}'
+        received = Received(time.time_ns(), topic, name, bytes(data))
+        if topic.endswith(STATIC):
+            self._static.append(received)
+            return
+        self._received.append(received)
+        self._bytes += len(data)
+        while self._bytes > self._i.max_memory * MB or self._is_old(self._received[0].time):
+            self._bytes -= len(self._received.popleft().data)
+
+    def _is_old(self, at: int) -> bool:
+        after = 0.0 if self._pending is None else self._i.after
+        return time.time_ns() - at > (self._i.before + after) * SECOND
+
+    def follow(self, frame: Frame) -> None:
+        """A frame that was published."""
+        if not self._i.record:
+            return
+        self._published.append(
+            Published(time.time_ns(), frame.stamp, frame.T_map_base, frame.cov_map, frame.health)
+        )
+        while self._is_old(self._published[0].time):
+            self._published.popleft()
+        now = time.monotonic()
+        why = self._triggers.reason(frame, now)
+        if why and self._pending is None and now - self._last >= self._i.min_period:
+            self._begin(why, '; '.join(frame.health.reasons), now)
+        self.write_if_due()
+
+    def _begin(self, why: str, reasons: str, now: float) -> Path:
+        self._last = now
+        path = incident_file.free_name(self._folder, why)
+        self._pending = now + self._i.after, path, reasons
+        self._logger.warning(f'incident ({why}): {path} is written in {self._i.after:g} s')
+        return path
+
+    def on_request(self, _request: Any, response: Any) -> Any:
+        """Write what there is, for a user."""
+        if self._pending is None:
+            self._begin('asked', '', time.monotonic())
+        assert self._pending is not None
+        response.success = True
+        response.message = f'{self._pending[1]} is written in {self._i.after:g} s'
+        return response
+
+    def write_if_due(self) -> None:
+        """Give the incident to the writing thread, once its time has come."""
+        if self._pending is None or time.monotonic() < self._pending[0]:
+            return
+        (_, path, reasons), self._pending = self._pending, None
+        n = self._p.node
+        about: dict[str, object] = {
+            'reasons': reasons, 'mode': n.mode, 'map': n.map_file_name, 'written': path.name,
+        }  # fmt: skip
+        static, received = list(self._static), list(self._received)
+        published, p = list(self._published), self._p
+        write = partial(incident_file.write, path, about, static, received, published, p)
+        self._worker.submit(lambda: self._save(path, write))
+
+    def _save(self, path: Path, write: Callable[[], None]) -> None:
+        try:
+            write()
+            incident_file.make_room(path.parent, self._i.max_disk * MB)
+            self._problem = ''
+            self._logger.warning(f'incident: {path}, {path.stat().st_size / MB:.1f} MB')
+        except (BagError, OSError) as e:
+            self._problem = f'incident not written: {e}'
+            self._logger.warning(self._problem)
+
+    def problems(self) -> tuple[str, ...]:
+        """Why the newest incident could not be written."""
+        return (self._problem,) if self._problem else ()
+
+    def close(self) -> None:
+        """Write what is pending now; then end the thread."""
+        if self._pending is not None:
+            self._pending = float('-inf'), *self._pending[1:]
+            self.write_if_due()
+        self._worker.submit(lambda: None).result()
+        self._worker.close()
