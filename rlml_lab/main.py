@@ -67,6 +67,9 @@ COMMANDS: Table = {
                 'rlml_lab.studies.study_store',
                 'map files that are cut off, flipped, or killed while saved',
             ),
+            'incidents': Command(
+                'rlml_lab.studies.study_incidents', 'kidnapped robots and their black boxes'
+            ),
             'lifecycle': Command(
                 'rlml_lab.studies.study_lifecycle', 'transitions at random instants, over DDS'
             ),
