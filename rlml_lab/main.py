@@ -68,13 +68,13 @@ COMMANDS: Table = {
                 'map files that are cut off, flipped, or killed while saved',
             ),
             'incidents': Command(
-                'rlml_lab.studies.study_incidents', 'kidnapped robots and their black boxes'
+                'rlml_lab.live.study_incidents', 'kidnapped robots and their black boxes'
             ),
             'lifecycle': Command(
-                'rlml_lab.studies.study_lifecycle', 'transitions at random instants, over DDS'
+                'rlml_lab.live.study_lifecycle', 'transitions at random instants, over DDS'
             ),
             'live-load': Command(
-                'rlml_lab.studies.study_live_load',
+                'rlml_lab.live.study_live_load',
                 'load a map while driving, over DDS',
             ),
             'contact': Command(

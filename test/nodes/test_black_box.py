@@ -22,7 +22,7 @@ from rlml_slam.params import Parameters, from_mapping
 from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.front_end import incident_file
 from rlml_slam.ros.front_end.black_box import Triggers
-from rlml_slam.ros.front_end.incident_file import Published, Received
+from rlml_slam.ros.front_end.incident import Published, Received
 from rlml_slam.types import Frame, Health, Level, Motion, Observation
 
 SECOND = 1_000_000_000
@@ -153,7 +153,8 @@ import sys, time
 from pathlib import Path
 import numpy as np
 from rlml_slam.params import Parameters
-from rlml_slam.ros.front_end.incident_file import Received, write
+from rlml_slam.ros.front_end.incident import Received
+from rlml_slam.ros.front_end.incident_file import write
 data = [Received(k, '/odom', 'nav_msgs/msg/Odometry', bytes(700)) for k in range(1, 20000)]
 print('ready', flush=True)
 write(Path(sys.argv[1]), {}, [], data, [], Parameters())

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +13,7 @@ from std_srvs.srv import Trigger
 from rlml_slam.errors import BagError
 from rlml_slam.params import Parameters
 from rlml_slam.ros.back_end.worker import Worker
-from rlml_slam.ros.front_end import incident_file
-from rlml_slam.ros.front_end.incident_file import Published, Received
+from rlml_slam.ros.front_end.incident import Published, Received, free_name
 from rlml_slam.ros.message_guard import guard_of
 from rlml_slam.types import Frame, Level
 
@@ -114,7 +111,7 @@ class BlackBox:
 
     def _begin(self, why: str, reasons: str, now: float) -> Path:
         self._last = now
-        path = incident_file.free_name(self._folder, why)
+        path = free_name(self._folder, why)
         self._pending = now + self._i.after, path, reasons
         self._logger.warning(f'incident ({why}): {path} is written in {self._i.after:g} s')
         return path
@@ -139,16 +136,18 @@ class BlackBox:
         }  # fmt: skip
         static, received = list(self._static), list(self._received)
         published, p = list(self._published), self._p
-        write = partial(incident_file.write, path, about, static, received, published, p)
-        self._worker.submit(lambda: self._save(path, write))
+        self._worker.submit(lambda: self._save(path, about, static, received, published, p))
 
-    def _save(self, path: Path, write: Callable[[], None]) -> None:
+    def _save(self, path: Path, *parts: Any) -> None:
+        """In the worker: write a file, and make room for it."""
         try:
-            write()
+            from rlml_slam.ros.front_end import incident_file
+
+            incident_file.write(path, *parts)
             incident_file.make_room(path.parent, self._i.max_disk * MB)
             self._problem = ''
             self._logger.warning(f'incident: {path}, {path.stat().st_size / MB:.1f} MB')
-        except (BagError, OSError) as e:
+        except (ImportError, BagError, OSError) as e:
             self._problem = f'incident not written: {e}'
             self._logger.warning(self._problem)
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One incident as one MCAP file: inputs as they came, poses and health as they were published."""
+"""One incident as one MCAP file: inputs as they came, poses and health as they were published.
+
+It is imported where one is written: nodes that write none need no rosbags.
+"""
 
 from __future__ import annotations
 
@@ -7,40 +10,16 @@ import json
 import shutil
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from rlml_slam.params import Parameters, declarations
 from rlml_slam.ros.bags.bag import BagWriter
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import bag_types, make_bag
-from rlml_slam.se2 import Array
-from rlml_slam.types import Health
+from rlml_slam.ros.front_end.incident import PREFIX, Published, Received
 from rlml_slam.version import __version__
 
 STALE = 3600.0  # [s] after which what a killed process began is removed
-PREFIX = 'incident-'
-
-
-@dataclass(frozen=True)
-class Received:
-    """A serialized message that came at a ``time`` [ns] of the wall clock."""
-
-    time: int
-    topic: str
-    kind: str
-    data: bytes
-
-
-@dataclass(frozen=True)
-class Published:
-    """What was published of a frame at a ``time`` [ns]: its stamp, pose, covariance, health."""
-
-    time: int
-    stamp: int
-    T_map_base: Array
-    cov_map: Array
-    health: Health
 
 
 def changed(params: Parameters) -> dict[str, object]:
@@ -103,12 +82,3 @@ def make_room(folder: Path, most: float) -> None:
     for left in folder.glob('.bag-*'):
         if time.time() - left.stat().st_mtime > STALE:
             shutil.rmtree(left, ignore_errors=True)
-
-
-def free_name(folder: Path, why: str) -> Path:
-    """A path that does not exist yet, by date and reason."""
-    name = f'{PREFIX}{time.strftime("%Y%m%d-%H%M%S")}-{why}'
-    path, k = folder / f'{name}.mcap', 1
-    while path.exists():
-        path, k = folder / f'{name}-{k}.mcap', k + 1
-    return path
