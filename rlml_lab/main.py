@@ -73,6 +73,9 @@ COMMANDS: Table = {
             'lifecycle': Command(
                 'rlml_lab.live.study_lifecycle', 'transitions at random instants, over DDS'
             ),
+            'site': Command(
+                'rlml_lab.site.study_site', 'many sessions of a large site become one map'
+            ),
             'live-load': Command(
                 'rlml_lab.live.study_live_load',
                 'load a map while driving, over DDS',
