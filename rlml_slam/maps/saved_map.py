@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,8 @@ from rlml_slam.maps import nav2_map, reflector_file
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.types import Reflectors
 
+ID_DIGITS = 12
+
 
 @dataclass(frozen=True)
 class SavedMap:
@@ -20,6 +24,22 @@ class SavedMap:
 
     reflectors: Reflectors
     grid: OccupancyGrid | None = None
+
+    @cached_property
+    def id(self) -> str:
+        """The same for equal maps: 12 hexadecimal digits of SHA-256 of reflectors and grid.
+
+        Computed from what a robot localizes with, as it survives the way over topics.
+        """
+        content = hashlib.sha256()
+        r, grid = self.reflectors, self.grid
+        for array in (r.keys.astype('<i4'), r.ids.astype('<i4'), r.points.astype('<f8')):
+            content.update(np.ascontiguousarray(array).tobytes())
+        if grid is not None:
+            lattice = np.array([*grid.origin, grid.yaw, grid.resolution], dtype='<f4')
+            content.update(repr(grid.cells.shape).encode() + lattice.tobytes())
+            content.update(np.ascontiguousarray(grid.cells).data)
+        return content.hexdigest()[:ID_DIGITS]
 
 
 def require_contents(saved: SavedMap) -> SavedMap:

@@ -13,7 +13,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from rlml_slam.deformable.slam import DeformableSlam
 from rlml_slam.params import DeformableParameters, Parameters
 from rlml_slam.ros.codecs import decode
-from rlml_slam.ros.diagnostics import HealthPublisher
+from rlml_slam.ros.diagnostics import HealthPublisher, map_id
 from rlml_slam.ros.managed_node import ManagedNode
 from rlml_slam.ros.message_guard import Listener
 from rlml_slam.ros.run import run
@@ -73,7 +73,8 @@ class DeformableSlamNode(ManagedNode):
         """Figures for /diagnostics."""
         estimate = self.slam.estimate
         out: dict[str, object] = {
-            'features': 0 if estimate is None else len(estimate.features.keys)
+            'features': 0 if estimate is None else len(estimate.features.keys),
+            'map id': map_id(None),
         }
         if self._updates:
             wall, cpu = 1e3 * np.percentile(self._cost[: self._updates], 99, axis=0)

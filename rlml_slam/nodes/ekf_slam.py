@@ -15,7 +15,7 @@ from rlml_slam.params import EkfParameters
 from rlml_slam.ros.back_end.map_transform import MapTransform
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.declare import pace
-from rlml_slam.ros.diagnostics import HealthPublisher
+from rlml_slam.ros.diagnostics import HealthPublisher, map_id
 from rlml_slam.ros.front_end.frame_publisher import FramePublisher
 from rlml_slam.ros.managed_node import ManagedNode
 from rlml_slam.ros.map_publisher import TOPICS, MapPublisher
@@ -46,7 +46,9 @@ class EkfSlamNode(ManagedNode):
         timer = self.every(n.transform_publish_period or 0.1, self.tf.repeat)
         self.checks['transform_publish_period'] = pace(timer)
         self.sensors = Sensors(self, self.params, STREAMS, self.process, self.restart)
-        self.health = HealthPublisher(self, self.sensors)
+        self.health = HealthPublisher(
+            self, self.sensors, lambda: {'map id': map_id(self.map_services.saved)}
+        )
         Listener(self, PoseWithCovarianceStamped, 'initialpose', self.start_at, RELIABLE)
         self.restart()
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from rlml_slam.ros.diagnostics import HealthPublisher
+from rlml_slam.ros.diagnostics import HealthPublisher, map_id
 from rlml_slam.ros.front_end.black_box import BlackBox
 from rlml_slam.ros.front_end.frame_publisher import FramePublisher
 from rlml_slam.ros.front_end.front_end_control import FrontEndControl
@@ -43,7 +43,7 @@ class FrontEndNode(ManagedNode):
         began, has_back_end = self.answers.begin_session, self._has_back_end
         self.control = FrontEndControl(self, self.params, began, self.publish, has_back_end)
         self.sensors = Sensors(self, self.params, STREAMS, self.process, self.control.restart)
-        self.health = HealthPublisher(self, self.sensors, problems=self.problems)
+        self.health = HealthPublisher(self, self.sensors, self.figures, self.problems)
         if self._map is not None:
             self.control.command(self._map)
 
@@ -53,6 +53,10 @@ class FrontEndNode(ManagedNode):
             self._map = command  # for a front end that is configured again
         if self.is_configured:
             self.control.command(command)
+
+    def figures(self) -> dict[str, object]:
+        """Figures for /diagnostics."""
+        return {'map id': map_id(self.control.session.map)}
 
     def problems(self) -> tuple[str, ...]:
         """What is wrong around the estimate."""

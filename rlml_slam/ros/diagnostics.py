@@ -11,6 +11,7 @@ from typing import Any
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 
+from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
 from rlml_slam.ros.message_guard import guard_of
@@ -119,6 +120,11 @@ class HealthPublisher:
         )
         self._publisher.publish(message)
         self._publish_health()
+
+
+def map_id(saved: SavedMap | None) -> str:
+    """Of the saved map that a node uses."""
+    return 'none: a map in the making' if saved is None else saved.id
 
 
 def with_problems(health: Health, problems: tuple[str, ...]) -> Health:

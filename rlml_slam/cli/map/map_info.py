@@ -34,6 +34,7 @@ def contents(content: Content) -> dict[str, Any]:
     """How much of everything there is."""
     a = content.arrays
     return {
+        'id': map_file.saved_map(content).id,
         'program': content.description['program'],
         'keyframes': len(a['pose']),
         'scans': int((a['key_points'] >= 0).sum()),

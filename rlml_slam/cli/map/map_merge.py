@@ -56,6 +56,7 @@ def run(args: argparse.Namespace) -> int:
             for s, T in zip(placed.site.sessions, merged.poses, strict=True)
         ],
         'left_out': {name: doubt.why for name, doubt in placed.left_out.items()},
+        'id': merged.content.description['id'],
         'in_survey_frame': placed.is_in_survey_frame,
         'keyframes': len(merged.back_end.keyframes),
         'reflectors': len(merged.back_end.reflector_graph.keys()),
@@ -92,7 +93,7 @@ def text(f: dict[str, Any], out: Path) -> str:
     lines += [
         f'{f["reflectors_joined"]} reflectors in both of two sessions, '
         f'{f["closures_between"]} loop closures between sessions',
-        f'{out}: {len(f["sessions"])} of {len(f["sessions"]) + len(f["left_out"])} sessions, '
+        f'{out}: map {f["id"]} of {len(f["sessions"])} sessions, {len(f["left_out"])} left out, '
         f'{f["keyframes"]} keyframes, {f["reflectors"]} reflectors',
     ]
     return '\n'.join(lines)

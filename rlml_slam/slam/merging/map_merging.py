@@ -8,10 +8,11 @@ a time is read; what stays in memory is the merged one.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,31 +121,30 @@ def assemble(
     poses = site.poses
     if not placed.is_in_survey_frame:
         poses = se2.between(poses[0], poses)
-    arrays: Arrays = {}
-    description: Any = {}
-    first_pose: list[int] = []
-    offsets: list[int] = []
+    maps: list[Arrays] = []
+    sizes = [Sizes()]
     for session, T in zip(site.sessions, poses, strict=True):
         content = read(session)
-        first_pose.append(len(arrays['pose']) if arrays else 0)
-        offsets.append(1 + int(max(_keys(arrays), default=-1)) if arrays else 0)
-        own = _moved(dict(content.arrays), T, is_first=not arrays)
-        arrays = _joined(arrays, own, offsets[-1]) if arrays else own
-        description = description or content.description
+        own = _moved(dict(content.arrays), T, is_first=not maps)
+        maps.append(_shifted(own, sizes[-1]))
+        sizes.append(sizes[-1].after(own))
+    arrays, description = _joined(maps), content.description
     if survey is not None and placed.is_in_survey_frame:
         arrays |= {f'survey_{name}': array for name, array in survey._asdict().items()}
     back_end = BackEnd(params, survey)
     map_file.restore(Content(arrays, description), back_end)
+    paths = {name: arrays[name] for name in ('path', 'path_motion')}
+    arrays.clear()
+    first_pose = [n.poses for n in sizes[:-1]]
     for begin in first_pose[1:]:
         _connect(back_end, begin)
-    joined = _tie(back_end, site, offsets)
+    joined = _tie(back_end, site, [n.keys for n in sizes[:-1]])
     back_end.optimize_after_join()
     accepted = 0
     if params.loop_closure.enabled:
         accepted = _close(back_end, first_pose, params.loop_closure.keyframe_interval)
     back_end.optimize(final=True)
     made = map_file.content_of(back_end, params, back_end.occupancy_grid())
-    paths = {name: arrays[name] for name in ('path', 'path_motion')}
     content = Content({**made.arrays, **paths}, made.description)
     return Merged(back_end, content, poses, joined, accepted)
 
@@ -208,50 +208,70 @@ def _moved(a: Arrays, T: Array, is_first: bool) -> Arrays:
     }
 
 
-def _joined(a: Arrays, b: Arrays, keys: int) -> Arrays:
-    """Arrays of both maps, the indices of the second after those of the first."""
-    poses, landmarks = len(a['pose']), len(a['landmark'])
-    edges, sightings = len(a['edge_nodes']), len(a['sighted_nodes'])
-    numbers = 1 + int(a['closure_state'][:, 0].max(initial=-1))
+class Sizes(NamedTuple):
+    """Of the maps so far: what the indices and keys of the next one come after."""
+
+    poses: int = 0
+    landmarks: int = 0
+    edges: int = 0
+    sightings: int = 0
+    closures: int = 0
+    keys: int = 0
+
+    def after(self, a: Arrays) -> Sizes:
+        """With one more map."""
+        return Sizes(
+            self.poses + len(a['pose']), self.landmarks + len(a['landmark']),
+            self.edges + len(a['edge_nodes']), self.sightings + len(a['sighted_nodes']),
+            self.closures + 1 + int(a['closure_state'][:, 0].max(initial=-1)),
+            self.keys + 1 + int(max(_keys(a), default=-1)),
+        )  # fmt: skip
+
+
+def _shifted(b: Arrays, n: Sizes) -> Arrays:
+    """Arrays of a map, its indices and keys after those of the maps before."""
     sighting, removed, state, path = (
-        b[n].copy() for n in ('sighting', 'reflector_removed', 'closure_state', 'path')
+        b[name].copy() for name in ('sighting', 'reflector_removed', 'closure_state', 'path')
     )
-    path['key'] += poses
-    sighting['pose'] += poses
-    sighting['factor'] = _after(sighting['factor'], sightings)
-    removed['key'] += keys
-    state[:, 0] = _after(state[:, 0], numbers)
-    shifted: Arrays = {
-        'edge_nodes': b['edge_nodes'] + poses,
-        'sighted_nodes': b['sighted_nodes'] + (poses, landmarks),
-        'pose_prior_nodes': b['pose_prior_nodes'] + poses,
-        'landmark_prior_nodes': b['landmark_prior_nodes'] + landmarks,
-        'submap_anchor': b['submap_anchor'] + poses,
+    path['key'] += n.poses
+    sighting['pose'] += n.poses
+    sighting['factor'] = _after(sighting['factor'], n.sightings)
+    removed['key'] += n.keys
+    state[:, 0] = _after(state[:, 0], n.closures)
+    return b | {
+        'edge_nodes': b['edge_nodes'] + n.poses,
+        'sighted_nodes': b['sighted_nodes'] + (n.poses, n.landmarks),
+        'pose_prior_nodes': b['pose_prior_nodes'] + n.poses,
+        'landmark_prior_nodes': b['landmark_prior_nodes'] + n.landmarks,
+        'submap_anchor': b['submap_anchor'] + n.poses,
         'closure': np.column_stack(
-            [b['closure'][:, :2] + poses, _after(b['closure'][:, 2], edges)]
+            [b['closure'][:, :2] + n.poses, _after(b['closure'][:, 2], n.edges)]
         ),
         'closure_state': state,
-        'reflector_key': b['reflector_key'] + keys,
-        'reflector_node': _after(b['reflector_node'], landmarks),
-        'reflector_seen_together': b['reflector_seen_together'] + keys,
-        'reflector_alias': b['reflector_alias'] + keys,
+        'reflector_key': b['reflector_key'] + n.keys,
+        'reflector_node': _after(b['reflector_node'], n.landmarks),
+        'reflector_seen_together': b['reflector_seen_together'] + n.keys,
+        'reflector_alias': b['reflector_alias'] + n.keys,
         'reflector_removed': removed,
         'sighting': sighting,
+        'path': path,
     }  # fmt: skip
-    skipped = ('grid', 'path', 'path_motion', 'closures_tried', 'reflector_num_added')
-    out: Arrays = {
-        name: np.concatenate([array, shifted.get(name, b[name])])
-        for name, array in a.items()
-        if name not in skipped and not name.startswith(('survey_', 'reflector_map'))
-    }
-    path = np.concatenate([a['path'], path])
-    between = se2.between(a['pose'][-1:], b['pose'][:1])
-    return {
-        **out,
-        'path': path[np.argsort(path['stamp'], kind='stable')],
-        'path_motion': np.concatenate([a['path_motion'], between, b['path_motion']]),
-        'closures_tried': a['closures_tried'] + b['closures_tried'],
-    }
+
+
+def _joined(maps: list[Arrays]) -> Arrays:
+    """Arrays of all maps, each of which is emptied; the largest ones are never there twice."""
+    motion = [maps[0]['path_motion']]
+    for a, b in itertools.pairwise(maps):
+        motion += [se2.between(a['pose'][-1:], b['pose'][:1]), b['path_motion']]
+    out: Arrays = {'path_motion': np.concatenate(motion)}
+    out['closures_tried'] = np.sum([a['closures_tried'] for a in maps], axis=0)
+    path = np.concatenate([a['path'] for a in maps])
+    out['path'] = path[np.argsort(path['stamp'], kind='stable')]
+    skipped = ('grid', *out, 'reflector_num_added')
+    for name in list(maps[0]):
+        if name not in skipped and not name.startswith(('survey_', 'reflector_map')):
+            out[name] = np.concatenate([a.pop(name) for a in maps])
+    return out
 
 
 def _after(index: NDArray[np.int64], offset: int) -> NDArray[np.int64]:

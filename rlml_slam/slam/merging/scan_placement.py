@@ -21,7 +21,7 @@ from rlml_slam.slam.relocalization.scan_relocalization import SPREAD, relocalize
 from rlml_slam.slam.store import map_file
 from rlml_slam.types import Verdict
 
-SCANS = 12  # searched of a session, evenly over its drive
+SCANS = 8  # searched of a session, evenly over its drive
 VOTES = 4  # that have to agree
 
 

@@ -17,7 +17,8 @@ metres and radians:
     closure…, path, path_motion     records of closures, the path of all frames
     grid (rows, columns)            the occupancy grid, where there are scans
 
-The description has the parameters that the map was made with, and the grid's origin.
+The description has the parameters that the map was made with, the grid's origin, and ``id``, the
+hash of reflectors and grid that /diagnostics show of who localizes in the map.
 """
 
 from __future__ import annotations
@@ -111,6 +112,7 @@ def content_of(back_end: BackEnd, params: Parameters, grid: OccupancyGrid | None
         arrays |= {
             f'survey_{name}': array for name, array in survey_frame.survey._asdict().items()
         }
+    description['id'] = SavedMap(found, grid).id
     if grid is not None:
         arrays['grid'] = grid.cells
         description['grid'] = {'resolution': grid.resolution, 'origin': list(grid.origin)}
