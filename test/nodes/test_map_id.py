@@ -41,8 +41,8 @@ def id_of_file(file, capsys):
     return json.loads(capsys.readouterr().out)['id']
 
 
-def shown(live, node):
-    """The figure of a node's /diagnostics, as it is sent."""
+def assert_shown(live, node, map_id):
+    """It is in the /diagnostics of a node; what was sent before the map came may come late."""
     name = node.get_fully_qualified_name().lstrip('/')
 
     def values():
@@ -54,8 +54,7 @@ def shown(live, node):
 
     live.heard['/diagnostics'].clear()
     node.health.publish()
-    live.spin_until(values)
-    return values()[-1]
+    live.spin_until(lambda: values()[-1:] == [map_id])
 
 
 def test_every_node_that_localizes_in_a_map_shows_its_id(live, file, id_of_file):
@@ -65,15 +64,16 @@ def test_every_node_that_localizes_in_a_map_shows_its_id(live, file, id_of_file)
     back = live.start(BackEndNode, **values)
     live.spin_until(lambda: front.control.session.map is not None)
     ekf = live.start(EkfSlamNode, **values)
-    assert {shown(live, node) for node in (front, back, ekf)} == {id_of_file}
+    for node in (front, back, ekf):
+        assert_shown(live, node, id_of_file)
 
 
 def test_node_that_makes_a_map_shows_none(live, tmp_path):
     live.listen('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray')
     values = {'map_directory': str(tmp_path)}
     for kind in (FrontEndNode, BackEndNode, EkfSlamNode):
-        assert shown(live, live.start(kind, **values)) == NONE
-    assert shown(live, live.start(DeformableSlamNode)) == NONE
+        assert_shown(live, live.start(kind, **values), NONE)
+    assert_shown(live, live.start(DeformableSlamNode), NONE)
 
 
 def test_id_is_stored_and_differs_with_every_part_of_the_map(file, id_of_file):
