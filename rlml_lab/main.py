@@ -31,6 +31,10 @@ COMMANDS: Table = {
                 'rlml_lab.faults.study_stalls',
                 'odometry that stands still while the robot drives, then catches up',
             ),
+            'fleet': Command(
+                'rlml_lab.fleet.study_fleet',
+                'many replays on a cluster: the same, faster, through kills, and what they find',
+            ),
             'lifelong': Command(
                 'rlml_lab.studies.study_lifelong',
                 'hours in one hall: size of the map and cost of a keyframe',

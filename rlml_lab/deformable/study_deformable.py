@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 import time
 from collections.abc import Sequence
@@ -21,7 +20,7 @@ from rlml_lab.deformable.experiment import CONTROLS, ROWS, Row
 from rlml_lab.deformable.monte_carlo import RowResult, concatenate, run_row, summarize
 from rlml_lab.deformable.replay_note import replay
 from rlml_lab.deformable.study_deformable_tables import tables
-from rlml_lab.support.parallel_jobs import each
+from rlml_lab.support.parallel_jobs import Workers, add_workers, each, workers_of
 from rlml_slam.errors import ParameterError, RlmlError
 
 CHUNK = 50  # seeds per task: small enough for a moving bar, large enough to be worth sending
@@ -38,7 +37,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--control', choices=('both', *CONTROLS), default='both')
     parser.add_argument('--out', type=Path, help='folder for report.html, figures, results.json')
     parser.add_argument('--figure-seed', type=int, default=0, help='the run that is drawn')
-    parser.add_argument('--jobs', type=int, default=0, help='processes (default: one per core)')
+    add_workers(parser, 0)
     parser.add_argument('--json', action='store_true', help='print the results as JSON alone')
     parser.add_argument(
         '--replay-note', type=Path, metavar='DIR', help="replay the note's stored noise instead"
@@ -73,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
         )
     rows = tuple(r for r in ROWS if args.control in ('both', r.control))
     started = time.perf_counter()
-    results = run_study(rows, args.seeds, args.jobs or _cores())
+    results = run_study(rows, args.seeds, workers_of(args))
     summary = summarize(results)
     summary['wall_s'] = round(time.perf_counter() - started, 2)
     if args.out is not None:
@@ -105,8 +104,9 @@ def _run_drives(args: argparse.Namespace) -> int:
         summary = node.summarize(drives)
         claims, lines = node.claims(summary), node.lines
     else:
-        jobs = args.jobs or _cores()
-        summary = window.summarize(window.run_all(args.minutes, runs, not args.anonymous, jobs))
+        summary = window.summarize(
+            window.run_all(args.minutes, runs, not args.anonymous, workers_of(args))
+        )
         claims, lines = window.claims(summary), window.lines
     if args.json:
         print(json.dumps(summary))
@@ -132,7 +132,7 @@ def _show_claims(console: Console, claims: Sequence[tuple[str, str, bool]]) -> N
         console.print(f'  not shown: {claim}{found and ": "}{found}', markup=False)
 
 
-def run_study(rows: tuple[Row, ...], seeds: int, jobs: int) -> dict[Row, RowResult]:
+def run_study(rows: tuple[Row, ...], seeds: int, workers: Workers) -> dict[Row, RowResult]:
     """Results of ``rows`` over seeds 0 .. seeds-1, whatever the number of processes.
 
     A bar on stderr shows the progress.
@@ -150,17 +150,10 @@ def run_study(rows: tuple[Row, ...], seeds: int, jobs: int) -> dict[Row, RowResu
         bar = progress.add_task('compiling', total=len(rows) * seeds)
         run_row(Row('straight', 'fixed', 'active'), range(1))  # fills the cache for all processes
         progress.update(bar, description='simulating')
-        for (row, part), result in each(run_row, tasks, jobs):
+        for (row, part), result in each(run_row, tasks, workers):
             parts[row][part.start] = result
             progress.advance(bar, len(part))
     return {row: concatenate(p for _, p in sorted(parts[row].items())) for row in rows}
-
-
-def _cores() -> int:
-    """Cores this process may use."""
-    if hasattr(os, 'sched_getaffinity'):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _console() -> Console:

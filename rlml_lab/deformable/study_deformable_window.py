@@ -22,7 +22,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedCo
 from rlml_lab.carrier.carrier import CarrierStep, simulate_carrier, true_features
 from rlml_lab.carrier.carrier_parameters import Carrier
 from rlml_lab.deformable.scoring import chi2_bounds
-from rlml_lab.support.parallel_jobs import each
+from rlml_lab.support.parallel_jobs import Workers, each
 from rlml_slam.deformable.slam import DeformableSlam
 from rlml_slam.deformable.window import CarrierVelocity, WindowEstimate
 from rlml_slam.params import DeformableParameters
@@ -104,7 +104,7 @@ def resident() -> int:
                  if line.startswith('VmRSS')), 0)  # fmt: skip
 
 
-def run_all(minutes: float, runs: int, ids: bool, jobs: int) -> dict[str, list[WindowRun]]:
+def run_all(minutes: float, runs: int, ids: bool, workers: Workers) -> dict[str, list[WindowRun]]:
     """Runs with seeds 0 .. runs-1 beside each kind of carrier; a bar on stderr shows them."""
     tasks = [(kind, minutes, seed, ids) for seed in range(runs) for kind in KINDS]
     done: dict[tuple[str, int], WindowRun] = {}
@@ -113,7 +113,7 @@ def run_all(minutes: float, runs: int, ids: bool, jobs: int) -> dict[str, list[W
         console=Console(stderr=True),
     ) as progress:  # fmt: skip
         bar = progress.add_task('driving', total=len(tasks))
-        for (kind, _, seed, _), run in each(run_window, tasks, jobs):
+        for (kind, _, seed, _), run in each(run_window, tasks, workers):
             done[kind, seed] = run
             progress.advance(bar)
     return {kind: [done[kind, seed] for seed in range(runs)] for kind in KINDS}

@@ -18,7 +18,7 @@ from typing import Any
 from rlml_lab.ekf import study_ekf_consistency as consistency
 from rlml_lab.ekf import study_ekf_drives as drives
 from rlml_lab.ekf import study_ekf_speed as speed
-from rlml_lab.support.parallel_jobs import each
+from rlml_lab.support.parallel_jobs import add_workers, each, workers_of
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.cli.support.text_table import aligned
 from rlml_slam.errors import ParameterError
@@ -41,7 +41,7 @@ def add_parser(subparsers: Any) -> None:
         help='drives with known associations, 0 for none (default: as --seeds)',
     )  # fmt: skip
     parser.add_argument('--config', type=Path, metavar='YAML', help="the systems' parameters")
-    parser.add_argument('--jobs', type=int, default=1, metavar='N', help='processes (default: 1)')
+    add_workers(parser)
     parser.add_argument('--out', type=Path, metavar='DIR', help='report.html and results.json')
     parser.add_argument('--json', action='store_true', help='print one JSON object and no more')
 
@@ -49,8 +49,9 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run all systems over all drives and print a row per world and system."""
     known = args.seeds if args.consistency_seeds is None else args.consistency_seeds
-    if args.seeds < 1 or args.jobs < 1 or known < 0:
-        raise ParameterError('study ekf: --seeds and --jobs must be 1 or more')
+    workers = workers_of(args)
+    if args.seeds < 1 or known < 0:
+        raise ParameterError('study ekf: --seeds must be 1 or more')
     began = time.perf_counter()
     values = read_yaml(args.config, EkfParameters) if args.config else {}
     tasks = [
@@ -60,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     ]
     rows: dict[str, dict[str, dict[int, Any]]] = {w: {} for w in args.world}
     with Progress('drives', len(tasks), args.json) as progress:
-        for k, (task, figures) in enumerate(each(drives.evaluate_drive, tasks, args.jobs), 1):
+        for k, (task, figures) in enumerate(each(drives.evaluate_drive, tasks, workers), 1):
             for system, f in figures.items():
                 rows[task[0]].setdefault(system, {})[task[1]] = f
             progress.update(k, f'{task[0]}, seed {task[1]}')
@@ -72,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
             for system, r in systems.items()
         },
     }
-    series = consistency.run_all(known, args.jobs, args.json) if known else {}
+    series = consistency.run_all(known, workers, args.json) if known else {}
     summary['consistency'] = {name: s.summary() for name, s in series.items()}
     summary['speed'] = speed.figures()
     summary['wall_s'] = round(time.perf_counter() - began, 1)

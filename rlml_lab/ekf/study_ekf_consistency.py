@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from rlml_lab.support.drives import observe, process, simulate
-from rlml_lab.support.parallel_jobs import each
+from rlml_lab.support.parallel_jobs import Workers, each
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.ekf.slam import EkfSlam
@@ -106,12 +106,12 @@ def rows(summary: Mapping[str, Any]) -> list[list[str]]:
     ]
 
 
-def run_all(seeds: int, jobs: int, quiet: bool) -> dict[str, Series]:
+def run_all(seeds: int, workers: Workers, quiet: bool) -> dict[str, Series]:
     """All cases over all seeds, by '<case>, <system>'."""
     tasks = [(case, seed) for case in CASES for seed in range(seeds)]
     found: dict[str, dict[int, CaseErrors]] = {}
     with Progress('known associations', len(tasks), quiet) as progress:
-        for k, ((case, seed), by_system) in enumerate(each(evaluate_case, tasks, jobs), 1):
+        for k, ((case, seed), by_system) in enumerate(each(evaluate_case, tasks, workers), 1):
             for system, errors in by_system.items():
                 found.setdefault(f'{case}, {system}', {})[seed] = errors
             progress.update(k, f'{case}, seed {seed}')

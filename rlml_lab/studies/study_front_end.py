@@ -28,7 +28,7 @@ from rlml_lab.studies.front_end_tables import (
     kidnap_text,
 )
 from rlml_lab.support.drives import feed, simulate
-from rlml_lab.support.parallel_jobs import each
+from rlml_lab.support.parallel_jobs import add_workers, each, workers_of
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.cli.support.text_table import aligned
 from rlml_slam.datasets.tum import Trajectory
@@ -66,7 +66,7 @@ def add_parser(subparsers: Any) -> None:
         help='carried robots, in the hall (default: as --seeds)',
     )
     parser.add_argument('--config', type=Path, metavar='YAML', help="the system's parameters")
-    parser.add_argument('--jobs', type=int, default=1, metavar='N', help='processes (default: 1)')
+    add_workers(parser)
     parser.add_argument('--out', type=Path, metavar='DIR', help='report.html and results.json')
     parser.add_argument('--json', action='store_true', help='print one JSON object and no more')
 
@@ -74,8 +74,9 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run all drives and print the tables."""
     kidnaps = args.seeds if args.kidnaps is None else args.kidnaps
-    if args.seeds < 1 or args.jobs < 1 or kidnaps < 0:
-        raise ParameterError('study front-end: --seeds and --jobs must be 1 or more')
+    workers = workers_of(args)
+    if args.seeds < 1 or kidnaps < 0:
+        raise ParameterError('study front-end: --seeds must be 1 or more, --kidnaps not below 0')
     began = time.perf_counter()
     values = read_yaml(args.config) if args.config else {}
     tasks = [
@@ -86,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
     ]
     rows: dict[str, dict[int, dict[str, float]]] = {}
     with Progress('drives', len(tasks), args.json) as progress:
-        for k, (task, figures) in enumerate(each(evaluate_drive, tasks, args.jobs), 1):
+        for k, (task, figures) in enumerate(each(evaluate_drive, tasks, workers), 1):
             for sensors, f in figures.items():
                 rows.setdefault(f'{task[0]}, {task[1] or sensors}', {})[task[2]] = f
             progress.update(k, f'{task[0]}, {task[1] or "clean"}, seed {task[2]}')
@@ -98,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
     with Progress('kidnaps', kidnaps, args.json) as progress:
         carried = []
         for k, (_, f) in enumerate(
-            each(evaluate_kidnap, [(seed, values) for seed in range(kidnaps)], args.jobs), 1
+            each(evaluate_kidnap, [(seed, values) for seed in range(kidnaps)], workers), 1
         ):
             carried.append(f)
             progress.update(k, f'found after {f["found_s"]} s')

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from rlml_lab.support.parallel_jobs import each
+from rlml_lab.support.parallel_jobs import add_workers, each, workers_of
 from rlml_slam import se2
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.cli.support.text_table import aligned
@@ -137,14 +137,15 @@ def add_parser(subparsers: Any) -> None:
         '--max-range', type=float, default=0.0, metavar='M',
         help=f'count reflectors nearer than this as unseen, up to {REACH:g} (default: none)',
     )  # fmt: skip
-    parser.add_argument('--jobs', type=int, default=1, metavar='N', help='processes (default: 1)')
+    add_workers(parser)
     parser.add_argument('--json', action='store_true', help='print one JSON object and no more')
 
 
 def run(args: argparse.Namespace) -> int:
     """Evaluate every layout, and maps of other layouts, and print a row for each."""
-    if args.poses < 1 or args.jobs < 1:
-        raise ParameterError('study relocalization: --poses and --jobs must be 1 or more')
+    workers = workers_of(args)
+    if args.poses < 1:
+        raise ParameterError('study relocalization: --poses must be 1 or more')
     params = replace(Relocalization(), max_range=args.max_range)
     tasks = [
         (layout, foreign, args.poses, args.seed, params)
@@ -153,7 +154,7 @@ def run(args: argparse.Namespace) -> int:
     ]
     rows: dict[str, dict[str, float | None]] = {}
     with Progress('layouts', len(tasks), args.json) as progress:
-        for n, (task, figures) in enumerate(each(evaluate, tasks, args.jobs), 1):
+        for n, (task, figures) in enumerate(each(evaluate, tasks, workers), 1):
             rows[f'{task[0]}, map of another' if task[1] else task[0]] = figures
             progress.update(n, task[0])
     print(json.dumps({'poses': args.poses, 'layouts': rows}) if args.json else text(rows))

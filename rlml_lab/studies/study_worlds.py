@@ -5,16 +5,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rlml_lab.support.parallel_jobs import add_workers, each, workers_of
 from rlml_slam import warm_up
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.datasets.tum import Trajectory
@@ -68,7 +67,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         '--simulator', type=Path, metavar='YAML', help="the simulator's parameters"
     )
-    parser.add_argument('--jobs', type=int, default=1, metavar='N', help='processes (default: 1)')
+    add_workers(parser)
     parser.add_argument(
         '--out', type=Path, metavar='DIR', help='report of the worst seed of each world'
     )
@@ -77,8 +76,9 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run all cases and print a row per world."""
-    if args.seeds < 1 or args.jobs < 1:
-        raise ParameterError('study worlds: --seeds and --jobs must be 1 or more')
+    workers = workers_of(args)
+    if args.seeds < 1:
+        raise ParameterError('study worlds: --seeds must be 1 or more')
     params = from_mapping(read_yaml(args.config)) if args.config else Parameters()
     simulator = read_yaml(args.simulator, SimulatorParameters) if args.simulator else {}
     cases = [
@@ -86,12 +86,14 @@ def run(args: argparse.Namespace) -> int:
         for world in args.world
         for seed in range(args.seeds)
     ]
-    results: dict[str, list[dict[str, Any]]] = {world: [] for world in args.world}
     with Progress('study', len(cases), args.json) as progress:
-        for k, (case, figures) in enumerate(_run_all(cases, params, simulator, args.jobs), 1):
-            results[case.world].append(figures)
+        found: dict[Case, dict[str, Any]] = {}
+        tasks = [(case, params, simulator) for case in cases]
+        for k, ((case, *_), figures) in enumerate(each(evaluate_case, tasks, workers), 1):
+            found[case] = figures
             error = 100 * figures['live_ate_rmse_m']
             progress.update(k, f'{case.world}, seed {case.seed}: {error:.1f} cm')
+    results = {w: [found[case] for case in cases if case.world == w] for w in args.world}
     summary = {world: summarize(rows) for world, rows in results.items()}
     if args.out is not None:
         for world, s in summary.items():
@@ -102,22 +104,6 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(table(summary))
     return 0
-
-
-def _run_all(
-    cases: Sequence[Case], params: Parameters, simulator: Mapping[str, Any], jobs: int
-) -> Iterator[tuple[Case, dict[str, Any]]]:
-    if jobs == 1:
-        for case in cases:
-            yield case, evaluate_case(case, params, simulator)
-        return
-    # a fresh interpreter per worker: a forked one would share the kernels' threads and locks
-    context = multiprocessing.get_context('spawn')
-    with ProcessPoolExecutor(jobs, mp_context=context) as pool:
-        n = len(cases)
-        yield from zip(
-            cases, pool.map(evaluate_case, cases, [params] * n, [simulator] * n), strict=True
-        )
 
 
 def drive(case: Case, params: Parameters, simulator: Mapping[str, Any] | None = None) -> Run:

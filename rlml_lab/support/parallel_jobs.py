@@ -1,25 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Independent tasks of a study over processes."""
+"""Independent tasks of a study over the workers of a cluster."""
 
 from __future__ import annotations
 
-import multiprocessing
+import argparse
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from typing import Any, TypeVar
+from typing import TypeAlias
 
-Task = TypeVar('Task', bound=tuple[Any, ...])
-Result = TypeVar('Result')
+from rlml_slam.errors import ParameterError
+from rlml_slam.fleet import cluster
+from rlml_slam.fleet.cluster import Result, Task
+
+# a number of processes of this machine (0: one per core), or the address of a scheduler
+Workers: TypeAlias = int | str
+
+
+def add_workers(parser: argparse.ArgumentParser, jobs: int = 1) -> None:
+    """Options for who works."""
+    who = parser.add_mutually_exclusive_group()
+    text = f'processes, 0: one per core (default: {jobs})'
+    who.add_argument('--jobs', type=int, default=jobs, metavar='N', help=text)
+    who.add_argument('--cluster', metavar='URL', help='scheduler of Dask, as tcp://HOST:8786')
+
+
+def workers_of(args: argparse.Namespace) -> Workers:
+    """Who works. ParameterError where --jobs is no number of processes."""
+    if args.jobs < 0:
+        raise ParameterError('--jobs must be 0 (one per core) or more')
+    return args.cluster or args.jobs
 
 
 def each(
-    function: Callable[..., Result], tasks: Sequence[Task], jobs: int
+    function: Callable[..., Result], tasks: Sequence[Task], workers: Workers
 ) -> Iterator[tuple[Task, Result]]:
     """(task, function(*task)) as they become ready, from this process where one is enough."""
-    if jobs == 1:
+    if workers == 1:
         yield from ((task, function(*task)) for task in tasks)
         return
-    context = multiprocessing.get_context('spawn')
-    with ProcessPoolExecutor(jobs, mp_context=context) as pool:
-        pending = {pool.submit(function, *task): task for task in tasks}
-        yield from ((pending[done], done.result()) for done in as_completed(pending))
+    address, jobs = (workers, 0) if isinstance(workers, str) else (None, workers)
+    with cluster.open_client(address, jobs) as client:
+        yield from cluster.each(client, function, tasks)

@@ -68,7 +68,7 @@ COMMANDS: Table = {
             'import': Command(
                 'rlml_slam.cli.map.map_import', 'text files as a saved map: CSV, g2o, PGM and YAML'
             ),
-            'merge': Command('rlml_slam.cli.map.map_merge', 'two saved maps as one'),
+            'merge': Command('rlml_slam.cli.map.map_merge', 'saved maps of many sessions as one'),
             'reflectors': Command(
                 'rlml_slam.cli.map.map_reflectors',
                 'which reflectors are there, new, moved, missing or ghosts',

@@ -119,7 +119,7 @@ def _replay_bag(job: Job, scratch: Path) -> Record:
     known = results.find(job.bag.name, key)
     if known is not None and job.extras <= set(known.files):
         return replace(known, times=known.times | {'reused': True})
-    fetched = time.perf_counter()
+    fetched, cpu = time.perf_counter(), time.process_time()
     folder = scratch / 'results'
     folder.mkdir()
     mcap = folder / MCAP if job.mcap else None
@@ -133,6 +133,7 @@ def _replay_bag(job: Job, scratch: Path) -> Record:
     times = {
         'wall_s': figures['wall_s'], 'front_end_ms': figures['front_end_ms']['median'],
         'front_end_p99_ms': figures['front_end_ms']['p99'], 'memory_mb': figures['peak_rss_mb'],
+        'cpu_s': time.process_time() - cpu,
         'fetch_s': fetched - began, 'replay_s': replayed - fetched, 'write_s': written - replayed,
     }  # fmt: skip
     files = tuple(sorted(f.name for f in folder.iterdir()))
