@@ -42,6 +42,8 @@ def open_client(cluster: str | None, jobs: int = 0) -> Iterator[Client]:
         raise ClusterError(
             f'a cluster needs the Python package {e.name!r}: pip install "rlml_slam[fleet]"'
         ) from e
+    # where a scheduler ends, its client raises; the traceback in the log says no more
+    logging.getLogger('distributed.client').setLevel(logging.CRITICAL)
     if cluster is not None:
         try:
             client = Client(cluster, timeout=CONNECT_S)
