@@ -94,6 +94,10 @@ COMMANDS: Table = {
             'kills': Command(
                 'rlml_lab.contact.study_kills', 'processes that are killed while they map, live'
             ),
+            'plan-suggest': Command(
+                'rlml_lab.layout.study_plan_suggest',
+                'suggested reflectors against exhaustive search, and drives through layouts',
+            ),
             'victoria-park': Command(
                 'rlml_lab.studies.study_victoria_park',
                 'dead reckoning, EKF and RLML among trees, against GPS',

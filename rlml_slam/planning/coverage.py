@@ -75,7 +75,7 @@ class Coverage:
             information = information + predicted(information, self.q)
         a, b, c = schur(information + scan + WEAK)
         mean, half = 0.5 * (a + c), np.hypot(0.5 * (a - c), b)
-        least = self.goal.sigma**-2 * (1.0 - 1e-9)
+        least = self.goal.sigma**-2 + WEAK[0]
         short = [np.log(np.maximum(least / np.maximum(v, 1e-30), 1.0))
                  for v in (mean - half, mean + half)]  # fmt: skip
         scale = 2.0 * math.log(least * OPEN**2)

@@ -23,11 +23,13 @@ from rlml_slam.simulation.world import ReflectorSet
 
 MOST_ROWS = 1500  # places at which mounts are compared
 MOST_VALUES = 1_000_000  # places times reflectors
-MOST_LOST = 150  # places at which uniqueness is compared
-TRIED = 3  # best mounts that an exchange evaluates
-ROUNDS = 3
+LOST_VALUES = 50_000
+LEAST_LOST, MOST_LOST = 150, 500  # places at which uniqueness is compared
+TRIED, FEW = 3, 40  # best mounts that an exchange evaluates; all of a few
+ROUNDS, STARTS = 3, 6
 GAIN = 1e-9
-MOST_MORE, ATTEMPTS = 40, 4  # places that count too after each attempt; attempts
+NOWHERE = np.zeros((0, 2))
+MOST_MORE, ATTEMPTS = 40, 5  # places that count too after each attempt; attempts
 TIME = 15.0  # [s] for attempts with one less
 
 
@@ -72,19 +74,22 @@ def suggested(
 ) -> tuple[Suggestion, Plan]:  # fmt: skip
     """Where to add reflectors, and the plan with them at all places (n, 2).
 
-    Mounts are compared at some places. Where the fewest miss the goal at others, these count too;
-    where it is because posts hide reflectors behind them, more are added.
+    Mounts are compared at some places. Where the fewest miss the goal at others, these count too,
+    with the posts that may hide reflectors from them; in the end, more are added.
     """
-    also = np.zeros((0, 2))
+    also, posts = NOWHERE, NOWHERE
     found = suggest(coverage(site, mounts, places, p, sensor, wanted, also), wanted)
+    at_least = found.at_least  # without posts that hide others: no more than are needed
     for attempt in range(ATTEMPTS + 1):
         plan = make_plan(site.with_posts(found.mounts), places, p, sensor, wanted.goal)
         lacks = _lacking(plan, wanted)
         if attempt == ATTEMPTS or wanted.number is not None or not len(lacks):
             break
         also = np.concatenate([also, lacks[spread(len(lacks), MOST_MORE)]])
-        if attempt < ATTEMPTS // 2:
-            found = suggest(coverage(site, mounts, places, p, sensor, wanted, also), wanted)
+        posts = np.concatenate([posts, found.mounts])
+        if attempt < ATTEMPTS - 2:
+            of = coverage(site, mounts, places, p, sensor, wanted, also, posts)
+            found = suggest(of, wanted)
             continue
         left = thin(mounts, 0.0, plan.site.reflectors.points)
         if not len(left):
@@ -93,7 +98,7 @@ def suggested(
         found = replace(found, mounts=np.concatenate([found.mounts, more.mounts]),
                         steps=found.steps + more.steps[1:],
                         is_complete=more.is_complete)  # fmt: skip
-    return found, plan
+    return replace(found, at_least=at_least if found.is_complete else None), plan
 
 
 def _lacking(plan: Plan, wanted: Wanted) -> Array:
@@ -104,11 +109,17 @@ def _lacking(plan: Plan, wanted: Wanted) -> Array:
     return np.concatenate([short, plan.places[plan.sampled][~plan.is_unique]])
 
 
+def cylinders(points: Array) -> ReflectorSet:
+    """Reflectors (k, 2) as they are suggested."""
+    k = len(points)
+    return ReflectorSet(points, np.full(k, DIAMETER), np.full(k, np.nan), np.arange(k))
+
+
 def coverage(
     site: Site, mounts: Array, places: Array, p: Parameters, sensor: SimulatorParameters,
-    wanted: Wanted, also: Array,
+    wanted: Wanted, also: Array, posts: Array = NOWHERE,
 ) -> Coverage:  # fmt: skip
-    """The coverage of some of the places (n, 2), and ``also`` (k, 2).
+    """The coverage of some of the places (n, 2), and ``also`` (k, 2) as ``posts`` (j, 2) hide.
 
     Each with all headings if the laser does not see all around.
     """
@@ -118,10 +129,13 @@ def coverage(
     headings = 1 if fov > 2.0 * np.pi - 1e-6 else HEADINGS
     most = max(min(MOST_ROWS, MOST_VALUES // max(count, 1)) // headings, 1)
     places = np.concatenate([also, places[spread(len(places), most)]])
-    none = np.full(len(mounts), np.nan)
-    posts = ReflectorSet(mounts, np.full(len(mounts), DIAMETER), none, np.arange(len(mounts)))
     geometry = site.walls.joined(present.geometry())
-    known, seen = (in_sight(places, r, geometry, p, sensor) for r in (present, posts))
+    hiding = geometry.joined(cylinders(posts).geometry())
+    known, seen = (
+        np.concatenate([in_sight(at, r, around, p, sensor) for at, around in
+                        ((places[: len(also)], hiding), (places[len(also) :], geometry))])
+        for r in (present, cylinders(mounts))
+    )  # fmt: skip
     useful = seen.any(axis=0)
     seen, mounts = np.concatenate([known, seen[:, useful]], axis=1), mounts[useful]
     points = np.concatenate([present.points, mounts])
@@ -135,7 +149,10 @@ def coverage(
     rows, columns = np.nonzero(seen)
     offsets = points[columns] - places[rows]
     information[rows, columns] = reflector_information(offsets, cov[columns], p.reflector)
-    lost = np.union1d(np.arange(len(also)), spread(len(places), MOST_LOST))
+    lost = np.union1d(
+        np.arange(len(also)),
+        spread(len(places), max(LEAST_LOST, min(MOST_LOST, LOST_VALUES // count))),
+    )
     lost = lost if wanted.is_unique else lost[:0]
     return Coverage(
         places, seen, points, cov, m, information, scan, wanted.goal.variance(p, sensor),
@@ -149,7 +166,7 @@ def suggest(of: Coverage, wanted: Wanted) -> Suggestion:
         raise MapError('there is no place to mount a reflector; see --mountable')
     choice, at_least = start(of), None
     if wanted.number is not None:
-        choice = exchanged(grown(choice, wanted.number))
+        choice = _best_grown(choice, wanted.number)
     else:
         choice = pruned(grown(choice, len(of.points)))
         if choice.is_complete:
@@ -157,6 +174,19 @@ def suggest(of: Coverage, wanted: Wanted) -> Suggestion:
             if at_least < len(choice.added):
                 choice = reduced(choice)
     return _described(start(of), choice, at_least, wanted.number is None)
+
+
+def _best_grown(choice: Choice, number: int) -> Choice:
+    """Grown and exchanged; of few mounts, the best of several that begin with another one."""
+    gains = choice.gains()
+    begins = np.argsort(-gains, kind='stable')[: STARTS if len(gains) <= FEW else 0]
+    found = [exchanged(grown(choice, number))]
+    for k in begins[1:]:
+        if found[0].is_complete:
+            break
+        first = choice.changed(choice.of.num_present + int(k))
+        found.append(exchanged(grown(first, number - 1)))
+    return min(found, key=lambda c: c.loss)
 
 
 def grown(choice: Choice, number: int) -> Choice:
@@ -199,9 +229,12 @@ def exchanged(choice: Choice) -> Choice:
                 return choice
             fewer = choice.changed(mount)
             gains = fewer.gains()
-            for k in np.argsort(-gains, kind='stable')[:TRIED]:
+            # gains of uniqueness are predicted; of few mounts, each is tried
+            tried = TRIED if len(gains) > FEW else FEW
+            for k in np.argsort(-gains, kind='stable')[:tried]:
                 other = choice.of.num_present + int(k)
-                if other == mount or fewer.loss - gains[k] >= choice.loss - GAIN:
+                hopeless = tried == TRIED and fewer.loss - gains[k] >= choice.loss - GAIN
+                if hopeless or fewer.chosen[other] or other == mount:
                     continue
                 swapped = fewer.changed(other)
                 if swapped.loss < choice.loss - GAIN:

@@ -105,7 +105,8 @@ def suggestion_notes(found: Mapping[str, Any]) -> list[str]:
     count = len(s['mounts'])
     if s['at_least'] >= count:
         return [f'no fewer than {count} reach the goal']
-    return [f'{count} reach the goal; fewer than {s["at_least"]} do not']
+    least = f'; fewer than {s["at_least"]} do not' if s['at_least'] else ''
+    return [f'{count} reach the goal{least}']
 
 
 def _map(plan: Plan, key: str, values: Array, added: int) -> bytes:
