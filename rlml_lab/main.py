@@ -47,6 +47,14 @@ COMMANDS: Table = {
                 'rlml_lab.ekf.study_ekf',
                 'RLML, the EKF with each extractor and dead reckoning on the same drives',
             ),
+            'plan-bound': Command(
+                'rlml_lab.layout.study_plan_bound',
+                'errors of the reflector term against the planned sigma, area by area',
+            ),
+            'plan-verdicts': Command(
+                'rlml_lab.layout.study_plan_verdicts',
+                'whether places that are planned unique are answered right',
+            ),
             'relocalization': Command(
                 'rlml_lab.studies.study_relocalization',
                 'whether reflectors alone give the pose, and whether the answer is right',
