@@ -47,13 +47,9 @@ COMMANDS: Table = {
                 'rlml_lab.ekf.study_ekf',
                 'RLML, the EKF with each extractor and dead reckoning on the same drives',
             ),
-            'plan-bound': Command(
-                'rlml_lab.layout.study_plan_bound',
-                'errors of the reflector term against the planned sigma, area by area',
-            ),
-            'plan-verdicts': Command(
-                'rlml_lab.layout.study_plan_verdicts',
-                'whether places that are planned unique are answered right',
+            'audit': Command(
+                'rlml_lab.layout.study_audit',
+                'whether an audit finds moved, hidden, dirty and mirrored reflectors',
             ),
             'relocalization': Command(
                 'rlml_lab.studies.study_relocalization',
@@ -101,6 +97,14 @@ COMMANDS: Table = {
             ),
             'kills': Command(
                 'rlml_lab.contact.study_kills', 'processes that are killed while they map, live'
+            ),
+            'plan-bound': Command(
+                'rlml_lab.layout.study_plan_bound',
+                'errors of the reflector term against the planned sigma, area by area',
+            ),
+            'plan-verdicts': Command(
+                'rlml_lab.layout.study_plan_verdicts',
+                'whether places that are planned unique are answered right',
             ),
             'plan-suggest': Command(
                 'rlml_lab.layout.study_plan_suggest',

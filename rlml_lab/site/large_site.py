@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A large simulated site: racks, reflectors, and the drives of many sessions through its aisles."""
+"""A large simulated site: racks, reflectors, and drives of many sessions through its aisles."""
 
 from __future__ import annotations
 

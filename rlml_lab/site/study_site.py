@@ -188,9 +188,14 @@ def evaluate(
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """A row per number of sessions, and who was left out."""
-    cells = [list(COLUMNS), *([f'{r[name]:{form}}' for name, form in COLUMNS.items()] for r in rows)]
+    cells = [
+        list(COLUMNS),
+        *([f'{r[name]:{form}}' for name, form in COLUMNS.items()] for r in rows),
+    ]
     widths = [max(len(row[k]) for row in cells) for k in range(len(COLUMNS))]
     lines = ['  '.join(f'{c:>{w}}' for c, w in zip(row, widths, strict=True)) for row in cells]
     for r in rows:
-        lines += [f'{r["sessions"]}: {name} left out: {why}' for name, why in r['left_out'].items()]
+        lines += [
+            f'{r["sessions"]}: {name} left out: {why}' for name, why in r['left_out'].items()
+        ]
     return '\n'.join(lines)

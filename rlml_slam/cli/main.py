@@ -98,6 +98,9 @@ COMMANDS: Table = {
             ),
         },
     ),
+    'audit': Command(
+        'rlml_slam.cli.layout.audit', 'a run against its planned layout: what is not as planned'
+    ),
     'compare': Command(
         'rlml_slam.cli.compare', 'from a bag of both, how far two localizations were apart'
     ),

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.maps.map_container import Content
 from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.planning.audit.sightings import SightingLog
 from rlml_slam.se2 import Array
 from rlml_slam.slam.landmarks.reflector_states import ReflectorState
 from rlml_slam.types import Frame, Health, Level, Reflectors, Status
@@ -46,12 +47,14 @@ class FrameLog:
     wall_ms: list[float] = field(default_factory=list)
     seen: list[int] = field(default_factory=list)
     used: list[int] = field(default_factory=list)
+    sightings: SightingLog = field(default_factory=SightingLog)
 
     def add(self, frames: Iterable[Frame]) -> None:
         """Note the poses as published live, their health and their cost."""
         for f in frames:
             self.add_pose(f.stamp, f.T_map_base, f.cov_map, f.health)
             self.wall_ms.append(f.wall_ms)
+            self.sightings.add(f)
             self.seen.append(len(f.statuses))
             used = f.statuses == Status.USED
             self.used.append(int(used.sum()) if len(used) else 0)

@@ -153,6 +153,18 @@ def read(path: str | Path) -> Content:
         raise
 
 
+def require(path: Path, arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, str]) -> None:
+    """Refuse arrays of other ``shapes``, such as ``'n 2'``; one letter has one size everywhere."""
+    sizes: dict[str, int] = {}
+    for name, shape in shapes.items():
+        a, wanted = arrays.get(name), shape.split()
+        if a is None or a.dtype.kind not in 'fi' or a.ndim != len(wanted) or any(
+            n != (int(w) if w.isdigit() else sizes.setdefault(w, n))
+            for n, w in zip(a.shape, wanted, strict=True)
+        ):  # fmt: skip
+            raise FileFormatError(f'{path}: {name} is not an array of {shape} numbers')
+
+
 def _body(path: Path) -> memoryview:
     """The archive in a file, after all checks."""
     try:

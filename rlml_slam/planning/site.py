@@ -28,13 +28,15 @@ WALLS = np.array([0.6, 0.0, 0.0, -1.0])  # surface of what a grid has
 class Site:
     """``walls`` stop beams; ``grid`` has them as cells, and free where the robot can be.
 
-    ``cov`` (m, 2, 2) are the covariances of the reflectors in the map.
+    ``cov`` (m, 2, 2) are the covariances of the reflectors in the map. ``oriented``: it is known
+    which reflectors are flat, and their normals.
     """
 
     walls: Geometry
     reflectors: ReflectorSet
     cov: Array
     grid: OccupancyGrid
+    oriented: bool = True
 
     def with_reflectors(self, survey: Survey) -> Site:
         """The same site with the reflectors of a survey, which is in the frame of the map."""
@@ -42,7 +44,7 @@ class Site:
         ids = np.where(survey.ids == ANONYMOUS, np.arange(n), survey.ids)
         widths = np.where(np.isfinite(survey.diameters), survey.diameters, DIAMETER)
         found = ReflectorSet(survey.points, widths, np.full(n, np.nan), ids)
-        return replace(self, reflectors=found, cov=np.zeros((n, 2, 2)))
+        return replace(self, reflectors=found, cov=np.zeros((n, 2, 2)), oriented=False)
 
     def with_posts(self, points: Array) -> Site:
         """The same site with cylinders (k, 2) added; they do not hide places."""
@@ -85,7 +87,7 @@ def of_grid(grid: OccupancyGrid, found: Reflectors) -> Site:
     widths = np.where(np.isfinite(found.diameters), found.diameters, DIAMETER)
     reflectors = ReflectorSet(found.points, widths, np.full(len(found), np.nan), found.keys)
     site = Site(Geometry(np.zeros((0, 6)), np.zeros((0, 5)), np.zeros((0, 4))), reflectors,
-                found.cov, grid)  # fmt: skip
+                found.cov, grid, oriented=False)  # fmt: skip
     return with_walls_of_grid(site)
 
 
@@ -113,6 +115,13 @@ def _edges(wall: NDArray[np.bool_]) -> Array:
     row, first = np.nonzero(runs == 1)
     _, end = np.nonzero(runs == -1)
     return np.stack([first, row, end, row], -1).astype(np.float64)
+
+
+def known(site: Site) -> Reflectors:
+    """Its reflectors as those of a saved map, anonymous ones."""
+    r, n = site.reflectors, len(site.reflectors)
+    anonymous = np.full(n, ANONYMOUS, dtype=np.int64)
+    return Reflectors(r.ids, r.points, site.cov, anonymous, np.zeros(n, np.int64), r.widths)
 
 
 def places(site: Site, spacing: float, clearance: float) -> Array:

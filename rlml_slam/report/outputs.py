@@ -18,16 +18,19 @@ from rlml_slam.maps import map_container, reflector_file
 from rlml_slam.maps.atomic_file import write_atomically
 from rlml_slam.maps.nav2_map import save
 from rlml_slam.maps.occupancy import UNKNOWN, OccupancyGrid
+from rlml_slam.planning.audit.sightings import save as save_sightings
 from rlml_slam.slam.landmarks.reflector_states import state_table
+
+SIGHTINGS = 'sightings.rlml'
 
 
 def write_outputs(run: Run, folder: str | Path, report: bool = True) -> dict[str, Any]:
     """Write all results and pictures of a run into a folder; the figures of metrics.json.
 
     trajectory.tum, front_end.tum, map.rlml, map.pgm, map.yaml, reflectors.csv,
-    reflector_states.csv and closures.csv depend on the data alone: two replays give the same
-    bytes. Without ``report`` there are no pictures and no report.html. Raises MapError if the
-    folder cannot be written.
+    reflector_states.csv, sightings.rlml and closures.csv depend on the data alone: two replays
+    give the same bytes. Without ``report`` there are no pictures and no report.html. Raises
+    MapError if the folder cannot be written.
     """
     folder = make_folder(folder)
     write_tum(folder / 'trajectory.tum', run.trajectory)
@@ -36,6 +39,10 @@ def write_outputs(run: Run, folder: str | Path, report: bool = True) -> dict[str
     reflector_file.save(run.reflectors, folder / 'reflectors.csv')
     if run.stored is not None:
         map_container.write(folder / 'map.rlml', run.stored)
+    if len(run.frames.sightings):
+        path = run.trajectory
+        save_sightings(run.frames.sightings.sightings(path.stamps, path.poses),
+                       folder / SIGHTINGS)  # fmt: skip
     if run.closure_table:
         write_atomically(folder / 'closures.csv', run.closure_table.encode())
     if run.reflector_states:

@@ -20,6 +20,7 @@ from rlml_slam.maps import survey_writer
 from rlml_slam.maps.atomic_file import write_atomically
 from rlml_slam.maps.occupancy import UNKNOWN, OccupancyGrid
 from rlml_slam.maps.survey import Survey
+from rlml_slam.planning import site_file
 from rlml_slam.planning.plan import Plan, figures, scan_sigma
 from rlml_slam.planning.suggest import Suggestion
 from rlml_slam.report.outputs import make_folder
@@ -44,7 +45,7 @@ CAPTIONS = {
 def write_plan(
     plan: Plan, name: str, folder: Path, suggestion: Suggestion | None = None
 ) -> dict[str, Any]:
-    """Write plan.json, the pictures and plan.html, each whole or not at all; the figures.
+    """Write plan.json, site, pictures and plan.html, each whole or not at all; the figures.
 
     With a suggestion, whose mounts are the plan's last reflectors, the layout as well.
     """
@@ -58,6 +59,7 @@ def write_plan(
     pictures = {k: _map(plan, k, v, added) for k, v in _values(plan).items()}
     for key, image in pictures.items():
         write_atomically(folder / f'{key}.png', image)
+    site_file.save(plan.site, folder)
     write_atomically(folder / 'plan.json', (json.dumps(found, indent=2) + '\n').encode())
     write_atomically(folder / 'plan.html', _page(name, found, pictures).encode())
     return found
