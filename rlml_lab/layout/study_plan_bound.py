@@ -48,7 +48,7 @@ BEAMS = 72  # the scan is not used
 def add_parser(subparsers: Any) -> None:
     """Declare ``rlml-lab study plan-bound``."""
     parser = subparsers.add_parser(
-        'plan-bound', help='errors of the reflector term against the planned sigma, by area'
+        'plan-bound', help='errors of the reflector term against the planned sigma, area by area'
     )
     parser.add_argument('--seeds', type=int, default=20, metavar='N', help='drives per world')
     parser.add_argument('--world', action='append', metavar='NAME', help='default: all')

@@ -35,7 +35,7 @@ def add_parser(subparsers: Any) -> None:
     """Declare ``rlml audit``."""
     parser = subparsers.add_parser(
         'audit',
-        help='a run against the plan of its layout: what is not as planned',
+        help='a run against its planned layout: what is not as planned',
         description='Reflectors that were moved, hidden, turned or are dirty, ghosts and the '
         'walls that mirror them, places where the robot was DEGRADED, and accuracy against the '
         'plan, area by area. Exit code 0 without findings, 1 with findings, 2 for an error.',
