@@ -114,6 +114,7 @@ class ManagedNode(LifecycleNode):
         """Save first."""
         self._release()
         super().destroy_node()
+        self._state_machine.destroy_when_not_in_use()  # it would keep the node in the graph
 
     def _attempt(self, act: Any) -> Any:
         """Run a step; an error is logged, kept, and leaves nothing behind."""

@@ -98,11 +98,8 @@ class Listener:
         self._subscription = node.create_subscription(
             kind, topic, self.receive, qos, raw=True, **options
         )
-
-    @property
-    def topic_name(self) -> str:
-        """The topic as it is after remapping."""
-        return str(self._subscription.topic_name)
+        # as it is after remapping
+        self.topic_name = str(getattr(self._subscription, 'topic_name', topic))
 
     def receive(self, data: bytes) -> None:
         """Use one serialized message, or count it as refused."""
