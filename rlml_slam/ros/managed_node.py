@@ -92,7 +92,10 @@ class ManagedNode(LifecycleNode):
         for timer in self._made('timers'):
             timer.reset()
         out = self._attempt(self.begin)
-        if out == TransitionCallbackReturn.SUCCESS and hasattr(self, 'health'):
+        if out != TransitionCallbackReturn.SUCCESS:
+            self._halt()
+            super().on_deactivate(state)
+        elif hasattr(self, 'health'):
             self.health.publish()
         return out
 

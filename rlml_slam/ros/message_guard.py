@@ -103,12 +103,7 @@ class Listener:
 
     def receive(self, data: bytes) -> None:
         """Use one serialized message, or count it as refused."""
-        self._note(data)
         self._guard.pass_on(self._topic, lambda: self._use(self._decoded(data)))
-
-    def _note(self, data: bytes) -> None:
-        if self._tap is not None and len(data) <= self._largest:
-            self._tap(self.topic_name, self._kind, data)
 
     def accept(self, msg: Any) -> None:
         """The same for a message."""
@@ -123,7 +118,6 @@ class Listener:
                 taken = handle.take_message(self._kind, True)
                 if taken is None:
                     break
-                self._note(taken[0])
                 msg = self._guard.pass_on(self._topic, partial(self._decoded, taken[0]))
                 if msg is not None:
                     out.append(msg)
@@ -135,6 +129,8 @@ class Listener:
         topic, kind = self._topic, self._kind.__name__
         if len(data) > self._largest:
             raise InputError(f'{topic}: {len(data)} bytes, more than {self._largest} of a {kind}')
+        if self._tap is not None:
+            self._tap(self.topic_name, self._kind, data)
         try:
             return deserialize_message(data, self._kind)
         except Exception as e:

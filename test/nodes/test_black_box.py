@@ -125,6 +125,18 @@ def test_memory_is_bounded(live):
     assert sum(len(r.data) for r in box._received) == box._bytes <= 1_000_000
 
 
+def test_steps_of_the_wall_clock_cost_and_reorder_nothing(live, monkeypatch):
+    node = live.start(FrontEndNode)
+    kind = type(next(m for stream, m in room(['/odom'])))
+    for step in (0, 10**6, -(10**6)):
+        monkeypatch.setattr(time, 'time_ns', lambda step=step: 10**18 + step * SECOND)
+        node.black_box.tap('/odom', kind, bytes(10))
+        node.black_box.follow(frame())
+    times = [r.time for r in node.black_box._received]
+    assert len(times) == len(node.black_box._published) == 3
+    assert times == sorted(times)
+
+
 def test_folder_that_cannot_be_written_is_a_problem_and_no_more(live, node, tmp_path):
     (tmp_path / 'maps').mkdir(exist_ok=True)
     (tmp_path / 'maps' / 'incidents').touch()

@@ -130,6 +130,21 @@ def test_error_of_our_own_leads_to_unconfigured(live, monkeypatch):
     assert change(live, node, 'configure') == (False, 'unconfigured')
 
 
+@pytest.mark.parametrize(
+    ('error', 'state'), [(MapError('no'), 'inactive'), (ValueError('bug'), 'unconfigured')]
+)
+def test_failed_activation_leaves_nothing_active(live, monkeypatch, error, state):
+    node = live.start(BackEndNode, autostart=False)
+
+    def fail():
+        raise error
+
+    monkeypatch.setattr(node, 'begin', fail)
+    assert change(live, node, 'configure') == (True, 'inactive')
+    assert change(live, node, 'activate') == (False, state)
+    assert not node.is_active
+
+
 def test_inactive_front_end_takes_and_publishes_nothing_and_goes_on_in_its_session(live):
     front, _ = pair(live)
     live.listen('pose', POSE)

@@ -65,6 +65,7 @@ class BlackBox:
         self._static: deque[Received] = deque(maxlen=MAX_STATIC)
         self._published: deque[Published] = deque()
         self._bytes = 0
+        self._began = time.time_ns() - time.monotonic_ns()  # later steps of the clock: no matter
         self._triggers = Triggers(self._i.degraded_time)
         self._last = float('-inf')  # [s] of the newest incident
         self._pending: tuple[float, Path, str] | None = None
@@ -81,27 +82,31 @@ class BlackBox:
             return
         package = kind.__module__.partition('.')[0]
         name = f'{package}/msg/{kind.__name__}'
-        received = Received(time.time_ns(), topic, name, bytes(data))
+        received = Received(self._now(), topic, name, bytes(data))
         if topic.endswith(STATIC):
             self._static.append(received)
             return
         self._received.append(received)
         self._bytes += len(data)
-        while self._bytes > self._i.max_memory * MB or self._is_old(self._received[0].time):
+        most, old = self._i.max_memory * MB, self._old()
+        while self._received and (self._bytes > most or self._received[0].time < old):
             self._bytes -= len(self._received.popleft().data)
 
-    def _is_old(self, at: int) -> bool:
+    def _now(self) -> int:
+        return self._began + time.monotonic_ns()
+
+    def _old(self) -> int:
         after = 0.0 if self._pending is None else self._i.after
-        return time.time_ns() - at > (self._i.before + after) * SECOND
+        return self._now() - int((self._i.before + after) * SECOND)
 
     def follow(self, frame: Frame) -> None:
         """A frame that was published."""
         if not self._i.record:
             return
         self._published.append(
-            Published(time.time_ns(), frame.stamp, frame.T_map_base, frame.cov_map, frame.health)
+            Published(self._now(), frame.stamp, frame.T_map_base, frame.cov_map, frame.health)
         )
-        while self._is_old(self._published[0].time):
+        while self._published[0].time < self._old():
             self._published.popleft()
         now = time.monotonic()
         why = self._triggers.reason(frame, now)
@@ -134,12 +139,10 @@ class BlackBox:
         about: dict[str, object] = {
             'reasons': reasons, 'mode': n.mode, 'map': n.map_file_name, 'written': path.name,
         }  # fmt: skip
-        static, received = list(self._static), list(self._received)
-        published, p = list(self._published), self._p
-        self._worker.submit(lambda: self._save(path, about, static, received, published, p))
+        parts = list(self._static), list(self._received), list(self._published), self._p
+        self._worker.submit(lambda: self._save(path, about, *parts))
 
     def _save(self, path: Path, *parts: Any) -> None:
-        """In the worker: write a file, and make room for it."""
         try:
             from rlml_slam.ros.front_end import incident_file
 
