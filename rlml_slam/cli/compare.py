@@ -1,44 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``rlml compare``: from a bag of both, how far two localizations were apart."""
+"""``rlml compare``: two runs of one recording, or two localizations in one bag."""
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from rlml_slam import se2
-from rlml_slam.datasets.tum import Trajectory
-from rlml_slam.errors import BagError, InputError
-from rlml_slam.evaluation.ate import trajectory_errors
-from rlml_slam.params import Node
+from rlml_slam.cli.support.text_table import aligned
+from rlml_slam.datasets.tum import Trajectory, read_tum
+from rlml_slam.errors import ParameterError
+from rlml_slam.evaluation.run_comparison import FIGURES, compare_runs, limits_with
+from rlml_slam.evaluation.run_folder import LIVE, METRICS, RunFolder, read_run
+from rlml_slam.recordings.bag_poses import TF, poses_of, poses_on_tf
+from rlml_slam.report.comparison_page import figures_of, table_of, text_of, write_comparison
 from rlml_slam.ros.bags.bag import BagReader
-from rlml_slam.ros.codecs import decode
-from rlml_slam.ros.tf import Extrinsics
-from rlml_slam.ros.tf_odometry import TfOdometry
-from rlml_slam.se2 import Array
-from rlml_slam.sensing.synchronization.odometry_sources import PoseHistory
-from rlml_slam.types import Odometry
 
-TF = '/tf'
+ERROR_CODE = 2  # 1: there are differences
 OURS = ('/shadow/pose', '/pose')
-WHOLE = 1e6  # [s] of transforms that are remembered
-MAX_GAP = 500_000_000  # [ns] over which poses of the other are not interpolated
 
 
 def add_parser(subparsers: Any) -> None:
     """Declare ``rlml compare``."""
     parser = subparsers.add_parser(
         'compare',
-        help='from a bag of both, how far two localizations were apart',
-        description='Compares the poses of a node in shadow mode with map to base on /tf, or with '
-        'a topic of poses. The maps may differ: one path is first fitted to the other.',
+        help='two runs of one bag: what differs, and where they part',
+        description='Compares the results of two replays of one recording (other parameters, '
+        'version or system), a trajectory in TUM format, or the poses in a bag, as of AMCL. With '
+        'one bag alone, a node in shadow mode is compared with map to base on /tf. Exit code 0 '
+        'where nothing differs beyond the limits, 1 where something does, 2 for an error.',
     )
-    parser.add_argument('bag', metavar='BAG', type=Path)
+    parser.add_argument('a', metavar='A', type=Path, help='folder of rlml replay, TUM file or bag')
+    parser.add_argument('b', metavar='B', type=Path, nargs='?', help='the other one')
+    parser.add_argument('--out', type=Path, metavar='DIR', help='write a page and its figures')
+    parser.add_argument(
+        '--limit', action='append', default=[], metavar='NAME=VALUE',
+        help=f'how far a figure may differ, of {", ".join(FIGURES)}; repeat for more',
+    )  # fmt: skip
     parser.add_argument(
         '--ours', metavar='TOPIC', default='', help=f'default: {OURS[0]}, else {OURS[1]}'
     )
@@ -47,79 +46,72 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument('--map-frame', default='map', metavar='FRAME')
     parser.add_argument('--base-frame', default='base_link', metavar='FRAME')
-    parser.add_argument('--same-map', action='store_true', help='do not fit: both have one map')
-    parser.add_argument('--json', action='store_true', help='print one JSON object and no more')
+    frame = parser.add_mutually_exclusive_group()
+    frame.add_argument('--same-map', action='store_true', help='do not fit: both have one map; '
+                       'the default for two runs')  # fmt: skip
+    frame.add_argument('--fit', action='store_true', help='fit the path of B to that of A first; '
+                       'the default for all others')  # fmt: skip
+    parser.add_argument('--json', action='store_true', help='print comparison.json and no more')
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compare and print."""
-    with BagReader(args.bag) as bag:
-        ours = args.ours or next((t for t in OURS if t in bag.topics), OURS[0])
-        path = poses_of(bag, ours)
-        if args.other == TF:
-            other = poses_on_tf(bag, path, args.map_frame, args.base_frame)
-        else:
-            other = poses_of(bag, args.other)
-    errors = trajectory_errors(path, other, not args.same_map, MAX_GAP)
-    figures = {'ours': ours, 'other': args.other, **errors.summary()}
-    print(json.dumps(figures) if args.json else text_of(figures, args.same_map))
-    return 0
+    """Compare, write and print; 1 where something differs."""
+    a, b = sides(args)
+    of_runs = a.is_run and b.is_run
+    limits = limits_with(args.limit, none=not of_runs)
+    found = compare_runs(a, b, limits, args.fit or not (of_runs or args.same_map))
+    if args.out is not None:
+        write_comparison(found, args.out)
+    if args.json:
+        print(json.dumps(figures_of(found)))
+        return int(found.is_different)
+    print(text_of(found))
+    print()
+    print(aligned(table_of(found.rows)))
+    beyond = [r.title for r in found.rows if r.is_beyond]
+    print()
+    print(f'different: {"; ".join(beyond)}' if beyond else 'no difference beyond the limits')
+    if args.out is not None:
+        print(args.out / 'comparison.html')
+    return int(found.is_different)
 
 
-def text_of(f: dict[str, Any], same_map: bool) -> str:
-    """The figures for people."""
-    fitted = '' if same_map else ', after one path was fitted to the other'
-    lines = [
-        f'{f["ours"]} against {f["other"]}: {f["matched"]:.0f} poses compared, '
-        f'{f["unmatched"]:.0f} without the other{fitted}',
-        f'position  median {f["median_m"]:.3f} m, rms {f["rmse_m"]:.3f} m, max {f["max_m"]:.3f} m',
-    ]
-    if 'heading_rmse_deg' in f:
-        lines.append(f'heading   rms {f["heading_rmse_deg"]:.3f} degrees')
-    return '\n'.join(lines)
+def sides(args: argparse.Namespace) -> tuple[RunFolder, RunFolder]:
+    """A and B; one bag alone has both."""
+    if args.b is None:
+        if _kind(args.a) != 'bag':
+            raise ParameterError(f'compare: {args.a} is no bag: give two runs')
+        with BagReader(args.a) as bag:
+            ours = args.ours or next((t for t in OURS if t in bag.topics), OURS[0])
+            path = poses_of(bag, ours)
+            return _other(args, bag, path), RunFolder(ours, {LIVE: path})
+    kinds = _kind(args.a), _kind(args.b)
+    if kinds == ('bag', 'bag'):
+        raise ParameterError('compare: of two bags at least one has to be replayed first')
+    read = {k: _read(p) for k, p in zip('ab', (args.a, args.b), strict=True) if _kind(p) != 'bag'}
+    for side, path in (('a', args.a), ('b', args.b)):
+        if side not in read:
+            known = read['b' if side == 'a' else 'a'].paths
+            with BagReader(path) as bag:
+                read[side] = _other(args, bag, next(iter(known.values())))
+    return read['a'], read['b']
 
 
-def poses_of(bag: BagReader, topic: str) -> Trajectory:
-    """The poses of a topic; what cannot be believed is left out."""
-    if topic not in bag.topics:
-        raise BagError(f'{bag.path}: no topic {topic}; it has {", ".join(sorted(bag.topics))}')
-    found: dict[int, Array] = {}
-    for _, _, msg in bag.messages([topic]):
-        with contextlib.suppress(InputError, AttributeError):
-            pose = getattr(msg.pose, 'pose', msg.pose)
-            found[decode.stamp(msg, topic)] = decode.planar_pose(pose, topic)
-    if not found:
-        raise BagError(f'{bag.path}: {topic} has no pose')
-    return Trajectory(
-        np.array(sorted(found), np.int64), np.array([found[t] for t in sorted(found)])
-    )
+def _kind(path: Path) -> str:
+    if path.is_dir() and ((path / METRICS).exists() or not (path / 'metadata.yaml').exists()):
+        return 'run'
+    return 'tum' if path.suffix in ('.tum', '.txt') else 'bag'
 
 
-def poses_on_tf(bag: BagReader, path: Trajectory, map_frame: str, base_frame: str) -> Trajectory:
-    """Map to base at the stamps of a path, as a buffer of tf2 has it."""
-    n, tree = Node(), Extrinsics()
-    odom = TfOdometry(tree, n.odom_frame, base_frame, map_frame)
-    steps = (PoseHistory(WHOLE), PoseHistory(WHOLE))
-    for topic in ('/tf_static', TF):
-        for _, _, msg in bag.messages([topic]) if topic in bag.topics else ():
-            for t in msg.transforms:
-                with contextlib.suppress(InputError):
-                    if topic != TF:
-                        tree.add(decode.transforms(t))
-                    elif decode.frame(t.child_frame_id) == n.odom_frame:
-                        steps[0].add(_sample(t))
-                    else:
-                        for sample in odom.add(t):
-                            steps[1].add(sample)
-    found = [(s, *(h.at(int(s)) for h in steps)) for s in path.stamps]
-    known = [(s, se2.compose(a, b)) for s, a, b in found if a is not None and b is not None]
-    if not known:
-        raise BagError(
-            f'{bag.path}: {TF} has no {map_frame} to {n.odom_frame} to {base_frame} at the poses'
-        )
-    return Trajectory(np.array([s for s, _ in known], np.int64), np.array([T for _, T in known]))
+def _read(path: Path) -> RunFolder:
+    if _kind(path) == 'run':
+        return read_run(path)
+    return RunFolder(path.name, {LIVE: read_tum(path)})
 
 
-def _sample(transform: Any) -> Odometry:
-    (t,) = decode.transforms(transform, TF)
-    return Odometry(decode.stamp(transform, TF), np.array([*t.t[:2], decode.yaw(t.R, TF)]))
+def _other(args: argparse.Namespace, bag: BagReader, path: Trajectory) -> RunFolder:
+    """The other localization of a bag: on /tf at the stamps of a path, or a topic's own."""
+    name = f'{bag.path.name} {args.other}'
+    if args.other == TF:
+        return RunFolder(name, {LIVE: poses_on_tf(bag, path, args.map_frame, args.base_frame)})
+    return RunFolder(name, {LIVE: poses_of(bag, args.other)})

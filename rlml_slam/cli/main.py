@@ -102,7 +102,7 @@ COMMANDS: Table = {
         'rlml_slam.cli.layout.audit', 'a run against its planned layout: what is not as planned'
     ),
     'compare': Command(
-        'rlml_slam.cli.compare', 'from a bag of both, how far two localizations were apart'
+        'rlml_slam.cli.compare', 'two runs of one bag: what differs, and where they part'
     ),
     'closures': Command(
         'rlml_slam.cli.closures', 'loop closures of a replay or of a running back end; revoke one'

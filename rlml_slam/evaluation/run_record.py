@@ -85,7 +85,8 @@ class Run:
     (k,) has the cost per keyframe, ``reflector_states`` the state of each reflector. ``inputs``
     counts used, late and invalid messages by stream, ``topics`` has the topic of each.
     ``problem`` says in one line what ended the run early or what of it is missing, empty without
-    either. ``stored`` is the whole map. ``extra`` is added to metrics.json.
+    either. ``stored`` is the whole map. ``extra`` is added to metrics.json; ``about`` has version,
+    system and changed parameters.
     """
 
     name: str
@@ -106,6 +107,7 @@ class Run:
     closure_table: str = ''
     reflector_states: tuple[ReflectorState, ...] = ()
     topics: dict[str, str] = field(default_factory=dict)
+    about: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def duration_s(self) -> float:

@@ -34,8 +34,8 @@ PAGE, MCAP = 'report.html', 'run.mcap'
 LIBRARIES = ('numba', 'numpy', 'rosbags', 'scipy')  # whose versions may change a result
 # of write_outputs: what depends on the key alone
 SAME = (
-    'trajectory.tum', 'front_end.tum', 'map.rlml', 'map.pgm', 'map.yaml', 'reflectors.csv',
-    'reflector_states.csv', 'closures.csv',
+    'trajectory.tum', 'front_end.tum', 'health.csv', 'map.rlml', 'map.pgm', 'map.yaml',
+    'reflectors.csv', 'reflector_states.csv', 'closures.csv',
 )  # fmt: skip
 TRUTH_FIGURES = (
     'ate_rmse_m', 'live_ate_rmse_m', 'live_ate_max_m', 'live_heading_rmse_deg', 'nees_mean',

@@ -18,7 +18,7 @@ from rlml_slam.evaluation.run_record import FrameLog, Run, Truth
 from rlml_slam.maps.map_container import Content
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.maps.survey import Survey
-from rlml_slam.params import EkfParameters, Parameters
+from rlml_slam.params import EkfParameters, Parameters, changed
 from rlml_slam.recordings.bag_inputs import BagInputs
 from rlml_slam.recordings.estimate_bag import EstimateBag
 from rlml_slam.recordings.products import collect, fates, survey_figures
@@ -26,6 +26,7 @@ from rlml_slam.ros.bags.bag import BagReader, BagWriter
 from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.store import map_file
+from rlml_slam.version import __version__
 
 # name -> the type of its parameters and its constructor
 SYSTEMS: Mapping[str, tuple[type[Any], Callable[[Any], Slam | EkfSlam]]] = {
@@ -61,6 +62,7 @@ def replay(
     ``Run.problem`` says so. Raises BagError if there is nothing to use at all.
     """
     warm_up.compile_loaded()
+    about = {'version': __version__, 'system': system, 'parameters': changed(params)}
     with BagReader(path) as bag, ExitStack() as files:
         inputs = BagInputs(bag, patient(params))
         params = inputs.params
@@ -100,7 +102,7 @@ def replay(
         if recording is not None:
             recording.add(bag.end, frames, slam)
             recording.finish(slam, run_errors(result))
-    result.wall_s = wall
+    result.wall_s, result.about = wall, about
     ended = f'{problem}; the results hold what came before' if problem else ''
     result.problem = '; '.join(filter(None, (ended, result.problem)))
     return result

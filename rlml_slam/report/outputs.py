@@ -13,6 +13,7 @@ import numpy as np
 from rlml_slam.datasets.tum import Trajectory, write_tum
 from rlml_slam.errors import MapError
 from rlml_slam.evaluation.metrics import RunErrors, metrics, run_errors
+from rlml_slam.evaluation.run_folder import HEALTH, health_table
 from rlml_slam.evaluation.run_record import Run
 from rlml_slam.maps import map_container, reflector_file
 from rlml_slam.maps.atomic_file import write_atomically
@@ -27,7 +28,7 @@ SIGHTINGS = 'sightings.rlml'
 def write_outputs(run: Run, folder: str | Path, report: bool = True) -> dict[str, Any]:
     """Write all results and pictures of a run into a folder; the figures of metrics.json.
 
-    trajectory.tum, front_end.tum, map.rlml, map.pgm, map.yaml, reflectors.csv,
+    trajectory.tum, front_end.tum, health.csv, map.rlml, map.pgm, map.yaml, reflectors.csv,
     reflector_states.csv, sightings.rlml and closures.csv depend on the data alone: two replays
     give the same bytes. Without ``report`` there are no pictures and no report.html. Raises
     MapError if the folder cannot be written.
@@ -35,6 +36,7 @@ def write_outputs(run: Run, folder: str | Path, report: bool = True) -> dict[str
     folder = make_folder(folder)
     write_tum(folder / 'trajectory.tum', run.trajectory)
     write_tum(folder / 'front_end.tum', run.frames.trajectory())
+    write_atomically(folder / HEALTH, health_table(run.frames).encode())
     save(run.grid if run.grid is not None else unknown_grid(run.trajectory), folder / 'map')
     reflector_file.save(run.reflectors, folder / 'reflectors.csv')
     if run.stored is not None:

@@ -220,7 +220,7 @@ def health_picture(run: Run) -> bytes:
     heights = [0.35, 1.5, 1.2] if has_reflectors else [0.35, 1.5]
     figure = Figure(figsize=(9.0, 1.3 * sum(heights) + 0.6), layout='constrained')
     panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
-    _health_strip(panels[0], t, frames.levels)
+    health_strip(panels[0], t, frames.levels)
     dress(panels[1], '', 'position σ [cm]')
     covs = np.array(frames.covs)
     sigma = 100.0 * np.sqrt(np.maximum(np.linalg.eigvalsh(covs[:, :2, :2])[:, 1], 0.0))
@@ -238,7 +238,7 @@ def health_picture(run: Run) -> bytes:
     return png(figure)
 
 
-def _health_strip(axes: Any, t: Array, levels: Sequence[int]) -> None:
+def health_strip(axes: Any, t: Array, levels: Sequence[int]) -> None:
     """A bar over time in the colour of each level."""
     dress(axes)
     axes.grid(False)

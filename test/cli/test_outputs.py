@@ -22,7 +22,7 @@ from rlml_slam.report.report import bad_spells, report_html
 from rlml_slam.report.summary import summary_text
 
 PICTURES = ('map', 'errors', 'health', 'timing')
-DATA = ('trajectory.tum', 'front_end.tum', 'map.pgm', 'map.yaml', 'reflectors.csv')
+DATA = ('trajectory.tum', 'front_end.tum', 'health.csv', 'map.pgm', 'map.yaml', 'reflectors.csv')
 
 
 @pytest.fixture(scope='module')

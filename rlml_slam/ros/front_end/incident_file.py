@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from rlml_slam.params import Parameters, declarations
+from rlml_slam.params import Parameters, changed
 from rlml_slam.ros.bags.bag import BagWriter
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import bag_types, make_bag
@@ -20,13 +20,6 @@ from rlml_slam.ros.front_end.incident import PREFIX, Published, Received
 from rlml_slam.version import __version__
 
 STALE = 3600.0  # [s] after which what a killed process began is removed
-
-
-def changed(params: Parameters) -> dict[str, object]:
-    """The parameters that differ from their defaults."""
-    given = {d.name: getattr(getattr(params, d.group), d.field) for d in declarations(Parameters)}
-    defaults = {d.name: d.default for d in declarations(Parameters)}
-    return {name: value for name, value in given.items() if value != defaults[name]}
 
 
 def write(
