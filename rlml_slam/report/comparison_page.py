@@ -87,7 +87,7 @@ def mounting_text(c: RunComparison) -> list[str]:
         return []
     (x, y, yaw), (sx, sy, syaw) = m.shift, m.sigma
     return [
-        'B differs as if its sensors sat elsewhere (laser_pose or /tf_static): '
+        'B differs as if its sensors sat elsewhere (laser_pose or /tf_static), by at least about '
         f'x {1e2 * x:+.2f} ± {1e2 * sx:.2f} cm, y {1e2 * y:+.2f} ± {1e2 * sy:.2f} cm, '
         f'heading {math.degrees(yaw):+.2f} ± {math.degrees(syaw):.2f}°'
     ]

