@@ -15,8 +15,9 @@ from rlml_slam.errors import ParameterError
 from rlml_slam.evaluation.run_record import Truth
 from rlml_slam.maps import saved_map, survey
 from rlml_slam.maps.saved_map import SavedMap
-from rlml_slam.params import from_mapping, read_yaml
+from rlml_slam.params import Parameters, from_mapping, read_yaml
 from rlml_slam.recordings.bag_replay import SYSTEMS, Given, replay
+from rlml_slam.recordings.incident import recorded_parameters
 from rlml_slam.report.outputs import make_folder, write_outputs
 from rlml_slam.report.summary import print_summary
 from rlml_slam.slam.store import map_file
@@ -65,6 +66,9 @@ def run(args: argparse.Namespace) -> int:
     """Replay, write the results, and say what they are."""
     kind = SYSTEMS[args.system][0]
     params = from_mapping(read_yaml(args.config, kind), kind) if args.config else kind()
+    if not args.config and kind is Parameters:
+        # an incident says how it was recorded, and where the robot was
+        params = recorded_parameters(args.bag) or params
     if args.no_odometry:
         params = replace(params, node=replace(params.node, use_odom=False))
     make_folder(args.out)  # before the work, not after it

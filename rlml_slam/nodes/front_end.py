@@ -37,12 +37,13 @@ class FrontEndNode(ManagedNode):
 
     def build(self) -> None:
         """The estimator with its topics."""
-        self.black_box = BlackBox(self, self.params)
+        self.black_box = BlackBox(self, self.params, lambda: map_id(self.control.session.map))
         self.tap = self.black_box.tap
         self.answers = FramePublisher(self, self.params.node)
         began, has_back_end = self.answers.begin_session, self._has_back_end
         self.control = FrontEndControl(self, self.params, began, self.publish, has_back_end)
         self.sensors = Sensors(self, self.params, STREAMS, self.process, self.control.restart)
+        self.sensors.arrange = self.black_box.arrange
         self.health = HealthPublisher(self, self.sensors, self.figures, self.problems)
         if self._map is not None:
             self.control.command(self._map)

@@ -152,12 +152,3 @@ def declarations(of: type[Any]) -> Iterator[Declaration]:
                 f.default,
                 *(f.metadata[k] for k in ('unit', 'low', 'high', 'choices', 'meaning', 'live')),
             )
-
-
-def changed(params: Any) -> dict[str, Any]:
-    """The parameters of a set that differ from their defaults, by name."""
-    given = {
-        d.name: getattr(getattr(params, d.group), d.field) for d in declarations(type(params))
-    }
-    defaults = {d.name: d.default for d in declarations(type(params))}
-    return {name: value for name, value in given.items() if value != defaults[name]}

@@ -95,6 +95,7 @@ class Sensors:
         self._frames: defaultdict[str, set[str]] = defaultdict(set)  # of sensors, by stream
         self._topics: Counter[str] = Counter()  # by stream
         self._queues: list[tuple[str, Listener]] = []
+        self.arrange: Callable[[list[str]], None] = lambda topics: None  # of what was taken
         self._heard, self._began = time.monotonic(), 0.0  # the latter of being active
         self._told: set[str] = set()
         for stream in streams:
@@ -151,6 +152,7 @@ class Sensors:
         so that a scan that comes between the two takes is not found to be late.
         """
         queues = {k: first.get(k, []) + self._taken(k) for k in reversed(range(len(self._queues)))}
+        self.arrange([listener.topic_name for _, listener in self._queues])
         ordered = (queues[k] for k in range(len(self._queues)))
         count = sum(map(len, queues.values()))
         self._missing = [k for k in self._missing if not queues[k]]

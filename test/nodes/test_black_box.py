@@ -14,12 +14,15 @@ import numpy as np
 import pytest
 from live import ROOT, room
 from rclpy.qos import QoSProfile
+from rclpy.serialization import serialize_message
 from std_srvs.srv import Trigger
 
 from rlml_slam.cli.main import main
 from rlml_slam.nodes.front_end import FrontEndNode
 from rlml_slam.params import Parameters, from_mapping
+from rlml_slam.recordings.incident import recorded_parameters
 from rlml_slam.ros.bags.bag import BagReader
+from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.front_end import incident_file
 from rlml_slam.ros.front_end.black_box import Triggers
 from rlml_slam.ros.front_end.incident import Published, Received
@@ -91,6 +94,7 @@ def test_incident_on_request_holds_inputs_and_outputs_and_can_be_replayed(live, 
     with BagReader(path) as bag:
         counts = {t.name: t.count for t in bag.topics.values()}
         (about,) = [json.loads(m.data) for _, _, m in bag.messages(['/incident'])]
+    assert about['map_id'].startswith('none')
     assert about['parameters'] == {'incident.after': 0.3, 'laser_pose': [0.2, 0.0, 0.0]}
     sent = [stream for stream, _ in room(seconds=3.0)]
     for stream in ('scan', 'odom', 'reflectors'):
@@ -135,6 +139,46 @@ def test_steps_of_the_wall_clock_cost_and_reorder_nothing(live, monkeypatch):
     times = [r.time for r in node.black_box._received]
     assert len(times) == len(node.black_box._published) == 3
     assert times == sorted(times)
+
+
+def test_file_has_the_order_in_which_messages_are_used(live, node, tmp_path):
+    """After a pause of two seconds the queues are emptied one after the other."""
+    queued = [(stream, msg) for stream, msg in room(seconds=2.0) if stream != '/tf_static']
+    for wanted in ('reflectors', 'imu', 'odom', 'scan'):
+        for stream, msg in queued:
+            if stream.strip('/') == wanted:
+                node.black_box.tap(f'/{wanted}', type(msg), serialize_message(msg))
+    topics = [listener.topic_name for _, listener in node.sensors._queues]
+    node.black_box.arrange(topics)
+    received = list(node.black_box._received)
+    stamps = [decode.serialized_stamp(r.data) for r in received]
+    assert len(received) == len(queued)
+    assert stamps == sorted(stamps)
+    times = [r.time for r in received]
+    assert times == sorted(times)
+    path = tmp_path / 'incident.mcap'
+    incident_file.write(path, {}, [], received, [], Parameters())
+    with BagReader(path) as bag:
+        read = [decode.stamp(m, topic) for _, topic, m in bag.messages() if topic != '/incident']
+    assert read == stamps
+    node.black_box.tap('/odom', type(queued[0][1]), b'\x00\x01')  # too short for a stamp
+    node.black_box.tap('/odom', type(queued[0][1]), b'')
+    node.black_box.arrange(topics)
+    assert len(node.black_box._received) == len(queued) + 2
+
+
+def test_replay_begins_as_the_robot_was(tmp_path):
+    path = tmp_path / 'incident.mcap'
+    start = np.array([3.0, -1.0, 0.5])
+    published = [Published(70, 7, start, 0.04 * np.eye(3), Health())]
+    given = {'laser_pose': (0.2, 0.0, 0.0), 'map_frame': 'site', 'mode': 'localization'}
+    incident_file.write(path, {}, [], [], published, from_mapping(given, Parameters))
+    params = recorded_parameters(path)
+    assert params.node.laser_pose == (0.2, 0.0, 0.0)
+    assert params.node.mode == 'mapping'  # the map is given to the replay
+    assert np.allclose(params.node.map_start_pose, start)
+    assert np.allclose(params.node.map_start_sigma, 0.2)
+    assert recorded_parameters(ROOT / 'bags' / 'room') is None
 
 
 def test_folder_that_cannot_be_written_is_a_problem_and_no_more(live, node, tmp_path):

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import struct
 import time
 from functools import partial
 from typing import Any
@@ -103,7 +102,7 @@ class Recorder(Node):
     def on_sensor(self, data: bytes) -> None:
         """One serialized message that begins with a header: note when it came."""
         self.sensed += 1
-        self._sensor_heard[stamp_of(data)] = time.monotonic()
+        self._sensor_heard[decode.serialized_stamp(data)] = time.monotonic()
 
     def on_pose(self, msg: PoseWithCovarianceStamped) -> None:
         """The front end's answer to a scan."""
@@ -191,7 +190,7 @@ class Recorder(Node):
             return True
         newest = max(self._sensor_heard, default=0)
         path = self.map.newest.get('trajectory')
-        mapped = stamp_of(path) if path is not None else 0
+        mapped = decode.serialized_stamp(path) if path is not None else 0
         answered = self.frames.stamps[-1] if self.frames.stamps else 0
         reported = max(self._healths, default=0)
         return self.sensed >= self.sent() and min(mapped, reported) >= answered >= newest
@@ -269,11 +268,3 @@ class Recorder(Node):
                 fate = out.setdefault(stream, {'used': 0, 'late': 0, 'invalid': 0})
                 fate[what] = int(value)
         return out
-
-
-def stamp_of(data: bytes) -> int:
-    """Stamp [ns] of a serialized message that begins with a header."""
-    # CDR: four bytes of encapsulation, then the header's stamp (int32 sec, uint32 nanosec)
-    order = '<' if data[1] & 1 else '>'
-    sec, nanosec = struct.unpack_from(f'{order}iI', data, 4)
-    return int(sec) * 1_000_000_000 + int(nanosec)

@@ -9,6 +9,7 @@ can be checked only in context (order of stamps, known frames) is left to the se
 from __future__ import annotations
 
 import math
+import struct
 from dataclasses import dataclass
 from typing import Any
 
@@ -306,3 +307,11 @@ def occupancy_grid(msg: Any, topic: str) -> OccupancyGrid | None:
         raise InputError(f'{topic}: {len(cells)} cells do not fill {rows} x {columns} of a map')
     # the message has 32 bits for it, of 0.05 m as well
     return OccupancyGrid(round(resolution, 7), (x, y), cells.reshape(rows, columns), turn)
+
+
+def serialized_stamp(data: bytes, skipped: int = 0) -> int:
+    """Stamp [ns] of a serialized message that begins with a header, after ``skipped`` bytes."""
+    # CDR: four bytes of encapsulation, then the header's stamp (int32 sec, uint32 nanosec)
+    order = '<' if data[1] & 1 else '>'
+    sec, nanosec = struct.unpack_from(f'{order}iI', data, 4 + skipped)
+    return int(sec) * 1_000_000_000 + int(nanosec)

@@ -3,8 +3,12 @@
 
 from __future__ import annotations
 
+import heapq
+import struct
 import time
-from collections import deque
+from collections import defaultdict, deque
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +17,7 @@ from std_srvs.srv import Trigger
 from rlml_slam.errors import BagError
 from rlml_slam.params import Parameters
 from rlml_slam.ros.back_end.worker import Worker
+from rlml_slam.ros.codecs.decode import serialized_stamp
 from rlml_slam.ros.front_end.incident import Published, Received, free_name
 from rlml_slam.ros.message_guard import guard_of
 from rlml_slam.types import Frame, Level
@@ -57,7 +62,10 @@ class BlackBox:
     file: no pose waits for it.
     """
 
-    def __init__(self, node: Any, params: Parameters) -> None:
+    def __init__(
+        self, node: Any, params: Parameters, map_id: Callable[[], str] = lambda: ''
+    ) -> None:
+        self._map_id = map_id
         self._p, self._logger = params, node.get_logger()
         self._i = params.incident
         self._folder = Path(params.node.map_directory) / FOLDER
@@ -65,6 +73,7 @@ class BlackBox:
         self._static: deque[Received] = deque(maxlen=MAX_STATIC)
         self._published: deque[Published] = deque()
         self._bytes = 0
+        self._fresh = 0  # of the newest received, whose order is not known yet
         self._began = time.time_ns() - time.monotonic_ns()  # later steps of the clock: no matter
         self._triggers = Triggers(self._i.degraded_time)
         self._last = float('-inf')  # [s] of the newest incident
@@ -87,10 +96,30 @@ class BlackBox:
             self._static.append(received)
             return
         self._received.append(received)
+        self._fresh += 1
         self._bytes += len(data)
         most, old = self._i.max_memory * MB, self._old()
         while self._received and (self._bytes > most or self._received[0].time < old):
             self._bytes -= len(self._received.popleft().data)
+
+    def arrange(self, topics: Sequence[str]) -> None:
+        """What was received since the last call, in the order in which it is used.
+
+        The queues of ``topics`` are emptied one after the other, and after a pause each holds
+        seconds; what was in them is used by stamp, and of equal ones by the order of ``topics``.
+        """
+        count, self._fresh = min(self._fresh, len(self._received)), 0
+        if count < 2:
+            return
+        newest = [self._received.pop() for _ in range(count)][::-1]
+        queues: defaultdict[str, list[tuple[int, Received]]] = defaultdict(list)
+        for r in newest:
+            queues[r.topic].append((_stamp(r), r))
+        known = {topic: k for k, topic in enumerate(topics)}
+        ordered = sorted(queues, key=lambda topic: known.get(topic, len(known)))
+        merged = heapq.merge(*(queues[topic] for topic in ordered), key=lambda item: item[0])
+        for came, (_, r) in zip(newest, merged, strict=True):
+            self._received.append(replace(r, time=came.time))
 
     def _now(self) -> int:
         return self._began + time.monotonic_ns()
@@ -137,7 +166,8 @@ class BlackBox:
         (_, path, reasons), self._pending = self._pending, None
         n = self._p.node
         about: dict[str, object] = {
-            'reasons': reasons, 'mode': n.mode, 'map': n.map_file_name, 'written': path.name,
+            'reasons': reasons, 'mode': n.mode, 'map': n.map_file_name, 'map_id': self._map_id(),
+            'written': path.name,
         }  # fmt: skip
         parts = list(self._static), list(self._received), list(self._published), self._p
         self._worker.submit(lambda: self._save(path, about, *parts))
@@ -165,3 +195,11 @@ class BlackBox:
             self.write_if_due()
         self._worker.submit(lambda: None).result()
         self._worker.close()
+
+
+def _stamp(r: Received) -> int:
+    """Stamp [ns] of a message with a header, of /tf that of its first transform; else 0."""
+    try:
+        return serialized_stamp(r.data, 4 if r.kind.endswith('TFMessage') else 0)
+    except (struct.error, IndexError):
+        return 0
