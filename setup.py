@@ -94,7 +94,15 @@ setup(
     extras_require={
         # a machine without ROS 2 gets it from wheels
         'ros': ['ros-jazzy-common-interfaces', 'ros-jazzy-rclpy[fastrtps]'],
-        'dev': ['hypothesis', 'mypy', 'pytest', 'pytest-xdist', 'ruff'],
+        'dev': [
+            'hypothesis',
+            'mcap',
+            'mcap-ros2-support',
+            'mypy',
+            'pytest',
+            'pytest-xdist',
+            'ruff',
+        ],
         # many recordings at once
         'fleet': ['dask', 'distributed', 'fsspec', 'pyarrow'],
         'bench': ['evo', 'g2o-python', 'g2opy', 'gtsam', 'pyceres', 'yag-slam'],

@@ -21,10 +21,11 @@ from rlml_slam.ros.codecs.message_types import bag_types
 from rlml_slam.ros.codecs.message_types import make_bag as make
 from rlml_slam.ros.codecs.reflector_clouds import build_associated, build_reflector_map
 from rlml_slam.slam.offline.slam import Slam
-from rlml_slam.types import Frame, Health, Level
+from rlml_slam.slam.relocalization.scan_relocalization import Relocation
+from rlml_slam.types import Frame, Health, Level, Verdict
 
 MARKERS, CLOUD = 'visualization_msgs/msg/MarkerArray', 'sensor_msgs/msg/PointCloud2'
-FLOAT = 'std_msgs/msg/Float64'
+FLOAT, PLACES = 'std_msgs/msg/Float64', 'geometry_msgs/msg/PoseArray'
 LATCHED = {
     '/map': 'nav_msgs/msg/OccupancyGrid',
     '/reflector_map': MARKERS,
@@ -39,6 +40,8 @@ TOPICS = {
     '/reflectors/statuses': MARKERS,
     '/reflectors/associated': CLOUD,
     '/front_end/health': 'diagnostic_msgs/msg/DiagnosticStatus',
+    '/search/places': PLACES,
+    '/search/verdict': 'diagnostic_msgs/msg/DiagnosticStatus',
     '/rosout': 'rcl_interfaces/msg/Log',
 }
 FIRST, GROWTH = 16, 1.25  # frames before a picture of the map: all cost 5 times the last one
@@ -59,7 +62,7 @@ class EstimateBag:
             self._writer.add_topic(topic, kind, latched=topic in LATCHED)
         self._times: list[int] = []  # of the frames
         self._drawn_at = float(FIRST)
-        self._updates, self._logs = 0, 0
+        self._updates, self._logs, self._searches = 0, 0, 0
         self._health = Health()
         self._placed: set[str] = set()
         self._last: tuple[int, Frame] | None = None
@@ -204,7 +207,30 @@ class EstimateBag:
                         self._log(time, stamp, LOG_LEVEL[Level.OK], text)
         for log in slam.logs[self._logs :]:
             self._log(time, stamp, 20 + 10 * int(log.severity), log.text)
+        for found in slam.searched[self._searches :]:
+            self._add_search(time, stamp, found)
         self._updates, self._logs = len(slam.updates), len(slam.logs)
+        self._searches = len(slam.searched)
+
+    def _add_search(self, time: int, stamp: int, found: Relocation) -> None:
+        """The verdict of a search, and the places that fit: the best one first."""
+        places = [*found.rivals] if found.pose is None else [found.pose, *found.rivals]
+        shown = make(
+            PLACES, header=encode.header(make, stamp, self._n.map_frame),
+            poses=[encode.pose(make, T) for T in places],
+        )  # fmt: skip
+        self._writer.write('/search/places', shown, time)
+        is_unique = found.verdict is Verdict.UNIQUE
+        health = Health(Level.OK if is_unique else Level.DEGRADED, (found.why,))
+        values = {
+            'verdict': found.verdict.value, 'score': f'{found.score:.3f}',
+            'second': f'{found.second:.3f}', 'places': len(places),
+        }  # fmt: skip
+        status = encode.diagnostic_status(make, 'search', health, values)
+        status.level = int(health.level)  # a byte is a number in bags
+        self._writer.write('/search/verdict', status, time)
+        text = f'search: {found.verdict.value}: {found.why}'
+        self._log(time, stamp, LOG_LEVEL[health.level], text)
 
     def _draw(self, slam: Slam | EkfSlam) -> None:
         """The map as it is now."""

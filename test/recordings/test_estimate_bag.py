@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,11 @@ from rlml_slam import se2
 from rlml_slam.cli.main import main
 from rlml_slam.datasets.tum import read_tum
 from rlml_slam.params import Parameters
-from rlml_slam.recordings.bag_replay import replay
+from rlml_slam.recordings.bag_replay import Given, replay
 from rlml_slam.ros.bags.bag import BagReader, BagWriter
 from rlml_slam.ros.codecs import decode, encode
 from rlml_slam.ros.codecs.message_types import make_bag
+from rlml_slam.slam.store import map_file
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOM = ROOT / 'bags' / 'room'
@@ -214,3 +216,22 @@ def test_recording_changes_no_figure_of_a_damaged_bag(damaged, tmp_path):
         assert not bag.skipped
     assert len(poses) == len(plain.frames.stamps)
     assert sorted(p.name for p in tmp_path.iterdir()) == ['damaged', 'run.mcap']
+
+
+def test_searches_have_their_verdicts_and_places(tmp_path):
+    """A robot that starts elsewhere than assumed finds itself in the map of another run."""
+    run = replay(ROOM, Parameters())
+    known = map_file.saved_map(run.stored)
+    node = replace(Parameters().node, map_start_pose=(4.0, 3.0, 1.0))
+    params = replace(Parameters(), node=node)
+    replay(ROOM, params, given=Given(known), mcap=tmp_path / 'run.mcap')
+    with BagReader(tmp_path / 'run.mcap') as bag:
+        verdicts = [m for _, _, m in bag.messages(['/search/verdict'])]
+        places = [m for _, _, m in bag.messages(['/search/places'])]
+        said = [m.msg for _, _, m in bag.messages(['/rosout']) if m.msg.startswith('search: ')]
+    assert len(verdicts) == len(places) == len(said) > 0
+    shown = {v.key: v.value for v in verdicts[-1].values}
+    assert shown['verdict'] == 'unique'
+    assert int(shown['places']) == len(places[-1].poses) > 0
+    best = decode.planar_pose(places[-1].poses[0], '/search/places')
+    assert np.abs(best - run.frames.poses[0])[:2].max() < 0.5

@@ -49,6 +49,7 @@ class Slam(SynchronizedSystem):
             self.batch_reassociation.close()
         self.updates: list[Update] = []
         self.answers: dict[int, say.Answer] = {}
+        self.searched: list[Relocation] = []
         self.logs: list[say.Log] = []
         self._params, self._survey = params, survey
         self._path: list[tuple[int, Array]] = []
@@ -168,6 +169,7 @@ class Slam(SynchronizedSystem):
 
     def _search(self, command: say.Search) -> None:
         found = locate(command, self._params)
+        self.searched.append(found)
         if self._delay == 0:
             self.execute(self.system.on_search_result(command.number, found))
             return

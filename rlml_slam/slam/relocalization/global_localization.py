@@ -44,6 +44,19 @@ def localize_globally(
     if seen is None or not p.node.use_reflectors:
         return relocalize(grid, points, p, complete)
     stars = locate(seen.points, seen.cov, reflectors.points, reflectors.cov, p.relocalization)
+    places = [c.pose for c in (*stars.candidates, *stars.rivals)]
+    found = _by_both(stars, grid, points, p, complete)
+    return replace(found, rivals=np.array(places).reshape(-1, 3))
+
+
+def _by_both(
+    stars: Constellation,
+    grid: OccupancyGrid | None,
+    points: Array | None,
+    p: Parameters,
+    complete: bool,
+) -> Relocation:
+    """The verdict by what the reflectors say, and by the scan."""
     if stars.verdict is Verdict.UNIQUE:
         (best,) = stars.candidates
         scores = _scores(grid, points, stars, p)

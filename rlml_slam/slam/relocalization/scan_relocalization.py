@@ -7,7 +7,7 @@ the scan observes every direction.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -40,7 +40,8 @@ class Relocation:
     """Verdict with its reason; ``pose`` (3,) and ``cov`` (3, 3) of the best match, map frame.
 
     ``score`` and ``second`` are the mean hit probabilities of the best and the next best pose, 0
-    if there is none. ``pose`` is None if no pose fits.
+    if there is none. ``pose`` is None if no pose fits. ``rivals`` (k, 3) are all poses where
+    reflectors fit, the best first.
     """
 
     verdict: Verdict
@@ -49,6 +50,7 @@ class Relocation:
     cov: Array | None = None
     score: float = 0.0
     second: float = 0.0
+    rivals: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 def relocalize(
