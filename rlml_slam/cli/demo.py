@@ -37,6 +37,10 @@ def add_parser(subparsers: Any) -> None:
         '--rate', type=float, default=RATE, metavar='X',
         help='simulated seconds per second (default: %(default)s)',
     )  # fmt: skip
+    parser.add_argument(
+        '--mcap', metavar='FILE', type=Path,
+        help='inputs and all that the nodes publish as one file for Foxglove, RViz and others',
+    )  # fmt: skip
     parser.add_argument('--json', action='store_true', help='print metrics.json and no more')
 
 
@@ -70,6 +74,7 @@ def source(args: argparse.Namespace, world: World) -> Source:
         # where there is no tf2_msgs, /tf_static has no laser pose
         {'laser_pose': list(Simulator().laser_pose), 'map_update_interval': 1.0},
         keeps_map=True,
+        mcap=args.mcap,
     )  # fmt: skip
 
 

@@ -28,6 +28,10 @@ def add_parser(subparsers: Any) -> None:
         '--rate', type=float, default=1.0, metavar='X',
         help='seconds of the recording per second (default: %(default)s)',
     )  # fmt: skip
+    parser.add_argument(
+        '--mcap', metavar='FILE', type=Path,
+        help='inputs and all that the nodes publish as one file for Foxglove, RViz and others',
+    )  # fmt: skip
     parser.add_argument('--json', action='store_true', help='print metrics.json and no more')
 
 
@@ -76,6 +80,8 @@ def source(
         keeps_map=not (
             params.back_end.survey or params.node.continue_map or params.node.mode != 'mapping'
         ),
+        mcap=args.mcap,
+        inputs={t: bag.topics[t].msgtype for t in inputs.shown()},
     )  # fmt: skip
 
 

@@ -19,6 +19,7 @@ from rlml_slam.cli.demo import route_length
 from rlml_slam.cli.main import main
 from rlml_slam.cli.support.live_session import node
 from rlml_slam.datasets.tum import read_tum
+from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.slam.store import map_file
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -77,7 +78,9 @@ def test_demo_drives_maps_and_reports(world, tmp_path):
 def test_bag_over_dds_ends_where_its_replay_does(tmp_path, capsys):
     """At twice the recording's pace, to be quick; every message of a small bag gets through."""
     bag, live, replayed = str(ROOT / 'bags' / 'room'), tmp_path / 'live', tmp_path / 'replayed'
-    assert main(['live', bag, '--out', str(live), '--rate', '2', '--json']) == 0
+    mcap = tmp_path / 'live.mcap'
+    args = ['live', bag, '--out', str(live), '--rate', '2', '--mcap', str(mcap), '--json']
+    assert main(args) == 0
     f = json.loads(capsys.readouterr().out)
     assert main(['replay', bag, '--out', str(replayed), '--json']) == 0
     capsys.readouterr()
@@ -85,6 +88,14 @@ def test_bag_over_dds_ends_where_its_replay_does(tmp_path, capsys):
     paths = [str(folder / 'trajectory.tum') for folder in (live, replayed)]
     assert main(['evaluate', 'ate', *paths, '--json']) == 0
     assert json.loads(capsys.readouterr().out)['last_m'] < 0.02
+    with BagReader(mcap) as heard, BagReader(bag) as source:
+        counts = {t.name: t.count for t in heard.topics.values()}
+        assert counts['/scan'] == source.topics['/scan'].count
+        assert list(heard.serialized(['/scan'])) != []
+        assert sum(1 for _ in heard.messages()) == heard.count()  # each can be read
+        assert not heard.skipped
+    assert counts['/pose'] == f['scans']
+    assert min(counts[t] for t in ('/map', '/graph', '/front_end/health', '/odom')) > 0
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])

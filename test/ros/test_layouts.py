@@ -82,6 +82,16 @@ def test_foxglove_shows_topics_of_the_nodes(topic):
     assert topic in TYPES
 
 
+def test_foxglove_shows_what_files_of_live_drives_have():
+    pytest.importorskip('rclpy', reason='needs ROS 2 or its wheels')
+    from rlml_slam.cli.support.live_bag import OTHERS, published
+
+    sensors = {
+        name for name, t in zip(NAMES.values(), TOPICS, strict=True) if t.direction == 'sub'
+    }
+    assert set(foxglove_topics()) <= {*published(), *OTHERS, *sensors}
+
+
 def test_foxglove_calls_services_of_the_nodes():
     known = {'/' + s.name.replace('~', s.node) for s in SERVICES}
     asked = [p['serviceName'] for p in FOXGLOVE['configById'].values() if 'serviceName' in p]

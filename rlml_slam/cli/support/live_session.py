@@ -8,7 +8,7 @@ import signal
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from rlml_slam import warm_up
 from rlml_slam.cli.support import live_map
+from rlml_slam.cli.support.live_bag import LiveBag
 from rlml_slam.cli.support.processes import Processes, free_domain
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.cli.support.recorder import Recorder
@@ -27,6 +28,7 @@ from rlml_slam.cli.support.usage import Usage, summary
 from rlml_slam.errors import RlmlError
 from rlml_slam.evaluation.metrics import distribution
 from rlml_slam.evaluation.run_record import Run
+from rlml_slam.ros.bags.bag import BagWriter
 from rlml_slam.version import __version__
 
 START_TIMEOUT = 90.0  # [s] for three processes to start and to find each other
@@ -42,6 +44,8 @@ class Source:
     ``system`` are parameters of front end and back end, ``config`` their parameter file.
     ``sensor`` is the (topic, type) whose every message asks for a pose. ``progress`` shows the
     share of the drive that is done. ``keeps_map``: the run gets the whole map at its end.
+    ``mcap`` is a file for all that was heard, ``inputs`` the types of the topics that it needs
+    besides those of our nodes.
     """
 
     title: str
@@ -52,6 +56,8 @@ class Source:
     config: Path | None = None
     sensor: tuple[str, str] = ('scan', 'sensor_msgs/msg/LaserScan')
     keeps_map: bool = False
+    mcap: Path | None = None
+    inputs: Mapping[str, str] = field(default_factory=dict)
 
 
 def drive(source: Source, out: Path, quiet: bool) -> Run:
@@ -66,9 +72,13 @@ def drive(source: Source, out: Path, quiet: bool) -> Run:
         own_domain(domain, environment),
         held_interrupts() as check,
         tempfile.TemporaryDirectory(prefix='rlml_map_') as maps,
+        ExitStack() as files,
         Processes(out / 'log', environment) as processes,
     ):
         recorder = Recorder(source.sensor)
+        if source.mcap is not None:
+            writer = files.enter_context(BagWriter(source.mcap))
+            recorder.bag = LiveBag(writer, source.inputs, source.sensor[0])
         executor = SingleThreadedExecutor()
         executor.add_node(recorder)
         try:

@@ -16,6 +16,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
 from rlml_slam.cli.support.heard_map import KINDS, HeardMap
+from rlml_slam.cli.support.live_bag import LiveBag
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.evaluation.run_record import FrameLog, Run, Truth
 from rlml_slam.params import Parameters
@@ -49,6 +50,7 @@ class Recorder(Node):
     def __init__(self, sensor: tuple[str, str] = SCAN, **options: Any) -> None:
         super().__init__('recorder', **options)
         self._sensor = sensor
+        self.bag: LiveBag | None = None
         self.frames = FrameLog()
         self.true: dict[int, Array] = {}
         self.latency_ms: list[float] = []
@@ -92,6 +94,8 @@ class Recorder(Node):
             self._settled = now + SETTLE
         if now < self._settled:
             return False
+        if self.bag is not None:
+            self.bag.listen(self)
         # bytes: the stamp is all that is wanted of a scan
         topic, kind = self._sensor
         self._listener = self.create_subscription(
@@ -102,6 +106,8 @@ class Recorder(Node):
     def on_sensor(self, data: bytes) -> None:
         """One serialized message that begins with a header: note when it came."""
         self.sensed += 1
+        if self.bag is not None:
+            self.bag.take(data)
         self._sensor_heard[decode.serialized_stamp(data)] = time.monotonic()
 
     def on_pose(self, msg: PoseWithCovarianceStamped) -> None:
