@@ -72,7 +72,16 @@ setup(
     license=ABOUT.findtext('license'),
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed', 'kernels/table.c', 'simulation/worlds/*.yaml']},
+    package_data={
+        NAME: [
+            'py.typed',
+            'kernels/table.c',
+            'simulation/worlds/*.yaml',
+            'report/page.css',
+            'report/viewer/viewer.css',
+            'report/viewer/viewer.js',
+        ]
+    },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
@@ -81,6 +90,7 @@ setup(
     ],
     install_requires=[
         'argcomplete',
+        'bokeh',
         'matplotlib',
         'numba',
         'numpy',
@@ -90,6 +100,7 @@ setup(
         'rosbags',
         'scipy',
         'setuptools',
+        'tornado',
     ],
     extras_require={
         # a machine without ROS 2 gets it from wheels

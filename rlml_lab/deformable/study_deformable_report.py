@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import json
 from collections.abc import Mapping
@@ -21,6 +20,7 @@ from rlml_lab.deformable.ekf import Estimate
 from rlml_lab.deformable.experiment import FEATURES, ROWS, Row
 from rlml_lab.deformable.monte_carlo import ESTIMATORS, RowResult, Runs, run_estimators
 from rlml_lab.deformable.study_deformable_tables import tables
+from rlml_lab.support import page
 from rlml_slam.errors import RlmlError
 from rlml_slam.se2 import Array
 
@@ -55,42 +55,19 @@ def write_report(
     for name, title, figure in figures:
         png = directory / f'{name}.png'
         figure.savefig(png, dpi=110, bbox_inches='tight', metadata={'Software': None})
-        data = base64.b64encode(png.read_bytes()).decode('ascii')
-        parts.append(f'<h2>{html.escape(title)}</h2><img alt="{html.escape(title)}" '
-                     f'src="data:image/png;base64,{data}">')  # fmt: skip
-    page = _PAGE.format(seeds=summary['seeds'], wall=summary['wall_s'], body='\n'.join(parts))
-    (directory / 'report.html').write_text(page, encoding='utf-8')
-
-
-_PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>Deformable-feature SLAM</title>
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<style>
-body {{ font: 15px/1.45 system-ui, sans-serif; max-width: 1200px; margin: 2em auto; padding: 0 1em;
-  color: #222; background: #fff; }}
-table {{ border-collapse: collapse; margin: 0 0 1.5em; font-variant-numeric: tabular-nums; }}
-th, td {{ padding: .25em .7em; border-bottom: 1px solid #ddd; text-align: right; }}
-th:first-child, td:first-child {{ text-align: left; }}
-td.no {{ color: #b00020; font-weight: 600; }}
-img {{ max-width: 100%; }} h2 {{ margin-top: 1.6em; font-size: 1.15em; }}
-div.wide {{ overflow-x: auto; }}
-</style></head><body>
-<h1>Deformable-feature SLAM: EKF against NLS</h1>
-<p>{seeds} seeds per row, the same seeds in every row; {wall} s. A robot accompanies three features
-that move and deform over 20 poses. Both estimators are given the same measurements: odometry,
-sightings, construction edges and the nominal motion of the features.</p>
-{body}
-</body></html>
-"""
+        parts += [page.heading(title), page.picture(png.read_bytes(), title)]
+    lead = (
+        f'{summary["seeds"]} seeds per row, the same seeds in every row; {summary["wall_s"]} s. A '
+        'robot accompanies three features that move and deform over 20 poses. Both estimators are '
+        'given the same measurements: odometry, sightings, construction edges and the nominal '
+        'motion of the features.'
+    )
+    text = page.page('Deformable-feature SLAM: EKF against NLS', lead, parts)
+    (directory / 'report.html').write_text(text, encoding='utf-8')
 
 
 def _table(title: str, header: list[str], lines: list[list[str]]) -> str:
-    head = ''.join(f'<th>{html.escape(h)}</th>' for h in header)
-    body = ''.join(
-        '<tr>' + ''.join(f'<td>{html.escape(c)}</td>' for c in line) + '</tr>' for line in lines
-    )
-    return (f'<h2>{html.escape(title)}</h2><div class="wide"><table><thead><tr>{head}</tr></thead>'
-            f'<tbody>{body}</tbody></table></div>')  # fmt: skip
+    return page.heading(title) + page.table(header, lines)
 
 
 def _claims(claims: list[dict[str, Any]]) -> str:

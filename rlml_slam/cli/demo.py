@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rlml_slam.cli.support.live_session import LISTENERS, Source, drive
+from rlml_slam.evaluation.run_record import Origin
 from rlml_slam.params import Simulator
 from rlml_slam.report.outputs import make_folder, write_outputs
 from rlml_slam.report.summary import print_summary
@@ -56,7 +57,9 @@ def run(args: argparse.Namespace) -> int:
             f'at {args.rate:g} × real time',
             flush=True,
         )
-    result = drive(source(args, world), out, args.json)
+    played = source(args, world)
+    result = drive(played, out, args.json)
+    result.origin = Origin(args.command_line, played.system)
     return print_summary(result, write_outputs(result, out), out, args.json)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -141,6 +142,7 @@ def main(
         args = parser.parse_args(arguments)
         if module is None:
             parser.error('a command is missing')
+        args.command_line = shlex.join([prog, *arguments])
         code = int(module.run(args))
         sys.stdout.flush()
         return code

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.datasets.tum import Trajectory
+from rlml_slam.evaluation.scan_log import ScanLog
 from rlml_slam.maps.map_container import Content
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.planning.audit.sightings import SightingLog
@@ -37,7 +38,7 @@ class Truth:
 
 @dataclass
 class FrameLog:
-    """The frames of the front end, one entry each, without the measurements themselves."""
+    """The frames of the front end, one entry each; of the scans, a thinned selection."""
 
     stamps: list[int] = field(default_factory=list)
     poses: list[Array] = field(default_factory=list)
@@ -48,6 +49,7 @@ class FrameLog:
     seen: list[int] = field(default_factory=list)
     used: list[int] = field(default_factory=list)
     sightings: SightingLog = field(default_factory=SightingLog)
+    scans: ScanLog = field(default_factory=ScanLog)
 
     def add(self, frames: Iterable[Frame]) -> None:
         """Note the poses as published live, their health and their cost."""
@@ -55,6 +57,8 @@ class FrameLog:
             self.add_pose(f.stamp, f.T_map_base, f.cov_map, f.health)
             self.wall_ms.append(f.wall_ms)
             self.sightings.add(f)
+            if f.observation.points is not None:
+                self.scans.add(f.stamp, f.observation.points)
             self.seen.append(len(f.statuses))
             used = f.statuses == Status.USED
             self.used.append(int(used.sum()) if len(used) else 0)
@@ -75,6 +79,18 @@ class FrameLog:
         )
 
 
+@dataclass(frozen=True)
+class Origin:
+    """What a run was made by: the command line, and by name the parameters that it changed.
+
+    ``source`` says what it was made from, such as the SHA-256 of a bag; empty if unknown.
+    """
+
+    command: str = ''
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    source: str = ''
+
+
 @dataclass
 class Run:
     """Inputs, estimates, products and cost of one run.
@@ -86,7 +102,7 @@ class Run:
     counts used, late and invalid messages by stream, ``topics`` has the topic of each.
     ``problem`` says in one line what ended the run early or what of it is missing, empty without
     either. ``stored`` is the whole map. ``extra`` is added to metrics.json; ``about`` has version,
-    system and changed parameters.
+    system and changed parameters. ``origin`` is for its report.
     """
 
     name: str
@@ -108,6 +124,7 @@ class Run:
     reflector_states: tuple[ReflectorState, ...] = ()
     topics: dict[str, str] = field(default_factory=dict)
     about: Mapping[str, Any] = field(default_factory=dict)
+    origin: Origin = field(default_factory=Origin)
 
     @property
     def duration_s(self) -> float:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import posixpath
 import re
 from collections.abc import Sequence
@@ -17,7 +16,6 @@ from rlml_slam.errors import BagError
 
 METADATA = 'metadata.yaml'
 FILES = ('.bag', '.mcap')  # bags of one file
-CHUNK = 1 << 22  # [bytes] that are read at once
 
 
 @dataclass(frozen=True)
@@ -102,15 +100,3 @@ def local_copy(url: str, into: Path) -> Path:
         here.parent.mkdir(parents=True, exist_ok=True)
         fs.get_file(file, str(here))
     return target
-
-
-def digest_of(path: Path) -> str:
-    """SHA-256 of the names and bytes of a file, or of all files of a folder."""
-    seen = hashlib.sha256()
-    for file in sorted(path.rglob('*')) if path.is_dir() else [path]:
-        if file.is_file():
-            seen.update(f'{file.relative_to(path).as_posix()}\0{file.stat().st_size}\0'.encode())
-            with file.open('rb') as f:
-                while chunk := f.read(CHUNK):
-                    seen.update(chunk)
-    return seen.hexdigest()

@@ -12,7 +12,7 @@ import numpy as np
 
 from rlml_slam.fleet.comparison import LIMITS, Effect, Limit, Verdict, effect_rows
 from rlml_slam.fleet.results import Record
-from rlml_slam.report.report import page, section
+from rlml_slam.report.page import heading, html_table, page, section
 
 COLUMNS = (
     'status', 'duration_s', 'frames', 'lost_s', 'degraded_s', 'closures', 'reflectors',
@@ -22,7 +22,7 @@ COLUMNS = (
 WORST = 10  # runs that are listed by name for each figure
 BINS, WIDTH, HEIGHT = 24, 300, 70  # of a histogram, in pixels
 _SCRIPT = """<style>table.runs th{cursor:pointer;width:auto;padding-right:12px}
-tr.worse td{background:#fdecea} .scroll{overflow-x:auto}</style><script>
+tr.worse td{background:var(--problem)} figure rect{fill:var(--accent)}</style><script>
 for (const th of document.querySelectorAll('table.runs th')) th.onclick = () => {
   const body = th.closest('table').tBodies[0], k = th.cellIndex, up = th.up = !th.up;
   const value = r => r.cells[k].dataset.v ?? r.cells[k].textContent;
@@ -43,8 +43,7 @@ def fleet_page(
     worse = {v.name: v.worse for v in verdicts if v.worse}
     hours = sum(r.row.get('duration_s', 0.0) for r in records) / 3600.0
     parts = [
-        '<h1>Fleet</h1>',
-        f'<p class="sub">{len(records)} bags, {hours:.1f} h; {ok} without a problem</p>',
+        heading('Fleet', f'{len(records)} bags, {hours:.1f} h; {ok} without a problem'),
     ]
     if verdicts:
         parts += [_verdict(verdicts, worse, records), _effects(found), _limits(limits)]
@@ -62,14 +61,14 @@ def _verdict(
     head = f'<p>{len(verdicts)} bags compared, {same} with the same bytes.</p>'
     rows = [[_link(by_name[n]), escape('; '.join(why))] for n, why in worse.items()]
     title = f'{len(worse)} bags got worse' if worse else 'No bag got worse'
-    return section(title, head + (_table(('bag', 'what'), rows) if rows else ''),
+    return section(title, head + (html_table(rows, ('bag', 'what')) if rows else ''),
                    'problem' if worse else '')  # fmt: skip
 
 
 def _effects(found: Sequence[Effect]) -> str:
     rows = [[escape(c) for c in row] for row in effect_rows(found)]
     return section(
-        'Mean change', _table(('figure', 'bags', 'mean', '95 % interval', ''), rows)
+        'Mean change', html_table(rows, ('figure', 'bags', 'mean', '95 % interval', ''))
     )  # fmt: skip
 
 
@@ -79,7 +78,7 @@ def _limits(limits: Mapping[str, Limit]) -> str:
         for v in limits.values()
     ]
     return section('A bag got worse where a figure changed by more than the larger of both',
-                   _table(('figure', 'direction', 'step', 'share'), rows))  # fmt: skip
+                   html_table(rows, ('figure', 'direction', 'step', 'share')))  # fmt: skip
 
 
 def _worst(records: Sequence[Record]) -> str:
@@ -93,7 +92,7 @@ def _worst(records: Sequence[Record]) -> str:
         rows += [
             [escape(LIMITS[figure].title), _link(r), f'{r.row[figure]:.4g}'] for r in known[:WORST]
         ]
-    return _table(('by', 'bag', 'value'), rows)
+    return html_table(rows, ('by', 'bag', 'value'))
 
 
 def _link(r: Record) -> str:
@@ -122,7 +121,7 @@ def _histogram(title: str, values: Sequence[float]) -> str:
     step, top = WIDTH / BINS, max(int(counts.max()), 1)
     bars = ''.join(
         f'<rect x="{k * step:.1f}" y="{HEIGHT * (1 - c / top):.1f}" width="{step - 1:.1f}" '
-        f'height="{HEIGHT * c / top:.1f}" fill="#1f5fbf"/>'
+        f'height="{HEIGHT * c / top:.1f}"/>'
         for k, c in enumerate(counts.tolist())
     )
     median, p95 = np.percentile(values, (50, 95))
@@ -144,7 +143,7 @@ def _runs(records: Sequence[Record], worse: Mapping[str, tuple[str, ...]]) -> st
         rows.append(f'<tr{kind}><td>{_link(r)}</td>{cells}</tr>')
     head = ''.join(f'<th>{escape(c)}</th>' for c in ('bag', *columns))
     return (
-        '<p class="sub">A click on a heading sorts.</p><div class="scroll"><table class="runs">'
+        '<p class="sub">A click on a heading sorts.</p><div class="wide"><table class="runs">'
         f'<thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
     )
 
@@ -153,10 +152,3 @@ def _cell(value: Any) -> str:
     if isinstance(value, float):
         return f'<td data-v="{value!r}">{value:.4g}</td>'
     return f'<td>{"" if value is None else escape(str(value))}</td>'
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Cells are HTML."""
-    top = ''.join(f'<th>{escape(h)}</th>' for h in head)
-    body = ''.join(f'<tr>{"".join(f"<td>{c}</td>" for c in row)}</tr>' for row in rows)
-    return f'<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>'

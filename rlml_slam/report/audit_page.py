@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-import base64
 import json
-from collections.abc import Mapping, Sequence
-from html import escape
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +15,8 @@ from rlml_slam.planning.audit.audit import Audit
 from rlml_slam.planning.audit.findings import Kind
 from rlml_slam.report import pictures as draw
 from rlml_slam.report.outputs import make_folder
+from rlml_slam.report.page import heading, page, picture, section, table
 from rlml_slam.report.plan_page import cm
-from rlml_slam.report.report import page, section
 from rlml_slam.types import Level
 
 CAPTION = 'Where the robot was, and what was found, by its rank in the table'
@@ -30,11 +28,11 @@ FINDING_HEADER = ('rank', 'kind', 'what', 'what to do')
 def write_audit(audit: Audit, name: str, folder: Path) -> None:
     """Write audit.json, audit.png and audit.html, each whole or not at all."""
     folder = make_folder(folder)
-    picture = _picture(audit)
-    write_atomically(folder / 'audit.png', picture)
+    image = _picture(audit)
+    write_atomically(folder / 'audit.png', image)
     text = json.dumps(audit.figures, indent=2) + '\n'
     write_atomically(folder / 'audit.json', text.encode())
-    write_atomically(folder / 'audit.html', _page(name, audit, picture).encode())
+    write_atomically(folder / 'audit.html', _page(name, audit, image).encode())
 
 
 def area_rows(found: Mapping[str, Any]) -> list[tuple[str, ...]]:
@@ -82,25 +80,21 @@ def _picture(audit: Audit) -> bytes:
     return draw.png(figure)
 
 
-def _page(name: str, audit: Audit, picture: bytes) -> str:
+def _page(name: str, audit: Audit, image: bytes) -> str:
     f = audit.figures
     kinds = ', '.join(dict.fromkeys(g.kind.value for g in audit.findings)) or 'all is as planned'
     parts = [
-        f'<h1>Audit of {escape(name)}</h1><p class="sub">{len(audit.findings)} findings: {kinds}. '
-        f'{f["scans"]} scans, {f["detections"]} detections, {f["unmatched"]} of which the layout '
-        f'does not have; {f["usual_rate"]:.1%} of expected reflectors were seen</p>'
+        heading(
+            f'Audit of {name}',
+            f'{len(audit.findings)} findings: {kinds}. {f["scans"]} scans, {f["detections"]} '
+            f'detections, {f["unmatched"]} of which the layout does not have; '
+            f'{f["usual_rate"]:.1%} of expected reflectors were seen',
+        )
     ]
     if audit.findings:
-        parts.append(section('What to do', _table(finding_rows(f)), 'problem'))
-    data = base64.b64encode(picture).decode('ascii')
-    parts.append(section(CAPTION, f'<img alt="{CAPTION}" src="data:image/png;base64,{data}">'))
-    parts.append(section('Areas', _table(area_rows(f))))
+        head, *rows = finding_rows(f)
+        parts.append(section('What to do', table(rows, head), 'problem'))
+    parts.append(section(CAPTION, picture(image, CAPTION)))
+    head, *rows = area_rows(f)
+    parts.append(section('Areas', table(rows, head)))
     return page(f'Audit of {name}', parts)
-
-
-def _table(rows: Sequence[Sequence[str]]) -> str:
-    head, *body = rows
-    cells = '<tr>' + ''.join(f'<th>{escape(c)}</th>' for c in head) + '</tr>'
-    for row in body:
-        cells += '<tr>' + ''.join(f'<td>{escape(c)}</td>' for c in row) + '</tr>'
-    return f'<table>{cells}</table>'

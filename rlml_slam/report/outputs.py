@@ -26,12 +26,12 @@ SIGHTINGS = 'sightings.rlml'
 
 
 def write_outputs(run: Run, folder: str | Path, report: bool = True) -> dict[str, Any]:
-    """Write all results and pictures of a run into a folder; the figures of metrics.json.
+    """Write all results of a run into a folder; the figures of metrics.json.
 
     trajectory.tum, front_end.tum, health.csv, map.rlml, map.pgm, map.yaml, reflectors.csv,
     reflector_states.csv, sightings.rlml and closures.csv depend on the data alone: two replays
-    give the same bytes. Without ``report`` there are no pictures and no report.html. Raises
-    MapError if the folder cannot be written.
+    give the same bytes. Without ``report`` there is no report.html. Raises MapError if the
+    folder cannot be written.
     """
     folder = make_folder(folder)
     write_tum(folder / 'trajectory.tum', run.trajectory)
@@ -73,16 +73,11 @@ def make_folder(folder: str | Path) -> Path:
 def write_report(
     run: Run, errors: RunErrors | None, figures: dict[str, Any], folder: Path
 ) -> None:
-    """Pictures as PNG, and report.html that carries the same ones inside."""
-    # matplotlib takes half a second to import, which other commands need not wait for
-    from rlml_slam.report.pictures import draw
+    """report.html, which needs no other file."""
+    # Bokeh takes a second to import, which other commands need not wait for
     from rlml_slam.report.report import report_html
 
-    pictures = draw(run, errors)
-    for name, png in pictures.items():
-        write_atomically(folder / f'{name}.png', png)
-    html = report_html(run, figures, pictures)
-    write_atomically(folder / 'report.html', html.encode())
+    write_atomically(folder / 'report.html', report_html(run, figures, errors).encode())
 
 
 def unknown_grid(trajectory: Trajectory) -> OccupancyGrid:

@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-import base64
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from html import escape
 from pathlib import Path
@@ -24,8 +23,8 @@ from rlml_slam.planning import site_file
 from rlml_slam.planning.plan import Plan, figures, scan_sigma
 from rlml_slam.planning.suggest import Suggestion
 from rlml_slam.report.outputs import make_folder
+from rlml_slam.report.page import heading, page, picture, section, table
 from rlml_slam.report.pictures import LIVE, REFLECTOR, SOFT, draw_grid, dress, png
-from rlml_slam.report.report import page, section
 from rlml_slam.se2 import Array
 
 PIXELS = 1000
@@ -203,24 +202,25 @@ def table_rows(found: Mapping[str, Any]) -> list[tuple[str, ...]]:
 def _page(name: str, found: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
     goal, share = 100.0 * found['goal_m'], found['goal_share']
     parts = [
-        f'<h1>Layout of {escape(name)}</h1><p class="sub">{found["reflectors"]} reflectors, '
-        f'{found["places"]} places; {goal:g} cm reached at {share:.1%}</p>'
+        heading(
+            f'Layout of {name}',
+            f'{found["reflectors"]} reflectors, {found["places"]} places; {goal:g} cm reached at '
+            f'{share:.1%}',
+        )
     ]
     if found['notes']:
-        items = ''.join(f'<li>{escape(n)}</li>' for n in found['notes'])
-        parts.append(section('Notes', f'<ul>{items}</ul>', 'problem'))
+        parts.append(section('Notes', _paragraphs(found['notes']), 'problem'))
     if 'suggested' in found:
-        notes = ''.join(f'<p>{escape(n)}</p>' for n in suggestion_notes(found))
-        parts.append(section('Suggested reflectors', _table(suggestion_rows(found)) + notes))
+        head, *rows = suggestion_rows(found)
+        notes = _paragraphs(suggestion_notes(found))
+        parts.append(section('Suggested reflectors', table(rows, head) + notes))
     for key, image in pictures.items():
-        data = base64.b64encode(image).decode('ascii')
-        body = f'<img alt="{escape(CAPTIONS[key])}" src="data:image/png;base64,{data}">'
-        parts.append(section(CAPTIONS[key], body))
+        parts.append(section(CAPTIONS[key], picture(image, CAPTIONS[key])))
     size = found['area_size_m']
-    parts.append(section(f'Areas of {size:g} m, largest sigmas', _table(table_rows(found))))
+    head, *rows = table_rows(found)
+    parts.append(section(f'Areas of {size:g} m, largest sigmas', table(rows, head)))
     return page(f'Layout of {name}', parts)
 
 
-def _table(rows: Sequence[Sequence[str]]) -> str:
-    cells = (''.join(f'<td>{escape(c)}</td>' for c in row) for row in rows)
-    return '<table>' + ''.join(f'<tr>{row}</tr>' for row in cells) + '</table>'
+def _paragraphs(lines: Iterable[str]) -> str:
+    return ''.join(f'<p>{escape(line)}</p>' for line in lines)

@@ -1,82 +1,52 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report of a run: one HTML file that carries its pictures and needs nothing else."""
+"""The report of a run: one interactive HTML file that needs nothing else."""
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from html import escape
 from typing import Any
 
-from rlml_slam.evaluation.run_record import Run
+from rlml_slam.evaluation.metrics import RunErrors
+from rlml_slam.evaluation.run_record import Origin, Run
 from rlml_slam.evaluation.survey_residuals import changes, name_of
+from rlml_slam.report.page import heading, page, section, table
 from rlml_slam.report.summary import summary_rows
+from rlml_slam.report.viewer import viewer_page
+from rlml_slam.report.viewer.columns import columns_of
 from rlml_slam.slam.landmarks.reflector_states import PRESENT, describe
 from rlml_slam.types import Level
-from rlml_slam.version import __version__
-
-CAPTIONS = {
-    'map': 'Map, trajectory, reflectors with 95 % ellipses, and loop closures',
-    'errors': 'Errors against ground truth over time, with the 3σ bands that were published',
-    'health': 'Health, position uncertainty and detections over time',
-    'timing': 'Time per scan and per keyframe',
-}
-_STYLE = """
-:root { --ink: #24292f; --soft: #6a737d; --line: #e3e6ea; --accent: #1f5fbf; }
-* { box-sizing: border-box; }
-body { margin: 0; background: #f6f7f9; color: var(--ink);
-       font: 15px/1.5 system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif; }
-main { max-width: 1080px; margin: 0 auto; padding: 32px 20px 48px; }
-h1 { font-size: 26px; margin: 0 0 2px; } h2 { font-size: 17px; margin: 0 0 12px; }
-.sub { color: var(--soft); margin: 0 0 20px; }
-.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 12px; }
-.card, section { background: #fff; border: 1px solid var(--line); border-radius: 10px; }
-.card { padding: 12px 16px; } .card b { display: block; font-size: 23px; color: var(--accent); }
-.card span { color: var(--soft); font-size: 13px; }
-section { padding: 18px 20px; margin-top: 16px; }
-img { width: 100%; height: auto; display: block; }
-table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
-td, th { text-align: left; padding: 5px 12px 5px 0; border-bottom: 1px solid var(--line);
-         vertical-align: top; font-weight: normal; }
-th { color: var(--soft); white-space: nowrap; width: 1%; padding-right: 28px; }
-.problem { background: #fdecea; border-color: #f1b8b2; }
-footer { color: var(--soft); font-size: 13px; margin-top: 20px; }
-"""
 
 
-def report_html(run: Run, figures: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
-    """The page: key figures, pictures, table of all figures, and spells of bad health."""
+def report_html(run: Run, figures: Mapping[str, Any], errors: RunErrors | None) -> str:
+    """The page: key figures, viewer, table of all figures, and spells of bad health."""
     parts = [
-        f'<h1>{escape(run.name)}</h1>',
-        f'<p class="sub">{escape(_subtitle(figures))}</p>',
+        heading(run.name, _subtitle(figures)),
         f'<div class="cards">{"".join(_cards(figures))}</div>',
     ]
     if run.problem:
-        parts.append(section('The results are incomplete', escape(run.problem), 'problem'))
-    parts += [_picture(name, pictures[name]) for name in ('map', 'errors') if name in pictures]
-    parts.append(section('Figures', _table(summary_rows(figures))))
+        parts.append(section('The results are incomplete', '', 'problem', run.problem))
+    *viewer, bar, script, code = viewer_page.parts(columns_of(run, errors))
+    parts += viewer
+    spells = list(bad_spells(run))
+    if spells:
+        parts.append(section('When it was not OK', table(spells)))
+    parts.append(section('Figures', table(summary_rows(figures))))
     if figures.get('survey', {}).get('found'):
-        parts.append(section('Reflectors against the survey', _table(_residuals(figures))))
+        parts.append(section('Reflectors against the survey', table(_residuals(figures))))
     changed = [describe(s).partition(': ') for s in run.reflector_states if s.state != PRESENT]
     if changed:
         rows = [(kind, what) for kind, _, what in changed]
-        parts.append(section('New, moved, missing and ghost reflectors', _table(rows)))
-    parts += [_picture(name, pictures[name]) for name in ('health', 'timing') if name in pictures]
-    spells = list(bad_spells(run))
-    if spells:
-        parts.append(section('When it was not OK', _table(spells)))
-    return page(run.name, parts)
+        parts.append(section('New, moved, missing and ghost reflectors', table(rows)))
+    return page(run.name, [*parts, bar, script, code], origin_rows(run.origin), viewer_page.head())
 
 
-def page(title: str, parts: Sequence[str]) -> str:
-    """A whole page of these parts, in the style of the report."""
-    body = '\n'.join(parts)
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f'<title>{escape(title)} · rlml_slam</title><style>{_STYLE}</style></head>\n'
-        f'<body><main>\n{body}\n<footer>rlml_slam {__version__}</footer></main></body></html>\n'
-    )
+def origin_rows(origin: Origin) -> dict[str, str]:
+    """What a run was made by, for the footer."""
+    rows = {'command': origin.command, 'made from': origin.source}
+    changed = ', '.join(f'{k}={v}' for k, v in origin.parameters.items())
+    rows['parameters'] = changed or 'all as by default'
+    return {k: v for k, v in rows.items() if v}
 
 
 def _subtitle(f: Mapping[str, Any]) -> str:
@@ -113,22 +83,6 @@ def _residuals(f: Mapping[str, Any]) -> list[tuple[str, str]]:
         kind, _, what = line.partition(': ')
         rows.append((kind, what))
     return rows
-
-
-def _picture(name: str, png: bytes) -> str:
-    data = base64.b64encode(png).decode('ascii')
-    alt = escape(CAPTIONS[name])
-    return section(CAPTIONS[name], f'<img alt="{alt}" src="data:image/png;base64,{data}">')
-
-
-def section(title: str, body: str, kind: str = '') -> str:
-    """A box of the page; ``body`` is HTML."""
-    return f'<section class="{kind}"><h2>{escape(title)}</h2>{body}</section>'
-
-
-def _table(rows: list[tuple[str, str]]) -> str:
-    cells = ''.join(f'<tr><th>{escape(a)}</th><td>{escape(b)}</td></tr>' for a, b in rows)
-    return f'<table>{cells}</table>'
 
 
 def bad_spells(run: Run, most: int = 20) -> Iterator[tuple[str, str]]:

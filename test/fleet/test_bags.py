@@ -6,7 +6,8 @@ from __future__ import annotations
 import pytest
 
 from rlml_slam.errors import BagError
-from rlml_slam.fleet.bags import digest_of, find_bags, local_copy
+from rlml_slam.fleet.bags import find_bags, local_copy
+from rlml_slam.recordings.origin import digest_of
 
 fsspec = pytest.importorskip('fsspec')
 FILES = ('r1/a/metadata.yaml', 'r1/a/a_0.mcap', 'r2/a/metadata.yaml', 'r2/a/a_0.db3', 'r2/b.bag',

@@ -56,9 +56,7 @@ def add_parser(subparsers: Any) -> None:
         help='the change is meant to change no result: another byte is worse',
     )  # fmt: skip
     parser.add_argument('--mcap', action='store_true', help='also write run.mcap of each bag')
-    parser.add_argument(
-        '--no-report', action='store_true', help='no pictures and no report.html of each bag'
-    )
+    parser.add_argument('--no-report', action='store_true', help='no report.html of each bag')
 
 
 def run(args: argparse.Namespace) -> int:

@@ -13,6 +13,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
 from rlml_slam.cli.support.heard_map import KINDS, HeardMap
@@ -21,7 +22,7 @@ from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.evaluation.run_record import FrameLog, Run, Truth
 from rlml_slam.params import Parameters
 from rlml_slam.ros.codecs import decode
-from rlml_slam.ros.codecs.frame_messages import read_record
+from rlml_slam.ros.codecs.frame_messages import read_points, read_record
 from rlml_slam.ros.codecs.message_types import rclpy_class
 from rlml_slam.ros.codecs.reflector_clouds import read_associated, read_reflector_map
 from rlml_slam.ros.codecs.update_message import UpdateSummary, read_update
@@ -74,6 +75,7 @@ class Recorder(Node):
         listen(PoseWithCovarianceStamped, 'pose', self.on_pose, DEEP)
         listen(PointCloud2, 'rlml/frames', self.on_frame, DEEP)
         listen(PointCloud2, 'reflectors/associated', self.on_associated, DEEP)
+        listen(PointCloud2, 'deskewed_points', self.on_points, DEEP, raw=True)
         listen(PointCloud2, 'updates', self.on_update, DEEP)
         listen(Odometry, 'ground_truth', self.on_truth, DEEP)
         listen(PointCloud2, TRUE_REFLECTORS, self.on_true_reflectors, LATCHED)
@@ -125,6 +127,15 @@ class Recorder(Node):
         """What the front end says of one pose: its level of health, and its cost."""
         frame = read_record(msg).of.frame
         self._answers[frame.stamp] = (frame.health.level, frame.wall_ms)
+
+    def on_points(self, data: bytes) -> None:
+        """The end points of one scan, serialized: few of them are looked into."""
+        stamp = stamp_of(data)
+        if self.frames.scans.is_due():
+            points = read_points(deserialize_message(data, PointCloud2))
+            self.frames.scans.add(stamp, points)
+        else:
+            self.frames.scans.skip()
 
     def on_associated(self, msg: PointCloud2) -> None:
         """The detections of one pose: how many, and how many were used."""
@@ -242,6 +253,7 @@ class Recorder(Node):
             seen, used = self._seen.get(stamp, (0, 0))
             log.seen.append(seen)
             log.used.append(used)
+        log.scans = live.scans
         return log
 
     def _reasons(self, stamp: int, level: Level) -> tuple[str, ...]:

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run was made by and from, for its report."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+from rlml_slam.evaluation.run_record import Origin
+from rlml_slam.params import declarations
+
+CHUNK = 1 << 22  # [bytes] that are read at once
+
+
+def origin(command: str, params: Any, bag: Path | None = None) -> Origin:
+    """The origin of a run with the set ``params``, of a bag where there is one."""
+    source = '' if bag is None else f'{bag.resolve().name}, SHA-256 {digest_of(bag)}'
+    return Origin(command, changed(params), source)
+
+
+def changed(params: Any) -> dict[str, Any]:
+    """The parameters of a set, by their ROS names, that are not as by default."""
+    values = {
+        d.name: (getattr(getattr(params, d.group), d.field), d.default)
+        for d in declarations(type(params))
+    }
+    return {name: value for name, (value, default) in values.items() if value != default}
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of the names and bytes of a file, or of all files of a folder."""
+    seen = hashlib.sha256()
+    for file in sorted(path.rglob('*')) if path.is_dir() else [path]:
+        if file.is_file():
+            seen.update(f'{file.relative_to(path).as_posix()}\0{file.stat().st_size}\0'.encode())
+            with file.open('rb') as f:
+                while chunk := f.read(CHUNK):
+                    seen.update(chunk)
+    return seen.hexdigest()
