@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import socket
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +45,10 @@ def add_parser(subparsers: Any) -> None:
         '--mcap', metavar='FILE', type=Path,
         help='inputs and all that the nodes publish as one file for Foxglove, RViz and others',
     )  # fmt: skip
+    parser.add_argument(
+        '--view', type=int, default=8080, metavar='PORT',
+        help='watch it at this port of 127.0.0.1 (default: %(default)s; 0: no)',
+    )  # fmt: skip
     parser.add_argument('--json', action='store_true', help='print metrics.json and no more')
 
 
@@ -57,10 +64,20 @@ def run(args: argparse.Namespace) -> int:
             f'at {args.rate:g} × real time',
             flush=True,
         )
-    played = source(args, world)
+    played = replace(source(args, world), view_port=port_of(args))
+    if played.view_port and not args.json:
+        print(f'watch it at http://127.0.0.1:{played.view_port}/', flush=True)
     result = drive(played, out, args.json)
     result.origin = Origin(args.command_line, played.system)
     return print_summary(result, write_outputs(result, out), out, args.json)
+
+
+def port_of(args: argparse.Namespace) -> int | None:
+    """The port to watch at, the one that was asked for or the next one that is free."""
+    for port in range(args.view, args.view + 20) if args.view else ():
+        with contextlib.suppress(OSError), socket.create_server(('127.0.0.1', port)):
+            return port
+    return None
 
 
 def source(args: argparse.Namespace, world: World) -> Source:

@@ -53,6 +53,9 @@ COMMANDS: Table = {
         'rlml_slam.cli.warm_up', 'compile the kernels once, into the package or else for this user'
     ),
     'live': Command('rlml_slam.cli.live', 'play a bag to the live nodes, then a report'),
+    'view': Command(
+        'rlml_slam.cli.view.view', 'running nodes in a browser: map, plots and health, live'
+    ),
     'convert': Command('rlml_slam.cli.convert', 'a recorded log becomes a bag'),
     'evaluate': Command(
         'rlml_slam.cli.evaluate', 'errors of a trajectory against relations or ground truth'

@@ -83,11 +83,12 @@ class FrameLog:
 class Origin:
     """What a run was made by: the command line, and by name the parameters that it changed.
 
-    ``source`` says what it was made from, such as the SHA-256 of a bag; empty if unknown.
+    ``source`` says what it was made from, such as the SHA-256 of a bag. Each is empty, or None, if
+    unknown.
     """
 
     command: str = ''
-    parameters: Mapping[str, Any] = field(default_factory=dict)
+    parameters: Mapping[str, Any] | None = None
     source: str = ''
 
 

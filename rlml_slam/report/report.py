@@ -44,8 +44,9 @@ def report_html(run: Run, figures: Mapping[str, Any], errors: RunErrors | None) 
 def origin_rows(origin: Origin) -> dict[str, str]:
     """What a run was made by, for the footer."""
     rows = {'command': origin.command, 'made from': origin.source}
-    changed = ', '.join(f'{k}={v}' for k, v in origin.parameters.items())
-    rows['parameters'] = changed or 'all as by default'
+    if origin.parameters is not None:
+        changed = ', '.join(f'{k}={v}' for k, v in origin.parameters.items())
+        rows['parameters'] = changed or 'all as by default'
     return {k: v for k, v in rows.items() if v}
 
 

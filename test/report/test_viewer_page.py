@@ -13,6 +13,8 @@ import pytest
 from made_runs import made_run
 
 from rlml_slam.report.outputs import write_outputs
+from rlml_slam.report.page import page as page_of
+from rlml_slam.report.viewer import columns, viewer_page
 from rlml_slam.report.viewer.figures import PLOTS
 
 pytestmark = pytest.mark.skipif(
@@ -160,3 +162,30 @@ def test_page_prints(page):
     pdf = base64.b64decode(page.call('Page.printToPDF', printBackground=True)['data'])
     assert pdf.startswith(b'%PDF')
     assert len(pdf) > 20_000
+
+
+def test_live_page_takes_messages(tmp_path):
+    """The page of `rlml view`, whose messages are put into it by hand: nobody serves it here."""
+    frames = columns.frames(made_run().frames, made_run().frames.stamps[0])
+    first = {'start': True, 'replace': {'frames': columns.as_lists(frames)}}
+    scan = {'t': 60.0, 'x': [100, 0], 'y': [0, 100]}
+    more = {c: [v[-1]] for c, v in columns.as_lists(frames).items()} | {'t': [60.0], 'level': [2]}
+    html = page_of('Live', viewer_page.parts(), {}, viewer_page.head())
+    (tmp_path / 'live.html').write_text(html)
+    with chromium.browser() as page:
+        page.open((tmp_path / 'live.html').as_uri())
+        page.evaluate(f'viewer.take({json.dumps(first)})')
+        assert page.evaluate('document.getElementById("slider").value') == '59'
+        page.evaluate(f'viewer.take({json.dumps({"stream": {"frames": more}, "scan": scan})})')
+        page.settle()
+        text = page.evaluate('document.getElementById("now").textContent')
+        assert '60.00 s' in text
+        assert 'LOST' in text
+        assert data(page, 'health', 'name') == ['OK', 'DEGRADED', 'OK', 'LOST']
+        assert len(data(page, 'scan', 'x')) == 2
+        # nothing is known of a truth: its plots are hidden
+        hidden = 'document.querySelector("[data-needs=\'frames.error\']").hidden'
+        assert page.evaluate(hidden)
+        page.evaluate('document.getElementById("play").click()')
+        page.evaluate(f'viewer.take({json.dumps({"stream": {"frames": more | {"t": [61.0]}}})})')
+        assert '60.00 s' in page.evaluate('document.getElementById("now").textContent')

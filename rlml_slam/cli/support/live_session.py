@@ -45,7 +45,8 @@ class Source:
     ``sensor`` is the (topic, type) whose every message asks for a pose. ``progress`` shows the
     share of the drive that is done. ``keeps_map``: the run gets the whole map at its end.
     ``mcap`` is a file for all that was heard, ``inputs`` the types of the topics that it needs
-    besides those of our nodes.
+    besides those of our nodes. On ``view_port`` a browser
+    can watch meanwhile.
     """
 
     title: str
@@ -58,6 +59,7 @@ class Source:
     keeps_map: bool = False
     mcap: Path | None = None
     inputs: Mapping[str, str] = field(default_factory=dict)
+    view_port: int | None = None
 
 
 def drive(source: Source, out: Path, quiet: bool) -> Run:
@@ -155,6 +157,9 @@ def _start(processes: Processes, source: Source, maps: str) -> None:
     system = dict(source.system)
     if source.keeps_map:
         system |= {'map_directory': maps, 'map_file_name': live_map.NAME}
+    if source.view_port is not None:
+        # nobody asks how it is: a viewer that ends costs the drive nothing
+        processes.start('view', ['rlml_slam', 'view', '--port', str(source.view_port)])
     for name in SYSTEM:
         processes.start(name, node(name, system, source.config))
     processes.start(source.executable, node(source.executable, source.parameters))

@@ -85,8 +85,7 @@ def columns_of(run: Run, errors: RunErrors | None) -> dict[str, Columns]:
         names = [str(i) for i in ids.tolist()] or [''] * len(known)
         out['true_reflectors'] = {'x': known[:, 0], 'y': known[:, 1], 'name': names}
     out['reflectors'] = reflectors(run.reflectors)
-    closures = run.closures[:: max(1, -(-len(run.closures) // MAX_CLOSURES))]
-    out['closures'] = {'xs': closures[:, :, 0].tolist(), 'ys': closures[:, :, 1].tolist()}
+    out['closures'] = closures(run.closures)
     out['keyframes'] = {'x': single(run.keyframes[:, 0]), 'y': single(run.keyframes[:, 1])}
     if run.grid is not None:
         out['grid'] = grid(run.grid)
@@ -164,19 +163,28 @@ def reflectors(of: Reflectors) -> Columns:
     }  # fmt: skip
 
 
-def grid(of: OccupancyGrid) -> Columns:
-    """The grid as a picture: occupied cells and unknown ones, on paper that is light or dark."""
+def closures(ends: Array) -> Columns:
+    """Loop closures (c, 2, 2) as lines, MAX_CLOSURES of them at most."""
+    kept = ends[:: max(1, -(-len(ends) // MAX_CLOSURES))]
+    return {'xs': kept[:, :, 0].tolist(), 'ys': kept[:, :, 1].tolist()}
+
+
+def grid(of: OccupancyGrid, is_small: bool = True) -> Columns:
+    """The grid as a picture: occupied cells and unknown ones, on paper that is light or dark.
+
+    ``is_small``: as few bytes as possible, which takes ten times as long.
+    """
     rows, columns = of.cells.shape
     centre = 0.5 * of.resolution * np.array([[columns, rows]])
     x, y = se2.transform(of.T_map_grid, centre)[0].tolist()
-    light, dark = grid_pictures(of.cells)
+    light, dark = grid_pictures(of.cells, is_small)
     return {
         'x': [x], 'y': [y], 'width': [columns * of.resolution], 'height': [rows * of.resolution],
         'angle': [of.yaw], 'light': [light], 'dark': [dark],
     }  # fmt: skip
 
 
-def grid_pictures(cells: NDArray[np.int8]) -> list[str]:
+def grid_pictures(cells: NDArray[np.int8], is_small: bool = True) -> list[str]:
     """Data URLs of PNG files with a palette, of at most MAX_SIDE pixels a side."""
     step = -(-max(cells.shape) // MAX_SIDE) or 1
     if step > 1:  # the most occupied cell of each block, so that walls stay
@@ -193,7 +201,8 @@ def grid_pictures(cells: NDArray[np.int8]) -> list[str]:
         rgba = np.array([*shades, unknown], dtype=np.uint8)
         image.putpalette(rgba[:, :3].tobytes())
         file = io.BytesIO()
-        image.save(file, 'png', optimize=True, transparency=rgba[:, 3].tobytes())
+        level = {'optimize': True} if is_small else {'compress_level': 1}
+        image.save(file, 'png', transparency=rgba[:, 3].tobytes(), **level)
         out.append('data:image/png;base64,' + base64.b64encode(file.getvalue()).decode('ascii'))
     return out
 

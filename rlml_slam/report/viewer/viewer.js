@@ -8,10 +8,11 @@
   const SIZES = [1, 2, 5, 10, 20, 50];
   const HISTORY = 6000; // frames that a live page keeps
   const LIVE_SCANS = 600;
+  const WINDOW = 120; // seconds that the plots of a live page show
   const by = id => document.getElementById(id);
   const isLive = by('viewer').dataset.live === '1';
 
-  let doc, map, cursors, scans = [], k = 0, follows = isLive, playing = 0;
+  let doc, map, cursors, scans = [], k = 0, follows = isLive, playing = 0, touched = false, times;
   const source = name => map.tags.find(s => s.name === name);
   const column = (of, name) => source(of).data[name];
 
@@ -56,6 +57,7 @@
     slider.value = k;
     slider.setAttribute('aria-valuetext', `${f.t[k].toFixed(2)} s`);
     for (const c of cursors) c.location = f.t[k];
+    if (follows) times.setv({ start: Math.max(0, f.t[n - 1] - WINDOW), end: Math.max(1, f.t[n - 1]) });
     drawRobot(f);
     drawScan(f);
     say(f);
@@ -120,15 +122,15 @@
     playing = yes ? playing + 1 || 1 : 0;
     label();
     if (!yes) return;
-    const times = column('frames', 't'), mine = playing;
-    const speed = Math.max(1, times[times.length - 1] / 60);
-    if (k >= times.length - 1) show(0);
-    const from = times[k], began = performance.now();
+    const all = column('frames', 't'), mine = playing;
+    const speed = Math.max(1, all[all.length - 1] / 60);
+    if (k >= all.length - 1) show(0);
+    const from = all[k], began = performance.now();
     const step = now => {
       if (playing !== mine) return;
       const t = from + speed * (now - began) / 1000;
-      show(indexAt(times, t));
-      if (t >= times[times.length - 1]) play(false); else requestAnimationFrame(step);
+      show(indexAt(all, t));
+      if (t >= all[all.length - 1]) play(false); else requestAnimationFrame(step);
     };
     requestAnimationFrame(step);
   }
@@ -195,6 +197,10 @@
     for (const [name, columns] of Object.entries(message.replace ?? {})) {
       source(name).data = numbers(columns);
       if (name === 'reflectors') ellipses();
+      if (name === 'frames') {
+        source('health').data = { left: [], right: [], level: [], name: [], reason: [], colour: [] };
+        health(columns);
+      }
     }
     for (const [name, columns] of Object.entries(message.stream ?? {})) {
       source(name).stream(numbers(columns), HISTORY);
@@ -204,7 +210,7 @@
       scans.push(message.scan);
       if (scans.length > LIVE_SCANS) scans.shift();
     }
-    if (message.extent) {
+    if (message.extent && !touched) { // not while a person looks somewhere else
       const [low, high] = message.extent;
       map.x_range.setv({ start: low[0], end: high[0] });
       map.y_range.setv({ start: low[1], end: high[1] });
@@ -255,6 +261,7 @@
 
   function begin() {
     cursors = [...doc._all_models.values()].filter(m => m.tags?.includes('cursor'));
+    times = views().find(v => v.model.name === 'health').model.x_range;
     unpackScans();
     layers();
     paper();
@@ -274,12 +281,13 @@
     for (const side of ['inner_width', 'inner_height']) {
       map.properties[side].change.connect(() => requestAnimationFrame(toScale));
     }
-    map.on_event('reset', toScale);
+    for (const event of ['pan', 'wheel', 'pinch']) map.on_event(event, () => { touched = true; });
+    map.on_event('reset', () => { touched = false; toScale(); });
     label();
     show(0);
     toScale();
     window.viewer = {
-      ready: true, show, seek, map, source, messages: 0, latency: NaN,
+      ready: true, show, seek, take, map, source, messages: 0, latency: NaN,
       cursors: () => cursors, figures: () => views().filter(v => v.model.type === 'Figure').map(v => v.model.name), element, tooltips,
     };
     if (isLive) listen();

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``rlml view``: running nodes in a browser."""
