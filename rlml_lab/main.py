@@ -102,6 +102,10 @@ COMMANDS: Table = {
                 'rlml_lab.layout.study_plan_bound',
                 'errors of the reflector term against the planned sigma, area by area',
             ),
+            'plan-real': Command(
+                'rlml_lab.layout.study_plan_real',
+                'plans of real layouts beside what recorded runs show, area by area',
+            ),
             'plan-verdicts': Command(
                 'rlml_lab.layout.study_plan_verdicts',
                 'whether places that are planned unique are answered right',
