@@ -8,10 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 
 from rlml_slam.cli.main import main
 from rlml_slam.maps import reflector_file, saved_map
+from rlml_slam.params import Parameters
 from rlml_slam.report.outputs import SIGHTINGS
+from rlml_slam.ros.front_end import incident_file
+from rlml_slam.ros.front_end.incident import Published, Received
+from rlml_slam.types import Health
 
 ROOM = Path(__file__).resolve().parents[2] / 'bags' / 'room'
 
@@ -63,6 +68,24 @@ def test_bag_is_replayed_in_the_map_of_the_plan(tmp_path, capsys):
     assert code == 0
     assert 'all is as planned' in out
     assert (tmp_path / 'out/run' / SIGHTINGS).exists()
+
+
+def test_incident_is_audited_as_a_bag(tmp_path, capsys):
+    """A file of the black box: inputs as they came, beside poses and health of its node."""
+    with AnyReader([ROOM]) as bag:
+        received = [Received(at, c.topic, c.msgtype, data) for c, at, data in bag.messages()]
+    static = [r for r in received if r.topic == '/tf_static']
+    moving = [r for r in received if r.topic != '/tf_static']
+    pose = Published(moving[9].time, moving[9].time, np.zeros(3), np.eye(3), Health())
+    path = tmp_path / 'incident-20260101-120000-lost.mcap'
+    incident_file.write(path, {'reason': 'lost'}, static, moving, [pose], Parameters())
+    plan = tmp_path / 'plan'
+    main(['plan', 'room', '--out', str(plan), '--spacing', '0.5'])
+    code, out, _ = audit(capsys, path, '--plan', plan, '--out', tmp_path / 'out')
+    assert code == 0
+    assert 'all is as planned' in out
+    code, _, err = audit(capsys, path, '--out', tmp_path / 'own')
+    assert code == 0, err
 
 
 def test_errors_are_exit_code_2(replayed, tmp_path, capsys):

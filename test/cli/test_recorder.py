@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,7 +23,10 @@ from rlml_slam.motion import STILL  # noqa: E402
 from rlml_slam.ros.codecs import encode  # noqa: E402
 from rlml_slam.ros.codecs.frame_messages import build_record  # noqa: E402
 from rlml_slam.ros.codecs.message_types import make_rclpy as make  # noqa: E402
-from rlml_slam.ros.codecs.reflector_clouds import build_reflector_map  # noqa: E402
+from rlml_slam.ros.codecs.reflector_clouds import (  # noqa: E402
+    build_associated,
+    build_reflector_map,
+)
 from rlml_slam.ros.codecs.serialized_path import serialized_path  # noqa: E402
 from rlml_slam.ros.codecs.update_message import build_update  # noqa: E402
 from rlml_slam.slam.back_end.back_end import Update  # noqa: E402
@@ -177,3 +181,30 @@ def test_every_keyframe_tells_its_cost_and_its_closures(recorder):
     assert_array_equal(run.back_end_ms, [2.0, 7.5])
     assert run.rejected == 2
     assert '2 keyframes, 1 closures' in recorder.note()
+
+
+def test_frames_and_their_detections_in_either_order_are_there_to_be_audited(recorder):
+    for k in range(1, 6):
+        z = np.array([[2.0 + k, 1.0], [4.0, 0.5]])
+        none = np.full(2, np.nan)
+        d = Detections(k * SECOND, 'base_link', z, np.tile(1e-4 * np.eye(2), (2, 1, 1)),
+                       np.full(2, -1), none)  # fmt: skip
+        f = frame(k, Level.OK, 0.0)
+        f = replace(
+            f, T_map_base=np.array([0.5 * k, 0.0, 0.0]),
+            observation=replace(f.observation, detections=d),
+            landmarks=np.zeros(2, np.int64), statuses=np.zeros(2, np.int64),
+        )  # fmt: skip
+        recorder.on_pose(pose(k, 0.5 * k))
+        associated = build_associated(make, f, 'base_link')
+        if k % 2:
+            recorder.on_frame(record(f))
+            recorder.on_associated(associated)
+        else:
+            recorder.on_associated(associated)
+            recorder.on_frame(record(f))
+    log = recorder.run('drive').frames.sightings
+    seen = log.sightings(np.zeros(0, np.int64), np.zeros((0, 3)))
+    assert_allclose(seen.poses[:, 0], [0.5, 1.0, 1.5, 2.0, 2.5])
+    assert_array_equal(seen.scan, np.repeat(np.arange(5), 2))
+    assert_allclose(seen.points[::2, 0], [3.0, 4.0, 5.0, 6.0, 7.0])

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -29,7 +30,7 @@ from rlml_slam.ros.codecs.update_message import UpdateSummary, read_update
 from rlml_slam.ros.sensors import LATCHED
 from rlml_slam.ros.systems.simulator_messages import TRUE_REFLECTORS
 from rlml_slam.se2 import Array
-from rlml_slam.types import Detections, Health, Level, Reflectors, Status
+from rlml_slam.types import Detections, Frame, Health, Level, Reflectors, Status
 
 SCAN = ('scan', 'sensor_msgs/msg/LaserScan')
 DEEP = QoSProfile(depth=1000)  # of the small messages, none may be lost
@@ -60,6 +61,8 @@ class Recorder(Node):
         self.distance = 0.0
         self._sensor_heard: dict[int, float] = {}
         self._healths: dict[int, Health] = {}
+        self._frame_of: dict[int, Frame] = {}
+        self._detections_of: dict[int, Detections] = {}
         self._answers: dict[int, tuple[Level, float]] = {}
         self._seen: dict[int, tuple[int, int]] = {}
         self._updates: list[UpdateSummary] = []
@@ -124,9 +127,11 @@ class Recorder(Node):
             self.latency_ms.append((now - heard) * 1e3)
 
     def on_frame(self, msg: PointCloud2) -> None:
-        """What the front end says of one pose: its level of health, and its cost."""
+        """What the front end says of one pose: its health and its cost."""
         frame = read_record(msg).of.frame
         self._answers[frame.stamp] = (frame.health.level, frame.wall_ms)
+        self._frame_of[frame.stamp] = frame
+        self._pair(frame.stamp)
 
     def on_points(self, data: bytes) -> None:
         """The end points of one scan, serialized: few of them are looked into."""
@@ -138,10 +143,23 @@ class Recorder(Node):
             self.frames.scans.skip()
 
     def on_associated(self, msg: PointCloud2) -> None:
-        """The detections of one pose: how many, and how many were used."""
+        """The detections of one pose, and how many were used."""
         associated = read_associated(msg)
         used = int(np.sum(associated.statuses == Status.USED))
-        self._seen[associated.detections.stamp] = (len(associated.statuses), used)
+        stamp = associated.detections.stamp
+        self._seen[stamp] = (len(associated.statuses), used)
+        self._detections_of[stamp] = associated.detections
+        self._pair(stamp)
+
+    def _pair(self, stamp: int) -> None:
+        """A frame and its detections, which come in either order, are what an audit needs."""
+        if stamp in self._frame_of and stamp in self._detections_of:
+            frame = self._frame_of[stamp]
+            seen = replace(frame.observation, detections=self._detections_of[stamp])
+            self.frames.sightings.add(replace(frame, observation=seen))
+            for waiting in (self._frame_of, self._detections_of):
+                for old in [t for t in waiting if t <= stamp]:
+                    del waiting[old]
 
     def on_update(self, msg: PointCloud2) -> None:
         """What one keyframe did, and its cost."""
@@ -244,7 +262,7 @@ class Recorder(Node):
 
     def _log(self) -> FrameLog:
         """The poses as published, each with its own health, detections and cost."""
-        log, live = FrameLog(), self.frames
+        log, live = FrameLog(sightings=self.frames.sightings), self.frames
         for stamp, pose, cov in zip(live.stamps, live.poses, live.covs, strict=True):
             level, wall_ms = self._answers.get(stamp, (Level.OK, None))
             log.add_pose(stamp, pose, cov, Health(level, self._reasons(stamp, level)))
