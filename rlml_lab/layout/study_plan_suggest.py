@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,6 +32,7 @@ from rlml_slam.planning.coverage import Choice, start
 from rlml_slam.planning.mounts import wall_mounts
 from rlml_slam.planning.plan import Goal, make_plan
 from rlml_slam.planning.suggest import Wanted, coverage, suggest, suggested
+from rlml_slam.report.plan_page import write_plan
 from rlml_slam.se2 import Array
 from rlml_slam.simulation.world_file import load_world
 
@@ -161,7 +164,7 @@ def layout(name: str, seeds: int) -> dict[str, Any]:
 
 
 def speed() -> Rows:
-    """Processor time for 10 000 m^2 and 100 reflectors: the plan, and 20 suggestions."""
+    """Processor time for 10 000 m^2 and 100 reflectors: plan, its files, and 20 suggestions."""
     site = sites.of_world(large_hall())
     rows = []
 
@@ -176,6 +179,9 @@ def speed() -> Rows:
     places = sites.places(site, 0.25, 0.3)
     goal = Goal(0.01)
     timed('plan', 10.0, lambda: make_plan(site, places, P, SENSOR, goal))
+    with tempfile.TemporaryDirectory() as out:
+        timed('plan with pictures', 10.0, lambda: write_plan(
+            make_plan(site, places, P, SENSOR, goal), 'hall', Path(out)))  # fmt: skip
     timed('suggest 20', 60.0, lambda: suggested(
         site, wall_mounts(site, 1.0), places, P, SENSOR, Wanted(20, goal)))  # fmt: skip
     return rows

@@ -29,7 +29,7 @@ class Bound(NamedTuple):
     """Sigmas (n,) of position, in its worst direction [m], and heading [rad].
 
     ``hidden`` (n, 2): of position with the worst one, the worst two reflectors hidden.
-    ``information`` (n, 6) without any hidden. Infinite where it is open.
+    NaN where it was not asked for. ``information`` (n, 6) without any hidden. Infinite where open.
     """
 
     position: Array
@@ -53,33 +53,39 @@ def reflector_information(offsets: Array, cov: Array, p: Reflector) -> Array:
 def sigmas(information: Array) -> tuple[Array, Array]:
     """Position sigma [m] in the worst direction and heading sigma [rad], of rows (..., 6)."""
     xx, xy, xt, yy, yt, tt = np.moveaxis(information, -1, 0)
-    a, b, c = schur(information)
-    mean, least = 0.5 * (a + c), OPEN * (xx + yy)
-    weakest = mean - np.sqrt((0.5 * (a - c)) ** 2 + b * b)
     with np.errstate(divide='ignore', invalid='ignore'):
-        position = np.where(weakest > least, weakest**-0.5, np.inf)
         det = xx * yy - xy * xy
         rest = tt - (yy * xt * xt - 2.0 * xy * xt * yt + xx * yt * yt) / det
         heading = np.where((det > 0.0) & (rest > OPEN * tt), rest**-0.5, np.inf)
-    return position, heading
+    return position_sigma(information), heading
+
+
+def position_sigma(information: Array) -> Array:
+    """Sigma [m] in the worst direction, of rows (..., 6)."""
+    a, b, c = schur(information)
+    weakest = 0.5 * (a + c) - np.sqrt((0.5 * (a - c)) ** 2 + b * b)
+    least = OPEN * (information[..., 0] + information[..., 3])
+    with np.errstate(divide='ignore', invalid='ignore'):
+        return np.where(weakest > least, weakest**-0.5, np.inf)
 
 
 def bound(
     places: Array, seen: NDArray[np.bool_], reflectors: Array, cov: Array, p: Reflector,
-    also: Array | None = None, q: float = math.inf,
+    also: Array | None = None, q: float = math.inf, hide: bool = True,
 ) -> Bound:  # fmt: skip
     """The bound at places (n, 2) that see (n, m) reflectors (m, 2) with covariances (m, 2, 2).
 
     ``also`` (n, 6): information from elsewhere, such as the scan. ``q`` [m^2]: while driving, with
-    that variance of odometry from scan to scan; infinite for a single scan.
+    that variance of odometry from scan to scan; infinite for a single scan. ``hide``: also with
+    the worst ones hidden, which takes most of the time.
     """
     n = len(places)
     total, hidden = np.zeros((n, 6)), np.zeros((n, 2))
     also = np.zeros((n, 6)) if also is None else also
 
-    def sigmas_at(rows: NDArray[np.int64] | slice, information: Array) -> tuple[Array, Array]:
+    def with_all(rows: NDArray[np.int64] | slice, information: Array) -> Array:
         more = predicted(information, q) if math.isfinite(q) else 0.0
-        return sigmas(information + more + also[rows])
+        return information + more + also[rows]
 
     for first in range(0, n, CHUNK):
         rows, columns = np.nonzero(seen[first : first + CHUNK])
@@ -89,12 +95,13 @@ def bound(
         starts = np.flatnonzero(np.diff(rows, prepend=-1))
         if len(starts):
             total[rows[starts]] = np.add.reduceat(each, starts)
-        _hide(total, rows, each, hidden, lambda at, left: sigmas_at(at, left)[0])
-    position, heading = sigmas_at(slice(None), total)
-    few = seen.sum(axis=1)
-    nothing = sigmas(also)[0]
+        if hide:
+            _hide(total, rows, each, hidden,
+                  lambda at, left: position_sigma(with_all(at, left)))  # fmt: skip
+    position, heading = sigmas(with_all(slice(None), total))
+    few, nothing = seen.sum(axis=1), position_sigma(also)
     for k in range(2):  # with fewer in view, all are hidden
-        hidden[:, k] = np.where(few <= k, nothing, hidden[:, k])
+        hidden[:, k] = np.where(few <= k, nothing, hidden[:, k]) if hide else np.nan
     return Bound(position, heading, hidden, total + also)
 
 

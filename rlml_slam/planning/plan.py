@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from rlml_slam import se2
 from rlml_slam.errors import MapError
 from rlml_slam.params import Parameters, SimulatorParameters
-from rlml_slam.planning.bound import Bound, bound, sigmas
+from rlml_slam.planning.bound import Bound, bound, position_sigma
 from rlml_slam.planning.driving import motion_variance
 from rlml_slam.planning.regular_patterns import rows_of
 from rlml_slam.planning.samples import patterns, rival, scan_information
@@ -55,7 +55,8 @@ class Plan:
     """Values at places (n, 2), of the worst heading where the laser does not see all around.
 
     ``in_view`` (n,) reflectors; bounds by ``reflectors`` alone, by the ``scan`` and by ``both``
-    in a single scan; by both while ``driving``, which the ``goal`` is for.
+    in a single scan; by both while ``driving``, which the ``goal`` is for, and which alone has
+    sigmas with reflectors hidden.
     At ``sampled`` (s,) places: ``verdicts`` and the ``rivals`` (s, 3) they may be mistaken for.
     """
 
@@ -101,8 +102,8 @@ def make_plan(
     for heading in np.arange(1 if whole else HEADINGS) * (2.0 * np.pi / HEADINGS):
         in_view = seen if whole else seen & within(places, points, heading, fov)
         scan = scans_at(site, places, heading, p, sensor)
-        alone.append(bound(places, in_view, points, site.cov, p.reflector))
-        both.append(bound(places, in_view, points, site.cov, p.reflector, scan))
+        alone.append(bound(places, in_view, points, site.cov, p.reflector, hide=False))
+        both.append(bound(places, in_view, points, site.cov, p.reflector, scan, hide=False))
         q = goal.variance(p, sensor)
         driving.append(bound(places, in_view, points, site.cov, p.reflector, scan, q))
         scans.append(scan)
@@ -220,7 +221,7 @@ def _figures(plan: Plan, mine: NDArray[np.bool_]) -> dict[str, Any]:
 
 def scan_sigma(plan: Plan) -> Array:
     """Position sigma (n,) by the scan alone."""
-    return sigmas(plan.scan)[0]
+    return position_sigma(plan.scan)
 
 
 def _percentiles(values: Array) -> dict[str, float | None]:

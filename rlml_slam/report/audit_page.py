@@ -83,10 +83,12 @@ def _picture(audit: Audit) -> bytes:
 def _page(name: str, audit: Audit, image: bytes) -> str:
     f = audit.figures
     kinds = ', '.join(dict.fromkeys(g.kind.value for g in audit.findings)) or 'all is as planned'
+    n = len(audit.findings)
+    count = '1 finding' if n == 1 else f'{n} findings'
     parts = [
         heading(
             f'Audit of {name}',
-            f'{len(audit.findings)} findings: {kinds}. {f["scans"]} scans, {f["detections"]} '
+            f'{count}: {kinds}. {f["scans"]} scans, {f["detections"]} '
             f'detections, {f["unmatched"]} of which the layout does not have; '
             f'{f["usual_rate"]:.1%} of expected reflectors were seen',
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from rlml_slam.maps import survey_writer
@@ -24,11 +25,17 @@ from rlml_slam.planning.plan import Plan, figures, scan_sigma
 from rlml_slam.planning.suggest import Suggestion
 from rlml_slam.report.outputs import make_folder
 from rlml_slam.report.page import heading, page, picture, section, table
-from rlml_slam.report.pictures import LIVE, REFLECTOR, SOFT, draw_grid, dress, png
+from rlml_slam.report.pictures import LIVE, REFLECTOR, draw_grid, dress, png
 from rlml_slam.se2 import Array
 
-PIXELS = 1000
+PIXELS = 700  # of a side of the grid that is drawn
 MANY = 20_000  # places from which they are drawn as an image
+NEIGHBOURS = 2_000  # places by which their spacing is known
+FAST = 2  # compression of pictures
+MARGINS = (0.6, 1.2, 0.5, 0.15)  # [inch] left, right, below, above
+LABELS = {'view': 'reflectors', 'unique': 'unique'}
+LOWEST = 1.0  # [inch] a picture, even of a corridor
+LEGEND = 'White line: the goal. Red: not held.'
 CAPTIONS = {
     'view': 'Reflectors in view',
     'reflectors': 'Position sigma of one scan, by reflectors alone',
@@ -55,7 +62,8 @@ def write_plan(
         found['suggested'] = _suggested(suggestion, r.ids[len(r) - added :].tolist())
         layout = Survey(r.ids, r.points, r.widths)
         survey_writer.save(layout, plan.site.walls.segments[:, :4], len(r) - added, folder)
-    pictures = {k: _map(plan, k, v, added) for k, v in _values(plan).items()}
+    grid, raster = _coarse(plan.site.grid), _Raster.of(plan.places)
+    pictures = {k: _map(plan, k, v, added, grid, raster) for k, v in _values(plan).items()}
     for key, image in pictures.items():
         write_atomically(folder / f'{key}.png', image)
     site_file.save(plan.site, folder)
@@ -110,20 +118,48 @@ def suggestion_notes(found: Mapping[str, Any]) -> list[str]:
     return [f'{count} reach the goal{least}']
 
 
-def _map(plan: Plan, key: str, values: Array, added: int) -> bytes:
+@dataclass(frozen=True)
+class _Raster:
+    """Many places as the pixels ``cell`` (n, 2) of an image with the ``extent`` of its sides."""
+
+    cell: NDArray[np.int64]
+    extent: tuple[float, float, float, float]
+
+    @staticmethod
+    def of(places: Array) -> _Raster:
+        gap = cKDTree(places).query(places[:NEIGHBOURS], k=min(2, len(places)))[0]
+        side, low = float(np.median(gap.reshape(len(gap), -1)[:, -1])) or 1.0, places.min(axis=0)
+        cell = np.rint((places - low) / side).astype(np.int64)
+        corner = low - 0.5 * side
+        far = corner + side * (cell.max(axis=0) + 1)
+        return _Raster(cell, (corner[0], far[0], corner[1], far[1]))
+
+    def image(self, values: Array) -> Any:
+        """Values (n,), open ones masked, -1 where there is no place."""
+        wide, high = self.cell.max(axis=0) + 1
+        image = np.full((high, wide), -1.0)
+        image[self.cell[:, 1], self.cell[:, 0]] = values
+        return np.ma.masked_invalid(image)
+
+
+def _map(
+    plan: Plan, key: str, values: Array, added: int, grid: OccupancyGrid, raster: _Raster
+) -> bytes:
     """The places, coloured by a value; sigmas in cm up to three goals. The ``added`` in orange."""
     places = plan.places[plan.sampled] if key == 'unique' else plan.places
     low, high = plan.places.min(axis=0) - 1.5, plan.places.max(axis=0) + 1.5
     width, height = high - low
-    scale = 8.0 / max(width, height)
-    size = (max(4.0, width * scale) + 1.8, max(3.0, height * scale) + 0.9)
+    scale = min(8.0 / width, 9.0 / height)  # inch per metre
+    more = np.maximum(LOWEST / scale - (high - low), 0.0)
+    low, high = low - 0.5 * more, high + 0.5 * more
+    width, height = high - low
+    size = (width * scale + sum(MARGINS[:2]), height * scale + sum(MARGINS[2:]))
     figure = Figure(figsize=size)
-    axes = figure.add_axes(
-        (0.6 / size[0], 0.5 / size[1], 1.0 - 0.6 / size[0], 1.0 - 0.9 / size[1])
-    )
+    axes = figure.add_axes((MARGINS[0] / size[0], MARGINS[2] / size[1],
+                            width * scale / size[0], height * scale / size[1]))  # fmt: skip
     dress(axes, 'x [m]', 'y [m]')
     axes.grid(False)
-    draw_grid(axes, _coarse(plan.site.grid))
+    draw_grid(axes, grid)
     is_sigma = key not in ('view', 'unique')
     colours = colormaps['viridis_r' if is_sigma else 'viridis'].with_extremes(
         bad='#d9534f', under=(0.0, 0.0, 0.0, 0.0)
@@ -132,37 +168,28 @@ def _map(plan: Plan, key: str, values: Array, added: int) -> bytes:
     limits: Any = {'cmap': colours, 'vmin': 0.0, 'vmax': most, 'zorder': 2}
     values = 100.0 * values if is_sigma else values
     if len(places) > MANY:
-        image, extent = _image(places, values)
         drawn: Any = axes.imshow(
-            image, origin='lower', extent=extent, interpolation='nearest', **limits
-        )
+            raster.image(values), origin='lower', extent=raster.extent, interpolation='nearest',
+            **limits,
+        )  # fmt: skip
     else:
         # the side of a marker in points, so that markers of neighbours touch
         side = 72.0 * scale * np.sqrt(width * height / len(places))
-        limits |= {'s': min(side, 8.0) ** 2, 'marker': 's', 'linewidths': 0.0}
+        limits |= {'s': min(side, 12.0) ** 2, 'marker': 's', 'linewidths': 0.0}
         drawn = axes.scatter(places[:, 0], places[:, 1], c=values, plotnonfinite=True, **limits)
     points = plan.site.reflectors.points
     for part, colour in ((points[: len(points) - added], REFLECTOR),
                          (points[len(points) - added :], LIVE)):  # fmt: skip
         axes.plot(*part.T, 'D', color=colour, mec='white', ms=6, zorder=3)
-    label = 'sigma [cm], red: not held' if is_sigma else CAPTIONS[key]
-    figure.colorbar(drawn, ax=axes, label=label, extend='max' if is_sigma else 'neither')
     axes.set(aspect='equal', xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    axes.set_title(CAPTIONS[key], fontsize=10, color='black' if is_sigma else SOFT)
-    return png(figure)
-
-
-def _image(places: Array, values: Array) -> tuple[Any, tuple[float, float, float, float]]:
-    """Values of many places as an image, open ones masked, -1 where there is no place; extent."""
-    gap = cKDTree(places).query(places[:MANY], k=2)[0][:, 1]
-    side, low = float(np.median(gap)), places.min(axis=0)
-    cell = np.rint((places - low) / side).astype(np.int64)
-    wide, high = cell.max(axis=0) + 1
-    image = np.full((high, wide), -1.0)
-    image[cell[:, 1], cell[:, 0]] = values
-    corner = low - 0.5 * side
-    far = corner + side * np.array([wide, high])
-    return np.ma.masked_invalid(image), (corner[0], far[0], corner[1], far[1])
+    beside = axes.inset_axes((1.0 + 0.2 / (width * scale), 0.0, 0.2 / (width * scale), 1.0))
+    bar = figure.colorbar(
+        drawn, cax=beside, label=LABELS.get(key, 'sigma [cm]'),
+        extend='max' if is_sigma else 'neither',
+    )  # fmt: skip
+    if is_sigma:
+        bar.ax.axhline(100.0 * plan.goal.sigma, color='white', linewidth=2.0)
+    return png(figure, FAST)
 
 
 def _coarse(grid: OccupancyGrid) -> OccupancyGrid:
@@ -215,7 +242,8 @@ def _page(name: str, found: Mapping[str, Any], pictures: Mapping[str, bytes]) ->
         notes = _paragraphs(suggestion_notes(found))
         parts.append(section('Suggested reflectors', table(rows, head) + notes))
     for key, image in pictures.items():
-        parts.append(section(CAPTIONS[key], picture(image, CAPTIONS[key])))
+        legend = '' if key in LABELS else f'<p class="sub">{LEGEND}</p>'
+        parts.append(section(CAPTIONS[key], legend + picture(image, CAPTIONS[key])))
     size = found['area_size_m']
     head, *rows = table_rows(found)
     parts.append(section(f'Areas of {size:g} m, largest sigmas', table(rows, head)))

@@ -135,7 +135,7 @@ class Recorder(Node):
 
     def on_points(self, data: bytes) -> None:
         """The end points of one scan, serialized: few of them are looked into."""
-        stamp = stamp_of(data)
+        stamp = decode.serialized_stamp(data)
         if self.frames.scans.is_due():
             points = read_points(deserialize_message(data, PointCloud2))
             self.frames.scans.add(stamp, points)
