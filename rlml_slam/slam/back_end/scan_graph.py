@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam import se2
+from rlml_slam import params, se2
 from rlml_slam.graph import Graph
 from rlml_slam.matching.scans import scan_information, voxel_filter
 from rlml_slam.matching.scans.scan_match import match
@@ -27,8 +27,8 @@ COVERED = 0.8  # share of a submap's walls that a newer one must contain to repl
 class ScanGraph:
     """Submaps of keyframes; ``finished`` ones are searched for loop closures."""
 
-    def __init__(self, params: Parameters, graph: Graph) -> None:
-        self._p = params
+    def __init__(self, parameters: Parameters, graph: Graph) -> None:
+        self._p = parameters
         self._graph = graph
         self._active: list[KeyframeSubmap] = []
         self.finished: list[KeyframeSubmap] = []
@@ -116,9 +116,12 @@ class ScanGraph:
 
     def _is_covered(self, old: KeyframeSubmap, new: KeyframeSubmap) -> bool:
         """Whether the walls of one submap are known to another one."""
+        return self._knows(new, old, old.walls)
+
+    def _knows(self, new: KeyframeSubmap, old: KeyframeSubmap, walls: Array) -> bool:
         poses = self._graph.poses
         T = se2.between(new.grid_pose(poses), old.grid_pose(poses))
-        return len(old.walls) > 0 and new.submap.knows(se2.transform(T, old.walls)) >= COVERED
+        return len(walls) > 0 and new.submap.knows(se2.transform(T, walls)) >= COVERED
 
     def move_anchors(self, pose: int, onto: Keyframe) -> None:
         """Keyframe ``pose`` is removed: attach its finished submaps to another keyframe."""
@@ -131,7 +134,11 @@ class ScanGraph:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The submaps, to be saved."""
         maps = [m for m in self.finished + self._active if m.size]
-        cells = [m.submap.values.ravel() for m in maps]
+        shapes = [m.submap.values.shape for m in maps]
+        ends = np.cumsum([0, *(rows * columns for rows, columns in shapes)])
+        cells = np.empty(ends[-1], dtype=np.uint16)
+        for m, begin, end in zip(maps, ends[:-1].tolist(), ends[1:].tolist(), strict=True):
+            cells[begin:end] = m.submap.values.ravel()
 
         def pairs(rows: Iterable[tuple[int, int]]) -> NDArray[np.int64]:
             return np.array(list(rows), dtype=np.int64).reshape(-1, 2)
@@ -142,24 +149,65 @@ class ScanGraph:
             'submap_size': pairs((m.size, m.submap.insertions) for m in maps),
             'submap_centre': np.array([m.centre for m in maps]).reshape(-1, 2),
             'submap_corner': pairs(m.submap.corner for m in maps),
-            'submap_shape': pairs(m.submap.values.shape for m in maps),
-            'submap_cells': np.concatenate([np.zeros(0, dtype=np.uint16), *cells]),
+            'submap_shape': pairs(shapes),
+            'submap_cells': cells,
         }
 
     def restore(self, arrays: Mapping[str, NDArray[Any]], keys: Sequence[Keyframe]) -> None:
         """Continue with the submaps of a saved map; all are finished."""
-        a = arrays
-        ends = np.cumsum(a['submap_shape'].prod(-1))
-        for k, (rows, columns) in enumerate(a['submap_shape'].tolist()):
-            submap = Submap(self._p.submap)
-            cells = a['submap_cells'][ends[k] - rows * columns : ends[k]]
-            submap.values = cells.reshape(rows, columns).copy()
-            submap.corner = (int(a['submap_corner'][k, 0]), int(a['submap_corner'][k, 1]))
-            size, submap.insertions = a['submap_size'][k].tolist()
-            submap.complete()
+        self.add_finished(saved_submaps(arrays, self._p.submap), keys)
+
+    def add_finished(self, saved: Iterable[SavedSubmap], keys: Sequence[Keyframe]) -> None:
+        """Finished submaps of the keyframes ``keys``, whose indices their anchors are."""
+        for s in saved:
             self.finished.append(
-                KeyframeSubmap(
-                    keys[int(a['submap_anchor'][k])], submap, size,
-                    a['submap_centre'][k].copy(), a['submap_pose'][k].copy(),
-                )
-            )  # fmt: skip
+                KeyframeSubmap(keys[s.anchor], s.submap, s.size, s.centre, s.T_anchor_grid)
+            )
+
+    def drop_covered(self, new: Sequence[KeyframeSubmap]) -> None:
+        """Drop the finished submaps that one of the ``new`` ones covers, where places are few.
+
+        Where ``keyframes_per_place`` is 0, all are kept.
+        """
+        if not self._p.back_end.keyframes_per_place or not new:
+            return
+        poses, near = self._graph.poses, self._p.loop_closure.max_distance
+
+        def middles(maps: Sequence[KeyframeSubmap]) -> Array:
+            return np.array([se2.transform(m.grid_pose(poses), m.centre[None])[0] for m in maps])
+
+        gap = np.linalg.norm(middles(self.finished)[:, None] - middles(new), axis=-1)
+        kept = []
+        for m, row in zip(self.finished, gap, strict=True):
+            beside = [n for n, d in zip(new, row, strict=True) if d < near and n is not m]
+            walls = m.submap.walls() if beside and m not in new else np.zeros((0, 2))
+            if not any(self._knows(n, m, walls) for n in beside):
+                kept.append(m)
+        self.finished = kept
+
+
+class SavedSubmap(NamedTuple):
+    """A finished submap of a map file; ``anchor`` is the index of its keyframe."""
+
+    anchor: int
+    submap: Submap
+    size: int
+    centre: Array
+    T_anchor_grid: Array
+
+
+def saved_submaps(arrays: Mapping[str, NDArray[Any]], p: params.Submap) -> Iterator[SavedSubmap]:
+    """The submaps of a saved map, one at a time."""
+    a = arrays
+    ends = np.cumsum(a['submap_shape'].prod(-1))
+    for k, (rows, columns) in enumerate(a['submap_shape'].tolist()):
+        submap = Submap(p)
+        cells = a['submap_cells'][ends[k] - rows * columns : ends[k]]
+        submap.values = cells.reshape(rows, columns).copy()
+        submap.corner = (int(a['submap_corner'][k, 0]), int(a['submap_corner'][k, 1]))
+        size, submap.insertions = a['submap_size'][k].tolist()
+        submap.complete()
+        yield SavedSubmap(
+            int(a['submap_anchor'][k]), submap, size, a['submap_centre'][k].copy(),
+            a['submap_pose'][k].copy(),
+        )  # fmt: skip

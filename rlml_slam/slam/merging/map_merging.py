@@ -9,7 +9,7 @@ a time is read; what stays in memory is the merged one.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,9 +22,11 @@ from rlml_slam.errors import MapError, RlmlError
 from rlml_slam.graph import relative_information
 from rlml_slam.maps.map_container import Content
 from rlml_slam.maps.survey import Survey, same
-from rlml_slam.params import Parameters
+from rlml_slam.matching.scans.packed_submap import PackedSubmap, Unpacked
+from rlml_slam.params import LoopClosure, Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.back_end.back_end import BackEnd
+from rlml_slam.slam.back_end.scan_graph import SavedSubmap, saved_submaps
 from rlml_slam.slam.keyframes import JUMP_SIGMA
 from rlml_slam.slam.merging.placement import Placement
 from rlml_slam.slam.merging.site_map import Session, Site, session_of
@@ -122,11 +124,13 @@ def assemble(
     if not placed.is_in_survey_frame:
         poses = se2.between(poses[0], poses)
     maps: list[Arrays] = []
-    sizes = [Sizes()]
+    submaps: list[SavedSubmap] = []
+    sizes, unpacked = [Sizes()], Unpacked()
     for session, T in zip(site.sessions, poses, strict=True):
         content = read(session)
         own = _moved(dict(content.arrays), T, is_first=not maps)
         maps.append(_shifted(own, sizes[-1]))
+        submaps += _packed(maps[-1], params, unpacked)
         sizes.append(sizes[-1].after(own))
     arrays, description = _joined(maps), content.description
     if survey is not None and placed.is_in_survey_frame:
@@ -135,14 +139,13 @@ def assemble(
     map_file.restore(Content(arrays, description), back_end)
     paths = {name: arrays[name] for name in ('path', 'path_motion')}
     arrays.clear()
+    back_end.scan_graph.add_finished(submaps, back_end.keyframes)
     first_pose = [n.poses for n in sizes[:-1]]
     for begin in first_pose[1:]:
         _connect(back_end, begin)
     joined = _tie(back_end, site, [n.keys for n in sizes[:-1]])
     back_end.optimize_after_join()
-    accepted = 0
-    if params.loop_closure.enabled:
-        accepted = _close(back_end, first_pose, params.loop_closure.keyframe_interval)
+    accepted = _close(back_end, first_pose, params.loop_closure)
     back_end.optimize(final=True)
     made = map_file.content_of(back_end, params, back_end.occupancy_grid())
     content = Content({**made.arrays, **paths}, made.description)
@@ -169,17 +172,32 @@ def _connect(back_end: BackEnd, begin: int) -> None:
     graph.add_edge(EdgeKind.ODOMETRY, begin - 1, begin, delta, information)
 
 
-def _close(back_end: BackEnd, first_pose: list[int], every: int) -> int:
-    """Loop closures of each map's keyframes with the submaps of the maps before; how many."""
-    accepted = 0
-    for begin, end in zip(first_pose[1:], [*first_pose[2:], None], strict=True):
-        submaps = [m for m in back_end.scan_graph.finished if m.anchor.index < begin]
-        for key in back_end.keyframes[begin:end:every]:
-            points = back_end.scan_graph.thinned(key)
-            if points is not None:
-                closures = back_end.loop_closer.match(key, points, submaps)
+def _close(back_end: BackEnd, first_pose: list[int], p: LoopClosure) -> int:
+    """Loop closures of each map's keyframes with the submaps of the maps before; how many.
+
+    Then a map's submaps replace those before that they cover, so that their number is bounded by
+    the area.
+    """
+    accepted, graph = 0, back_end.scan_graph
+    for begin, end in itertools.pairwise([*first_pose, len(back_end.keyframes)]):
+        before = [m for m in graph.finished if m.anchor.index < begin]
+        for key in back_end.keyframes[begin : end : p.keyframe_interval]:
+            points = graph.thinned(key)
+            if points is not None and before and p.enabled:
+                closures = back_end.loop_closer.match(key, points, before)
                 accepted += sum(c.accepted for c in closures)
+        if before:
+            graph.drop_covered([m for m in graph.finished if begin <= m.anchor.index < end])
     return accepted
+
+
+def _packed(a: Arrays, params: Parameters, unpacked: Unpacked) -> Iterator[SavedSubmap]:
+    """The submaps of a map, with compressed cells, which leave its arrays."""
+    own = {name: a[name] for name in list(a) if name.startswith('submap_')}
+    for name, array in own.items():
+        a[name] = array[:0]
+    for s in saved_submaps(own, params.submap):
+        yield s._replace(submap=PackedSubmap(s.submap, unpacked))
 
 
 def _keys(a: Any) -> list[int]:

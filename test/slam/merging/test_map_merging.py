@@ -16,8 +16,10 @@ from rlml_slam.matching.reflectors.constellation import locate
 from rlml_slam.params import Parameters, Relocalization
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.back_end.trajectory import poses_of
-from rlml_slam.slam.merging.map_merging import merge_files, merge_maps
+from rlml_slam.slam.merging.map_merging import assemble, merge_files, merge_maps
 from rlml_slam.slam.merging.placement import UNMATCHED_SHARE
+from rlml_slam.slam.merging.site_map import session_of, site_of
+from rlml_slam.slam.merging.site_tree import Placed
 from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.store import map_file
 from rlml_slam.types import Detections, Odometry, Scan, Verdict
@@ -212,3 +214,18 @@ def test_session_without_reflectors_is_placed_by_its_scans(two, tmp_path):
     assert list(placed.left_out) == [str(paths[2])]
     np.testing.assert_allclose(merged.poses[1], START, atol=0.1)
     assert merged.closures > 0
+
+
+@pytest.mark.parametrize('kept', [0, 6])
+def test_submaps_of_a_place_that_is_mapped_again_do_not_add_up(two, kept):
+    """The same session three times: its submaps are there once, or thrice if all are kept."""
+    params = replace(PARAMS, back_end=replace(PARAMS.back_end, keyframes_per_place=kept))
+    names = ['a', 'b', 'c']
+    sessions = [session_of(name, two[0]) for name in names]
+    site = site_of([(s, np.zeros(3)) for s in sessions])
+    made = assemble(Placed(site, {}, {}), lambda s: two[0], params)
+    once = len(two[0].arrays['submap_anchor'])
+    number = len(made.content.arrays['submap_anchor'])
+    assert number == 3 * once if kept == 0 else number <= 1.5 * once
+    cells = made.content.arrays['submap_shape'].prod(axis=1).sum()
+    assert len(made.content.arrays['submap_cells']) == cells
