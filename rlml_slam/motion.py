@@ -28,6 +28,8 @@ Stamps = NDArray[np.int64]
 # samples at least that are forgotten at once, and that are kept: what was before a gap is needed
 # after it, however long that lasted
 BATCH = 256
+# of the speed at which floor and slope of the noise are equal: no robot drives slower for long
+CREEP = 0.25
 COAST = 0.2  # [s] for which a robot is taken to go on as it went before its odometry ended
 # Share of the noise of a slow motion that is left where the wheels do not turn: what they miss is
 # less than a tick in all, and adds up to no walk. A larger one lets the noise of the first scan
@@ -48,15 +50,17 @@ def integrate(
 ) -> Array:
     """Compose control intervals (eq. 5, 7-9); all arguments ``(n,)``.
 
-    Returns ``(6, 3)``: the relative pose in row 0 (theta not wrapped), its covariance in rows 1-3,
+    Returns ``(7, 3)``: the relative pose in row 0 (theta not wrapped), its covariance in rows 1-3,
     its derivative by a bias of the turn rate in row 4 (``gyro`` is 1 where w is from the IMU), and
-    in row 5 that by the share by which the wheels turn too little, where w is from them.
+    in row 5 that by the share by which the wheels turn too little, where w is from them, and in
+    row 6 that by the turn per distance [rad/m] that they do not measure.
     The sideways variance ``var_lat`` is that of a velocity across the heading, which the notes'
     (v, omega) cannot express and which keeps the covariance regular.
     """
     x = y = th = 0.0
     bx = by = bt = 0.0
     sx = sy = st = 0.0
+    kx = ky = kt = 0.0
     P = np.zeros((3, 3))
     for k in range(len(v)):
         h = dt[k]
@@ -86,16 +90,21 @@ def integrate(
         sx += gx * st + more * wx
         sy += gy * st + more * wy
         st += more * h
+        far = (1.0 - gyro[k]) * v[k]
+        kx += gx * kt + far * wx
+        ky += gy * kt + far * wy
+        kt += far * h
         x += dx
         y += dy
         th += w[k] * h
-    out = np.empty((6, 3))
+    out = np.empty((7, 3))
     out[0, 0], out[0, 1], out[0, 2] = x, y, th
     out[1, 0], out[1, 1], out[1, 2] = P[0, 0], P[0, 1], P[0, 2]
     out[2, 0], out[2, 1], out[2, 2] = P[0, 1], P[1, 1], P[1, 2]
     out[3, 0], out[3, 1], out[3, 2] = P[0, 2], P[1, 2], P[2, 2]
     out[4, 0], out[4, 1], out[4, 2] = bx, by, bt
     out[5, 0], out[5, 1], out[5, 2] = sx, sy, st
+    out[6, 0], out[6, 1], out[6, 2] = kx, ky, kt
     return out
 
 
@@ -107,6 +116,7 @@ def compose_motion(first: Motion, second: Motion) -> Motion:
     cov = J_a @ first.cov @ J_a.T + J_b @ second.cov @ J_b.T
     bias_gain = J_a @ first.bias_gain + J_b @ second.bias_gain
     turn_gain = J_a @ first.turn_gain + J_b @ second.turn_gain
+    drift_gain = J_a @ first.drift_gain + J_b @ second.drift_gain
     # what the two say of the bias, weighted; the weight of one that says nothing is zero
     weight = 1.0 / first.bias_var + 1.0 / second.bias_var
     var = 1.0 / weight if weight > 0.0 else math.inf
@@ -120,6 +130,8 @@ def compose_motion(first: Motion, second: Motion) -> Motion:
         var,
         turn_gain,
         w_a * first.bias_turn + w_b * second.bias_turn,
+        drift_gain,
+        w_a * first.bias_way + w_b * second.bias_way,
     )
 
 
@@ -181,8 +193,8 @@ def _drive(
     imu_stamps: Stamps,
     rates: Array,
     n: _Noise,
-) -> tuple[Array, bool, float, float, float]:
-    """Motion between two stamps: that of integrate(), known, bias, its variance, bias_turn.
+) -> tuple[Array, bool, float, float, float, float]:
+    """Motion between two stamps: integrate(), known, bias, its variance, bias_turn, bias_way.
 
     ``twists`` (k, 3) are the velocities of the intervals that end at the odometry's ``stamps``,
     ``rates`` those measured by the IMU at its own. Between two stamps of either, the control is
@@ -206,7 +218,7 @@ def _drive(
     cuts[m] = end
     rows = np.empty((8, m))
     all_known = True
-    weight = weighted = turned = 0.0
+    weight = weighted = turned = drove = 0.0
     open2 = turned2 = 0.0  # [s^2] near the end of a long gap, of which odometry says nothing
     for k in range(m):
         dt = (cuts[k + 1] - cuts[k]) / SECOND
@@ -225,7 +237,8 @@ def _drive(
         sigma_v, sigma_w = n.max_speed / 5.0, n.max_turn_rate / 5.0
         if known:
             speed, turn = twists[at, 0], twists[at, 2]
-            fast, quick, long_interval_noise = abs(speed), abs(turn), 0.0
+            moved = _share_moved(abs(speed), abs(turn), n) if gap > n.max_gap else 1.0
+            fast, quick, long_interval_noise = abs(speed) / moved, abs(turn) / moved, 0.0
             if gap > 2.0 * n.noise_interval:
                 # when inside a long interval the motion happened is uncertain; what is left of it
                 # at the end is less than what was driven: at least as fast as before, and no arc
@@ -238,6 +251,7 @@ def _drive(
                 speed, sideways = chord * speed, chord * twists[at, 1]
             sigma_v = (n.speed_noise + long_interval_noise) * fast + n.speed_noise_floor
             sigma_w = (n.turn_noise + long_interval_noise) * quick + n.turn_noise_floor
+            sigma_v, sigma_w = math.sqrt(moved) * sigma_v, math.sqrt(moved) * sigma_w
         # the wheels do not turn: so does the robot not, and the IMU shows its bias
         stands = known and speed == 0.0 and sideways == 0.0 and turn == 0.0
         if stands:
@@ -269,6 +283,7 @@ def _drive(
             weight += 1.0 / (bias_sigma**2 * scale)
             weighted += bias / (bias_sigma**2 * scale)
             turned += gyro * rate / (bias_sigma**2 * scale)
+            drove += gyro * speed / (bias_sigma**2 * scale)
     out = integrate(
         rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6], rows[7]
     )  # fmt: skip
@@ -276,8 +291,19 @@ def _drive(
     out[2, 1] += open2 * (n.max_speed / 5.0) ** 2
     out[3, 2] += turned2 * (n.max_turn_rate / 5.0) ** 2
     if weight > 0.0:
-        return out, all_known, weighted / weight, 1.0 / weight, turned / weight
-    return out, all_known, 0.0, np.inf, 0.0
+        return out, all_known, weighted / weight, 1.0 / weight, turned / weight, drove / weight
+    return out, all_known, 0.0, np.inf, 0.0, 0.0
+
+
+@part
+def _share_moved(speed: float, turn: float, n: _Noise) -> float:
+    """Share of a long gap in which the robot moved, by its mean speed and turn rate; at most 1.
+
+    It may have stood for most of the gap, and wheels that stand add no noise.
+    """
+    share = speed * n.speed_noise / max(CREEP * n.speed_noise_floor, 1e-9)
+    share += turn * n.turn_noise / max(CREEP * n.turn_noise_floor, 1e-9)
+    return min(max(share, 1e-3), 1.0)
 
 
 @part
@@ -438,7 +464,10 @@ class MotionBuffer:
             cov[2, 2] = unmeasured.cov[2, 2]
         delta = se2.exp(np.array([twist[0] * coasted, twist[1] * coasted, turn]))
         turn_gain = np.zeros(3) if has_gyro else np.array([0.0, 0.0, turn])
-        rest = Motion(delta, cov, False, unmeasured.bias_gain, turn_gain=turn_gain)
+        drift_gain = np.zeros(3) if has_gyro else np.array([0.0, 0.0, delta[0]])
+        rest = Motion(
+            delta, cov, False, unmeasured.bias_gain, turn_gain=turn_gain, drift_gain=drift_gain
+        )
         return compose_motion(covered, rest)
 
     def forget_after(self, stamp: int) -> None:
@@ -475,7 +504,7 @@ class MotionBuffer:
             return STILL
         odometry = _around(self._stamps, start, end, int(self._noise.noise_interval * SECOND))
         imu = _around(self._imu_stamps, start, end)
-        out, known, bias, variance, turned = _drive(
+        out, known, bias, variance, turned, drove = _drive(
             start, end,
             np.array(self._stamps[odometry], dtype=np.int64),
             np.array(self._twists[odometry], dtype=np.float64).reshape(-1, 3),
@@ -484,7 +513,9 @@ class MotionBuffer:
             self._noise_values,
         )  # fmt: skip
         out[0, 2] = se2.wrapped(out[0, 2])
-        return Motion(out[0], out[1:4], known, out[4], bias, variance, out[5], turned)
+        return Motion(
+            out[0], out[1:4], known, out[4], bias, variance, out[5], turned, out[6], drove
+        )
 
 
 def warm_up() -> None:

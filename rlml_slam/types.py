@@ -78,10 +78,12 @@ class Motion:
     ``delta`` that of a bias of zero; ``bias`` [rad/s] is the bias measured by comparing IMU and
     wheels, with variance ``bias_var``, infinite without an IMU.
 
-    Wheel odometry has slowly varying scale errors of speed and turn, which ``delta`` does not
-    include. If the turn is that of the wheels, ``turn_gain`` (3,) is d delta / d (scale error of
-    turn); if it is that of the IMU, the bias is ``bias`` plus ``bias_turn`` [rad/s] times that
-    error. The scale error of speed needs no gain: its derivative is (x, y) of ``delta``.
+    Wheel odometry has slowly varying scale errors of speed and turn, and a turn per distance
+    that it does not measure (of unequal wheels, or of a steering that is off its zero). ``delta``
+    does not include them. If the turn is that of the wheels, ``turn_gain`` (3,) and ``drift_gain``
+    (3,) are d delta / d (scale error of turn, turn per distance). If it is that of the IMU, the
+    bias is ``bias`` plus ``bias_turn`` [rad/s] and ``bias_way`` [m/s] times these errors. The
+    scale error of speed needs no gain: its derivative is (x, y) of ``delta``.
     """
 
     delta: Array
@@ -92,6 +94,8 @@ class Motion:
     bias_var: float = np.inf
     turn_gain: Array = field(default_factory=lambda: np.zeros(3))
     bias_turn: float = 0.0
+    drift_gain: Array = field(default_factory=lambda: np.zeros(3))
+    bias_way: float = 0.0
 
 
 @dataclass(frozen=True)

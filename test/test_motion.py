@@ -120,6 +120,22 @@ def test_turn_gain_is_the_derivative_by_what_the_wheels_turn_too_little():
     assert np.abs(gain).min() > 0.01
 
 
+def test_drift_gain_is_the_derivative_by_the_turn_per_distance():
+    rng = np.random.default_rng(4)
+    v, w, dt = rng.normal(0.5, 1.0, 7), rng.normal(0.0, 1.0, 7), rng.uniform(0.05, 0.3, 7)
+    gyro = np.array([1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0])
+    zero, side = np.zeros(7), np.linspace(-0.2, 0.3, 7)
+
+    def moved(drift):
+        turn = w + (1.0 - gyro) * drift[0] * v
+        return integrate(v, turn, dt, zero, zero, zero, gyro, side)[0]
+
+    gain = central_differences(moved, np.zeros(1))[:, 0]
+    out = integrate(v, w, dt, zero, zero, zero, gyro, side)
+    np.testing.assert_allclose(out[6], gain, atol=1e-8)
+    assert np.abs(gain).min() > 0.01
+
+
 def test_way_is_its_own_derivative_by_the_share_of_speed():
     rng = np.random.default_rng(5)
     v, w, dt = rng.normal(0.5, 1.0, 7), rng.normal(0.0, 1.0, 7), rng.uniform(0.05, 0.3, 7)
@@ -163,13 +179,14 @@ def test_composition_is_the_integration_in_parts():
         ]
     )  # fmt: skip
     parts = [integrate(*np.ascontiguousarray(r)) for r in (rows, rows[:, :3], rows[:, 3:])]
-    both, a, b = (Motion(p[0], p[1:4], True, p[4], turn_gain=p[5]) for p in parts)
+    both, a, b = (Motion(p[0], p[1:4], True, p[4], turn_gain=p[5], drift_gain=p[6]) for p in parts)
     c = compose_motion(a, b)
     np.testing.assert_allclose(c.delta[:2], both.delta[:2], atol=1e-12)
     assert abs(se2.wrap(c.delta[2] - both.delta[2])) < 1e-12
     np.testing.assert_allclose(c.cov, both.cov, atol=1e-12)
     np.testing.assert_allclose(c.bias_gain, both.bias_gain, atol=1e-12)
     np.testing.assert_allclose(c.turn_gain, both.turn_gain, atol=1e-12)
+    np.testing.assert_allclose(c.drift_gain, both.drift_gain, atol=1e-12)
 
 
 def test_composition_weighs_what_its_parts_say_of_the_bias():
@@ -180,6 +197,7 @@ def test_composition_weighs_what_its_parts_say_of_the_bias():
     assert parts.bias == pytest.approx(whole.bias, rel=1e-9)
     assert parts.bias_var == pytest.approx(whole.bias_var, rel=1e-9)
     assert parts.bias_turn == pytest.approx(whole.bias_turn, rel=1e-9)
+    assert parts.bias_way == pytest.approx(whole.bias_way, rel=1e-9)
     silent = Motion(np.zeros(3), np.zeros((3, 3)))
     assert compose_motion(silent, silent).bias_var == math.inf
 
@@ -187,7 +205,7 @@ def test_composition_weighs_what_its_parts_say_of_the_bias():
 def test_standing_still_is_the_identity_of_composition():
     m = Motion(
         np.array([1.0, 0.2, 0.3]), np.diag([1.0, 2.0, 3.0]), True, np.arange(3.0), 0.01, 1e-4,
-        np.array([0.1, -0.2, 0.3]), 0.4,
+        np.array([0.1, -0.2, 0.3]), 0.4, np.array([0.2, 0.1, -0.3]), 0.6,
     )  # fmt: skip
     for c in (compose_motion(STILL, m), compose_motion(m, STILL)):
         np.testing.assert_allclose(c.delta, m.delta)
@@ -197,6 +215,8 @@ def test_standing_still_is_the_identity_of_composition():
         assert c.bias_var == pytest.approx(m.bias_var)
         np.testing.assert_allclose(c.turn_gain, m.turn_gain)
         assert c.bias_turn == pytest.approx(m.bias_turn)
+        np.testing.assert_allclose(c.drift_gain, m.drift_gain)
+        assert c.bias_way == pytest.approx(m.bias_way)
     unknown = Motion(np.zeros(3), np.eye(3), known=False)
     assert not compose_motion(m, unknown).known
     assert not compose_motion(unknown, m).known
@@ -292,6 +312,8 @@ def test_turn_rate_is_the_imus_where_there_is_one():
     assert m.cov[2, 2] == pytest.approx(sigma**2 * NOISE.noise_interval * 1.0, rel=1e-6)
     assert m.bias_gain[2] == pytest.approx(-1.0)
     np.testing.assert_array_equal(m.turn_gain, 0.0)
+    np.testing.assert_array_equal(m.drift_gain, 0.0)
+    assert m.bias_way == pytest.approx(1.0, rel=1e-6)
     # the difference of wheels and IMU is the bias, with the variance of both
     assert m.bias == pytest.approx(0.2, rel=1e-6)
     assert m.bias_turn == pytest.approx(0.7, rel=1e-6)
@@ -322,6 +344,7 @@ def test_gap_of_the_imu_is_bridged_by_the_wheels():
     assert m.delta[2] == pytest.approx(0.5)
     assert m.bias_gain[2] == 0.0
     assert m.turn_gain[2] == pytest.approx(0.5)
+    assert m.drift_gain[2] == pytest.approx(1.0)
 
 
 # --- gaps, jumps, ends -------------------------------------------------------------------------
@@ -357,6 +380,22 @@ def test_pose_after_a_long_gap_says_where_it_led_to():
     np.testing.assert_allclose(m.delta, [1.0, 3.0, 1.5], atol=1e-9)
     whole = filled(line(1.0), duration=10.0).motion(T0 + SECOND, T0 + round(4.0 * SECOND))
     assert np.trace(m.cov) > 4.0 * np.trace(whole.cov)
+
+
+def test_robot_that_stood_through_most_of_a_gap_is_as_certain_as_its_way_is_short():
+    def after(gap, way):
+        buffer = filled(lambda t: np.zeros(3), duration=2.0)
+        end = T0 + round((2.0 + gap) * SECOND)
+        for k in range(5):
+            buffer.add_odometry(Odometry(end + k * 20 * MS, np.array([way, 0.0, 0.0])))
+        return buffer.motion(T0 + 2 * SECOND, end)
+
+    # 0.2 m is a way of 4 s at most, however long the robot was not heard of
+    short, long = after(20.0, 0.2), after(200.0, 0.2)
+    np.testing.assert_allclose(long.cov, short.cov, rtol=0.05)
+    assert math.sqrt(long.cov[2, 2]) < 0.04
+    # on the way for all of the gap
+    assert after(20.0, 10.0).cov[2, 2] > 3.0 * short.cov[2, 2]
 
 
 def test_pose_after_a_gap_longer_than_the_memory_says_where_it_led_to():

@@ -29,12 +29,14 @@ FILES: dict[str, tuple[type[Any], str]] = {
 # what a node declares, because it shares the group, but does not read: names and groups
 UNREAD: dict[str, tuple[str, ...]] = {
     'ekf_slam.yaml': (
-        'continue_map', 'restore_pose',
+        'motion.drift_sigma', 'continue_map', 'restore_pose',
         'scan_match', 'loop_closure', 'relocalization', 'solver', 'incident',
     ),
-    'deformable_slam.yaml': ('motion.scale_error_sigma', 'motion.scale_error_time'),
+    'deformable_slam.yaml': (
+        'motion.scale_error_sigma', 'motion.scale_error_time', 'motion.drift_sigma',
+    ),
     'reflector_detector.yaml': (
-        'motion.scale_error_sigma', 'motion.scale_error_time',
+        'motion.scale_error_sigma', 'motion.scale_error_time', 'motion.drift_sigma',
         'local_frame', 'use_scan', 'use_reflectors',
         'reflector_poses_topic', 'reflector_markers_topic', 'reflector_beams_topic',
         'landmarks_topic', 'mode', 'map_directory', 'map_file_name', 'map_start_pose',

@@ -38,7 +38,7 @@ class HealthInputs:
     estimate. ``cov_map`` (3, 3) is that of the pose. ``unconfirmed``: why the saved map does not
     confirm the pose, empty if it does; ``is_lost``: for too long. ``contradicted``: scan or
     reflectors have contradicted the map for too long. ``seen`` of the ``expected`` reflectors in
-    view were detected.
+    view were detected. ``maps``: the map is in the making.
     """
 
     scan: ScanEvidence
@@ -51,6 +51,7 @@ class HealthInputs:
     contradicted: bool = False
     expected: int = 0
     seen: int = 0
+    maps: bool = False
 
 
 class HealthMonitor:
@@ -65,6 +66,8 @@ class HealthMonitor:
         self._held_by_reflectors = NEVER
         self._held_by_scan = NEVER
         self._first: int | None = None
+        self._variance = 0.0  # [m^2] of the position, at the last step
+        self._explored = 0.0  # [m^2] of that, what it has grown by while the map held the pose
 
     def evaluate(self, stamp: int, step: HealthInputs) -> Health:
         """Health at ``stamp`` [ns], after the first step."""
@@ -84,10 +87,24 @@ class HealthMonitor:
         sigma = math.sqrt(eigenvalues_2x2(step.cov_map[:2, :2])[1])
         if sigma > self._limits.sigma_degraded:
             reasons.append(f'position sigma is {sigma:.2f} m')
-        is_lost = step.is_lost or step.contradicted or sigma > self._limits.sigma_lost
+        is_lost = step.is_lost or step.contradicted or self._is_adrift(stamp, step, sigma)
         if is_lost or (misfit and (unmatched or not step.matched)):
             return Health(Level.LOST, tuple(reasons))
         return Health(Level.DEGRADED if reasons else Level.OK, tuple(reasons))
+
+    def _is_adrift(self, stamp: int, step: HealthInputs, sigma: float) -> bool:
+        """Whether the position is too uncertain to be known in the map.
+
+        A map in the making grows away from its start, and the robot's place in it stays known
+        while scan or reflectors hold the pose. What the variance grows by then does not count.
+        """
+        variance, last = sigma**2, self._variance
+        self._variance = variance
+        is_held = stamp in (self._held_by_scan, self._held_by_reflectors)
+        if step.maps and is_held:
+            self._explored += max(variance - last, 0.0)
+        self._explored = min(self._explored, variance)
+        return variance - self._explored > self._limits.sigma_lost**2
 
     def _note(self, stamp: int, step: HealthInputs) -> None:
         """Store the stamp of each input that is good in this step."""

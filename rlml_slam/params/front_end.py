@@ -41,8 +41,15 @@ class MotionNoise(Group, prefix='motion.'):
         0.0,
         1.0,
     )
+    drift_sigma: float = param(
+        0.03,
+        'turn per distance that the wheels do not measure, 1 sigma; 0: not modelled',
+        'rad/m',
+        0.0,
+        1.0,
+    )
     scale_error_time: float = param(
-        600.0, 'correlation time of the scale error: load, floor, tyres', 's', 1.0, 1e6
+        600.0, 'correlation time of these errors: load, floor, tyres', 's', 1.0, 1e6
     )
     noise_interval: float = param(
         0.1, 'control interval for which the noises above are given', 's', 1e-3, 10.0

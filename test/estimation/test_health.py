@@ -21,6 +21,7 @@ from made_worlds import (
 )
 
 from rlml_slam import se2
+from rlml_slam.estimation.health import HealthInputs, HealthMonitor, ScanEvidence
 from rlml_slam.estimation.kidnapping_detection import KidnappingDetection
 from rlml_slam.maps.occupancy import render
 from rlml_slam.maps.saved_map import SavedMap
@@ -322,3 +323,28 @@ def test_reflectors_that_tell_who_they_are_are_left_to_the_back_end():
         (o,) = observations(moved, [np.array([0.7, 0.9, 2.0])], ids=ids, **kw)
         later = replace(o, stamp=FIRST + (41 - ids) * STEP)
         assert front_end.process(later).unconfirmed is not ids
+
+
+def levels(steps):
+    """Levels of a monitor: (sigma [m], whether the scan holds the pose, whether it maps)."""
+    monitor = HealthMonitor(HealthLimits())
+    out = []
+    for k, (sigma, held, maps) in enumerate(steps):
+        scan = ScanEvidence(has_scan=True, used=held, score=0.6)
+        cov = np.diag([sigma, sigma, 0.01]) ** 2
+        step = HealthInputs(scan, True, None, 0, cov, maps=maps)
+        out.append(monitor.evaluate(FIRST + k * STEP, step).level)
+    return out
+
+
+def test_map_that_grows_far_from_its_start_is_no_reason_to_be_lost():
+    far = [(0.1 * k, True, True) for k in range(60)]
+    assert levels(far)[-1] is Level.DEGRADED
+    assert levels([(sigma, held, False) for sigma, held, _ in far])[-1] is Level.LOST
+
+
+def test_what_odometry_alone_made_uncertain_stays_so_until_the_place_is_found():
+    explored = [(0.1 * k, True, True) for k in range(50)]
+    gap = [(6.0, False, True), *[(6.0, True, True)] * 40]
+    assert levels([*explored, *gap])[-1] is Level.LOST
+    assert levels([*explored, *gap, (4.0, True, True), (4.5, True, True)])[-1] is Level.DEGRADED

@@ -45,9 +45,8 @@ class FrontEnd:
     def reset(self, pose: Array, cov: Array) -> None:
         """Drop all state and start at a pose (3,) of the map with covariance (3, 3)."""
         m = self._p.motion
-        self.state = JointState(
-            pose, cov, m.imu_bias_sigma, m.constant_velocity_sigma, m.scale_error_sigma
-        )
+        wheels = (*m.scale_error_sigma, m.drift_sigma)
+        self.state = JointState(pose, cov, m.imu_bias_sigma, m.constant_velocity_sigma, wheels)
         self._motion = MotionTerm(self._p)
         self._reflectors = ReflectorTerm(self._p, self.state)
         self._scans = ScanTerm(self._p, self.state, self._motion)
@@ -156,6 +155,7 @@ class FrontEnd:
                 contradicted=lasts and not confirmation.is_pending,
                 expected=expected,
                 seen=seen,
+                maps=self._map.saved is None,
             ),
         )
 

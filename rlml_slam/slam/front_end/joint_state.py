@@ -22,25 +22,26 @@ from rlml_slam.se2 import Array, wrapped
 from rlml_slam.types import Motion
 
 BIAS = 3
-SPEED, TURN = 4, 5
-VELOCITY = 6
-ANCHORS = (9, 12)
-LANDMARKS = 15
-WHEELS = slice(SPEED, TURN + 1)
-SYSTEMATIC = slice(BIAS, TURN + 1)
+SPEED, TURN, DRIFT = 4, 5, 6
+VELOCITY = 7
+ANCHORS = (10, 13)
+LANDMARKS = 16
+WHEELS = slice(SPEED, DRIFT + 1)
+SYSTEMATIC = slice(BIAS, DRIFT + 1)
 STANDING = np.zeros(2)
 GATE = 16.0  # squared sigmas of a bias beyond which the wheels slip
 MOVING = slice(VELOCITY, VELOCITY + 3)
 
 
 class JointState:
-    """Mean ``x`` (15 + 2m,) and covariance ``P`` of all that is estimated together.
+    """Mean ``x`` (16 + 2m,) and covariance ``P`` of all that is estimated together.
 
     In this order: the pose, the gyro's bias, the shares by which the robot's speed and turn
-    exceed those that its wheels measure, the velocity (forward, left, turn) of the base, which a
-    robot with odometry does not need (:mod:`coasting`), two anchors, the reflectors; and
-    ``extra`` rows, zero but while reflectors are left out (:mod:`distant`): of what they depend
-    on, the rows ``tied``, those that are nothing else any more.
+    exceed those that its wheels measure, the turn per distance [rad/m] that they do not measure,
+    the velocity (forward, left, turn) of the base, which a robot with odometry does not need
+    (:mod:`coasting`), two anchors, the reflectors; and ``extra`` rows, zero but while reflectors
+    are left out (:mod:`distant`): of what they depend on, the rows ``tied``, those that are
+    nothing else any more.
     """
 
     def __init__(
@@ -49,9 +50,9 @@ class JointState:
         cov: Array,
         bias_sigma: float,
         speeds: Sequence[float] = (0.0, 0.0, 0.0),
-        wheels: Sequence[float] = (0.0, 0.0),
+        wheels: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
-        """Sigmas: ``speeds`` (3,) [m/s, m/s, rad/s] of an unknown velocity, ``wheels`` (2,)."""
+        """Sigmas: ``speeds`` (3,) [m/s, m/s, rad/s] of an unknown velocity, ``wheels`` (3,)."""
         self.x = np.zeros(LANDMARKS)
         self.P = np.zeros((LANDMARKS, LANDMARKS))
         self.x[:3] = pose
@@ -121,16 +122,19 @@ class JointState:
         takes the place of odometry in the derivatives by these shares (:mod:`wheels`).
         """
         if math.isfinite(motion.bias_var):
-            measure_bias(self.x, self.P, motion.bias, motion.bias_var, motion.bias_turn)
+            measure_bias(
+                self.x, self.P, motion.bias, motion.bias_var, motion.bias_turn, motion.bias_way
+            )
         predict(
             self.x, self.P, motion.delta, motion.cov, motion.bias_gain, motion.turn_gain,
-            went, walk, kept, self._wheels2,
+            motion.drift_gain, went, walk, kept, self._wheels2,
         )  # fmt: skip
 
     def corrected(self, motion: Motion) -> Motion:
         """A motion as it is by what is known now of how wheels and gyro err."""
-        bias, speed, turn = self.x[SYSTEMATIC].tolist()
+        bias, speed, turn, drift = self.x[SYSTEMATIC].tolist()
         delta = motion.delta + bias * motion.bias_gain + turn * motion.turn_gain
+        delta += drift * motion.drift_gain
         delta[:2] *= 1.0 + speed
         delta[2] = se2.wrapped(delta[2])
         return Motion(delta, motion.cov, motion.known)
@@ -267,6 +271,16 @@ class JointState:
         """Kalman update of everything: v = H dx[columns] + noise of covariance R."""
         update(self.x, self.P, columns, H, R, v)
 
+    def turn_with_anchor(self, before: Array) -> None:
+        """Correlate positions with the heading of the first anchor, after a match moved them.
+
+        ``before`` is the state (n,) until then. A match is in the axes of the anchor: an error of
+        its heading moves a position by where that is now, relative to the anchor, not by where it
+        was. So it is in the right-invariant filter (Barrau, Bonnabel 2015); otherwise a large
+        correction seems to measure an uncertain heading.
+        """
+        turn_with_anchor(self.P, self.x - before, self._end)
+
 
 @brief
 def predict(
@@ -276,6 +290,7 @@ def predict(
     cov: Array,
     bias_gain: Array,
     turn_gain: Array,
+    drift_gain: Array,
     went: Array,
     walk: float,
     kept: float,
@@ -283,9 +298,9 @@ def predict(
 ) -> None:
     """Eq. 5 and its covariance in place; see :meth:`JointState.predict`."""
     c, s = math.cos(x[2]), math.sin(x[2])
-    moved = delta + bias_gain * x[BIAS] + turn_gain * x[TURN]
+    moved = delta + bias_gain * x[BIAS] + turn_gain * x[TURN] + drift_gain * x[DRIFT]
     faster = 1.0 + x[SPEED]
-    D = np.zeros((3, 4))  # of the pose by the heading, and bias, share of speed and of turn
+    D = np.zeros((3, 5))  # of the pose by the heading, bias, shares of speed and turn, drift
     gx, gy = faster * (c * moved[0] - s * moved[1]), faster * (s * moved[0] + c * moved[1])
     D[0, 0], D[1, 0] = -gy, gx
     D[0, 1] = faster * (c * bias_gain[0] - s * bias_gain[1])
@@ -296,23 +311,27 @@ def predict(
     D[0, 2], D[1, 2] = math.cos(middle) * went[0], math.sin(middle) * went[0]
     if turn_gain.any():
         D[0, 3], D[1, 3], D[2, 3] = -0.5 * gy * went[1], 0.5 * gx * went[1], went[1]
+    if drift_gain.any():
+        D[0, 4], D[1, 4], D[2, 4] = -0.5 * gy * went[0], 0.5 * gx * went[0], went[0]
     x[0] += gx
     x[1] += gy
     turn = x[2] + moved[2]
     x[2] = wrapped(turn)
     for k in range(len(x)):
-        heading, bias, speed, share = P[2, k], P[BIAS, k], P[SPEED, k], P[TURN, k]
+        heading, bias, speed, share, drift = P[2, k], P[3, k], P[4, k], P[5, k], P[6, k]
         for r in range(3):
-            P[r, k] += D[r, 0] * heading + D[r, 1] * bias + D[r, 2] * speed + D[r, 3] * share
+            P[r, k] += D[r, 0] * heading + D[r, 1] * bias + D[r, 2] * speed
+            P[r, k] += D[r, 3] * share + D[r, 4] * drift
     for k in range(len(x)):
-        heading, bias, speed, share = P[k, 2], P[k, BIAS], P[k, SPEED], P[k, TURN]
+        heading, bias, speed, share, drift = P[k, 2], P[k, 3], P[k, 4], P[k, 5], P[k, 6]
         for r in range(3):
-            P[k, r] += D[r, 0] * heading + D[r, 1] * bias + D[r, 2] * speed + D[r, 3] * share
+            P[k, r] += D[r, 0] * heading + D[r, 1] * bias + D[r, 2] * speed
+            P[k, r] += D[r, 3] * share + D[r, 4] * drift
     G = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     P[:3, :3] += np.dot(np.dot(G, cov), G.T.copy())
     P[BIAS, BIAS] += walk
     if kept < 1.0:
-        for k in range(2):
+        for k in range(3):
             e = SPEED + k
             x[e] *= kept
             P[e] *= kept
@@ -321,14 +340,17 @@ def predict(
 
 
 @brief
-def measure_bias(x: Array, P: Array, bias: float, variance: float, turn: float) -> None:
+def measure_bias(
+    x: Array, P: Array, bias: float, variance: float, turn: float, speed: float
+) -> None:
     """Scalar update with what IMU and wheels say of the gyro's bias, gated against slip.
 
-    Wheels that turned by ``turn`` [rad/s] say it but for the share that they err by.
+    Wheels that turned by ``turn`` [rad/s] and went at ``speed`` [m/s] say it but for the share
+    and for the drift that they err by.
     """
-    PH = P[:, BIAS] + turn * P[:, TURN]
-    S = PH[BIAS] + turn * PH[TURN] + variance
-    error = bias - (x[BIAS] + turn * x[TURN])
+    PH = P[:, BIAS] + turn * P[:, TURN] + speed * P[:, DRIFT]
+    S = PH[BIAS] + turn * PH[TURN] + speed * PH[DRIFT] + variance
+    error = bias - (x[BIAS] + turn * x[TURN] + speed * x[DRIFT])
     if not error * error < GATE * S:  # nor where it is NaN
         return
     for r in range(len(x)):
@@ -355,10 +377,32 @@ def update(x: Array, P: Array, columns: NDArray[np.int64], H: Array, R: Array, v
             P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i] - less[i, j] - less[j, i])
 
 
+@brief
+def turn_with_anchor(P: Array, shift: Array, end: int) -> None:
+    """Kernel of :meth:`JointState.turn_with_anchor`, in place, with reflectors up to row ``end``.
+
+    ``shift`` (n,) is what the update has changed the state by.
+    """
+    anchor = ANCHORS[0]
+    heading = anchor + 2
+    for row in range(end):
+        is_reflector = row >= LANDMARKS and (row - LANDMARKS) % 2 == 0
+        if not (is_reflector or row == 0 or row == ANCHORS[1]):
+            continue
+        dx, dy = shift[row] - shift[anchor], shift[row + 1] - shift[anchor + 1]
+        for k in range(len(P)):
+            P[row, k] -= dy * P[heading, k]
+            P[row + 1, k] += dx * P[heading, k]
+        for k in range(len(P)):
+            P[k, row] -= dy * P[k, heading]
+            P[k, row + 1] += dx * P[k, heading]
+
+
 def warm_up() -> None:
     """Compile the kernels with the signatures that are used at run time."""
     state = JointState(np.zeros(3), np.eye(3), 0.1)
     zero = np.zeros(3)
-    predict(state.x, state.P, zero, np.eye(3), zero, zero, STANDING, 0.0, 1.0, np.zeros(2))
-    measure_bias(state.x, state.P, 0.0, 1.0, 0.0)
+    predict(state.x, state.P, zero, np.eye(3), zero, zero, zero, STANDING, 0.0, 1.0, zero)
+    measure_bias(state.x, state.P, 0.0, 1.0, 0.0, 0.0)
     state.apply(np.arange(3), np.eye(3), np.eye(3), np.zeros(3))
+    state.turn_with_anchor(state.x)

@@ -221,10 +221,12 @@ class ScanTerm:
         gate, pull = self._p.scan_match.prior_robust_scale, np.zeros(3)
         if not self._motion.has_odometry:
             gate, pull = gate / math.sqrt(3.0), found.pull
+        before = state.x.copy()
         fuse(
             state.x, state.P, found.pose, information, gate, pull, found.information,
             sweep.half, sweep.velocity,
         )  # fmt: skip
+        state.turn_with_anchor(before)
 
     def _contradicts(self, submap: Submap, points: Array, found: ScanMatchResult) -> bool:
         """Whether a scan fits far worse than usual, and not because it sees unmapped space.

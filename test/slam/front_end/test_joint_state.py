@@ -11,10 +11,12 @@ from rlml_slam.matching.reflectors.innovations import expected
 from rlml_slam.slam.front_end.joint_state import (
     ANCHORS,
     BIAS,
+    DRIFT,
     LANDMARKS,
     SPEED,
     TURN,
     WHEELS,
+    JointState,
     measure_bias,
 )
 from rlml_slam.types import Motion
@@ -22,24 +24,30 @@ from rlml_slam.types import Motion
 
 def motion(**kw):
     cov = np.array([[4e-4, 1e-5, 2e-5], [1e-5, 2e-4, 1e-5], [2e-5, 1e-5, 3e-4]])
-    gains = {'bias_gain': np.array([0.01, -0.02, -0.1]), 'turn_gain': np.array([-0.02, 0.1, 0.15])}
+    gains = {
+        'bias_gain': np.array([0.01, -0.02, -0.1]),
+        'turn_gain': np.array([-0.02, 0.1, 0.15]),
+        'drift_gain': np.array([0.01, 0.04, 0.3]),
+    }
     return Motion(np.array([0.3, -0.02, 0.2]), cov, **gains, **kw)
 
 
 def moved(m, x):
     """Motion corrected by the errors of wheels and gyro in the state ``x`` (n,)."""
     delta = m.delta + m.bias_gain * x[BIAS] + m.turn_gain * x[TURN]
+    delta = delta + m.drift_gain * x[DRIFT]
     return delta * [1.0 + x[SPEED], 1.0 + x[SPEED], 1.0]
 
 
 @pytest.mark.parametrize('theta', [0.0, 0.4, 3.1, -3.1])
 def test_prediction_is_that_of_a_dense_ekf(theta):
     state, way, turn = made(theta=theta), 0.3, 0.2
-    state.x[[BIAS, TURN]] = 0.0
+    state.x[[BIAS, TURN, DRIFT]] = 0.0
     # an arc of the midpoint model, and a robot that went as far before
     arc = np.array([way * np.cos(0.5 * turn), way * np.sin(0.5 * turn), turn])
     by_turn = turn * np.array([-0.5 * arc[1], 0.5 * arc[0], 1.0])
-    m = replace(motion(), delta=arc, turn_gain=by_turn)
+    by_way = way * np.array([-0.5 * arc[1], 0.5 * arc[0], 1.0])
+    m = replace(motion(), delta=arc, turn_gain=by_turn, drift_gain=by_way)
     x, P = state.x.copy(), state.P.copy()
 
     def f(v):
@@ -53,7 +61,7 @@ def test_prediction_is_that_of_a_dense_ekf(theta):
     Q = np.zeros_like(P)
     Q[:3, :3] = G @ m.cov @ G.T
     Q[BIAS, BIAS] = 1e-6
-    Q[WHEELS, WHEELS] = (1.0 - 0.9**2) * np.diag([0.03, 0.05]) ** 2
+    Q[WHEELS, WHEELS] = (1.0 - 0.9**2) * np.diag([0.03, 0.05, 0.03]) ** 2
     state.predict(m, 1e-6, 0.9, np.array([way, turn]))
     np.testing.assert_allclose(state.x, f(x), atol=1e-12)
     np.testing.assert_allclose(state.P, F @ P @ F.T + Q, atol=1e-8)
@@ -106,12 +114,12 @@ def test_bias_is_measured_as_a_scalar_and_an_outlier_is_not():
     state = made(2)
     x, P = state.x.copy(), state.P.copy()
     m = motion(bias=0.03, bias_var=1e-3)
-    measure_bias(state.x, state.P, m.bias, m.bias_var, 0.0)
+    measure_bias(state.x, state.P, m.bias, m.bias_var, 0.0, 0.0)
     K = P[:, BIAS] / (P[BIAS, BIAS] + 1e-3)
     np.testing.assert_allclose(state.x, x + K * (0.03 - x[BIAS]), atol=1e-12)
     np.testing.assert_allclose(state.P, P - np.outer(K, P[BIAS]), atol=1e-12)
     x, P = state.x.copy(), state.P.copy()
-    measure_bias(state.x, state.P, 5.0, 1e-3, 0.0)
+    measure_bias(state.x, state.P, 5.0, 1e-3, 0.0, 0.0)
     np.testing.assert_array_equal(state.x, x)
     np.testing.assert_array_equal(state.P, P)
 
@@ -120,10 +128,10 @@ def test_bias_that_turning_wheels_tell_is_with_their_share_of_turn():
     state = made(13)
     x, P = state.x.copy(), state.P.copy()
     H = np.zeros((1, len(x)))
-    H[0, BIAS], H[0, TURN] = 1.0, 0.7
+    H[0, BIAS], H[0, TURN], H[0, DRIFT] = 1.0, 0.7, 0.4
     S = H @ P @ H.T + 1e-3
     K = P @ H.T / S
-    measure_bias(state.x, state.P, 0.03, 1e-3, 0.7)
+    measure_bias(state.x, state.P, 0.03, 1e-3, 0.7, 0.4)
     np.testing.assert_allclose(state.x, x + K[:, 0] * (0.03 - H[0] @ x), atol=1e-12)
     np.testing.assert_allclose(state.P, P - S * K @ K.T, atol=1e-12)
 
@@ -243,3 +251,37 @@ def test_widening_touches_the_pose_alone():
     state.widen(np.diag([0.1, 0.2, 0.3]))
     P[:3, :3] += np.diag([0.1, 0.2, 0.3])
     np.testing.assert_array_equal(state.P, P)
+
+
+def test_corrected_position_does_not_measure_an_uncertain_heading():
+    """It drove backward while its odometry said forward, at a heading that is unknown."""
+    state = JointState(np.zeros(3), np.diag([0.1, 0.1, 0.3]) ** 2, 0.0)
+    state.clone_pose(0, 0.0, np.zeros((3, 3)))
+    rows = np.r_[0:3, ANCHORS[0] : ANCHORS[0] + 3]
+    for k, measured in enumerate((-0.1, -0.2, -0.3)):
+        motion = Motion(np.array([0.1, 0.0, 0.0]), np.diag([0.3, 0.01, 0.01]) ** 2)
+        state.predict(motion, 0.0)
+        seen = se2.between(state.anchor(0), state.pose)
+        J = np.hstack([np.eye(3), -np.eye(3)])
+        c, s = np.cos(state.anchor(0)[2]), np.sin(state.anchor(0)[2])
+        R = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        H = R @ J
+        H[:, 5] += [seen[1], -seen[0], 0.0]
+        before = state.x.copy()
+        error = np.array([measured, 0.0, 0.0]) - seen
+        state.apply(rows, H, np.diag([0.005, 0.005, 0.003]) ** 2, error)
+        state.turn_with_anchor(before)
+        assert np.sqrt(state.P[2, 2]) > 0.99 * 0.3, k
+
+
+def test_turn_with_anchor_is_a_change_of_coordinates():
+    state = made(14)
+    before, P = state.x.copy(), state.P.copy()
+    state.x = before + np.random.default_rng(2).normal(0.0, 0.1, len(before))
+    shift, a = state.x - before, ANCHORS[0]
+    T = np.eye(len(before))
+    for row in (0, ANCHORS[1], *range(LANDMARKS, len(before), 2)):
+        dx, dy = shift[row : row + 2] - shift[a : a + 2]
+        T[row, a + 2], T[row + 1, a + 2] = -dy, dx
+    state.turn_with_anchor(before)
+    np.testing.assert_allclose(state.P, T @ P @ T.T, atol=1e-12)

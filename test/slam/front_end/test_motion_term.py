@@ -10,6 +10,7 @@ from rlml_slam.slam.front_end.motion_term import expected_motion
 from rlml_slam.types import Motion
 
 NOISE = MotionNoise()
+ERRORS = (*NOISE.scale_error_sigma, NOISE.drift_sigma)
 SIGMA = np.array([0.01, 0.01, 0.001])  # of a pose that is measured
 DT = STEP / SECOND
 
@@ -19,7 +20,7 @@ def drive(rng, shares, steps, turning=0.6):
 
     It goes at 1 m/s and turns at ``turning`` [rad/s], to the left and to the right by turns.
     """
-    state = JointState(np.zeros(3), np.zeros((3, 3)), 0.0, wheels=NOISE.scale_error_sigma)
+    state = JointState(np.zeros(3), np.zeros((3, 3)), 0.0, wheels=ERRORS)
     pose, velocity, kept = np.zeros(3), np.zeros(3), np.exp(-DT / NOISE.scale_error_time)
     shares = np.array(shares)
     for k in range(steps):
@@ -29,30 +30,34 @@ def drive(rng, shares, steps, turning=0.6):
         sigma_v = NOISE.speed_noise * v + NOISE.speed_noise_floor
         sigma_w = NOISE.turn_noise * abs(w) + NOISE.turn_noise_floor
         sigma = np.array([sigma_v, sigma_w]) * DT
-        measured = np.array([v, w]) * DT / (1.0 + shares) + sigma * rng.standard_normal(2)
+        wheels = np.array([v, w - shares[2] * v]) / (1.0 + shares[:2])
+        measured = wheels * DT + sigma * rng.standard_normal(2)
         half = 0.5 * measured[1]
         delta = np.array([measured[0] * np.cos(half), measured[0] * np.sin(half), measured[1]])
-        cov = np.diag([sigma[0], 1e-4, sigma[1]]) ** 2
-        by_turn = measured[1] * np.array([-0.5 * delta[1], 0.5 * delta[0], 1.0])
+        by_heading = np.array([-0.5 * delta[1], 0.5 * delta[0], 1.0])  # of the end of an arc
+        cov = np.diag([sigma[0], 1e-4, 0.0]) ** 2
+        cov += sigma[1] ** 2 * np.outer(by_heading, by_heading)
+        by_turn = measured[1] * by_heading
         before = state.pose
-        motion = Motion(delta, cov, turn_gain=by_turn)
+        by_way = measured[0] * by_heading
+        motion = Motion(delta, cov, turn_gain=by_turn, drift_gain=by_way)
         state.predict(motion, 0.0, kept, expected_motion(velocity, DT, NOISE))
         z = pose + SIGMA * rng.standard_normal(3)
         error = z - state.pose
         error[2] = se2.wrapped(error[2])
         state.apply(np.arange(3), np.eye(3), np.diag(SIGMA**2), error)
         velocity = se2.log(se2.between(before, state.pose)) / DT
-        innovation = np.sqrt(1.0 - kept**2) * np.array(NOISE.scale_error_sigma)
-        shares = kept * shares + innovation * rng.standard_normal(2)
+        innovation = np.sqrt(1.0 - kept**2) * np.array(ERRORS)
+        shares = kept * shares + innovation * rng.standard_normal(3)
     return state.x[WHEELS], state.P[WHEELS, WHEELS], shares
 
 
 def test_worn_wheels_are_found_out():
     rng = np.random.default_rng(0)
-    drives = [drive(rng, (0.04, -0.05), 800) for _ in range(8)]
+    drives = [drive(rng, (0.04, -0.05, 0.04), 800) for _ in range(8)]
     error = np.mean([x - true for x, _, true in drives], axis=0)
     sigma = np.sqrt(np.mean([np.diag(P) for _, P, _ in drives], axis=0))
-    assert (sigma < 0.5 * np.array(NOISE.scale_error_sigma)).all()
+    assert (sigma < 0.5 * np.array(ERRORS)).all()
     # a mean of eight: four sigmas of it
     assert (np.abs(error) < 4.0 * sigma / np.sqrt(8.0)).all()
 
@@ -62,16 +67,16 @@ def test_shares_are_as_sure_as_they_are_said_to_be():
     runs = 60
     nees = []
     for _ in range(runs):
-        x, P, true = drive(rng, rng.normal(0.0, NOISE.scale_error_sigma), 300)
+        x, P, true = drive(rng, rng.normal(0.0, ERRORS), 300)
         e = x - true
         nees.append(e @ np.linalg.solve(P, e))
-    # chi-square of 2 degrees of freedom: a mean of 2, the sigma of which is 2 / sqrt(runs)
-    assert np.mean(nees) == pytest.approx(2.0, abs=4.0 * 2.0 / np.sqrt(runs))
+    # chi-square of 3 degrees of freedom: a mean of 3, the sigma of which is sqrt(6 / runs)
+    assert np.mean(nees) == pytest.approx(3.0, abs=4.0 * np.sqrt(6.0 / runs))
 
 
 def test_noise_of_the_wheels_is_not_taken_for_a_share():
     # with the measured motion as the derivative, the share of turn comes to -0.4 here
-    x, P, _ = drive(np.random.default_rng(2), (0.0, 0.0), 2000, turning=0.0)
+    x, P, _ = drive(np.random.default_rng(2), (0.0, 0.0, 0.0), 2000, turning=0.0)
     assert abs(x[1]) < 0.01
     assert P[1, 1] == pytest.approx(NOISE.scale_error_sigma[1] ** 2, rel=0.02)
 
