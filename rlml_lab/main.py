@@ -75,6 +75,7 @@ COMMANDS: Table = {
                 'rlml_lab.studies.study_store',
                 'map files that are cut off, flipped, or killed while saved',
             ),
+            'view': Command('rlml_lab.live.study_view', 'cost and latency of the live viewer'),
             'incidents': Command(
                 'rlml_lab.live.study_incidents', 'kidnapped robots and their black boxes'
             ),

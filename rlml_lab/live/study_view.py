@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``study view``: `rlml view` beside a live drive, with many browsers and one that hangs.
+
+Prints messages per second, the time from a frame's arrival in the viewer to its arrival in a
+browser, and the viewer's share of a core. The browsers are WebSocket clients that draw nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import socket
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tornado.websocket import websocket_connect
+
+from rlml_slam.cli.support.live_session import node
+from rlml_slam.cli.support.processes import Processes, free_domain
+from rlml_slam.params import Simulator
+
+HANDSHAKE = (
+    'GET /messages HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nUpgrade: websocket\r\n'
+    'Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n'
+    'Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n'
+)
+
+
+def add_parser(subparsers: Any) -> None:
+    """Declare ``rlml-lab study view``."""
+    parser = subparsers.add_parser('view', help='cost and latency of the live viewer')
+    parser.add_argument('--browsers', type=int, default=10, help='default: %(default)s')
+    parser.add_argument('--seconds', type=float, default=30.0, help='default: %(default)s')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Drive, watch, and print the figures; 1 where one is missed."""
+    domain = {
+        'ROS_DOMAIN_ID': str(free_domain()), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+    }  # fmt: skip
+    with socket.create_server(('127.0.0.1', 0)) as probe:
+        port = probe.getsockname()[1]
+    with (
+        tempfile.TemporaryDirectory(prefix='rlml_view_') as folder,
+        Processes(Path(folder), domain) as processes,
+    ):
+        values = {'laser_pose': list(Simulator().laser_pose), 'map_directory': folder}
+        processes.start('view', ['rlml_slam', 'view', '--port', str(port)])
+        processes.start('slam', node('slam', values | {'map_update_interval': 1.0}))
+        processes.start('simulator', node('simulator', {'repeat': 'true'}))
+        found = asyncio.run(watch(processes, port, args))
+    print(json.dumps(found))
+    good = found['per_second'] >= 10.0 and found['latency_p99_ms'] <= 300.0
+    return int(not (good and found['core_share'] < 0.1))
+
+
+async def watch(processes: Processes, port: int, args: argparse.Namespace) -> dict[str, float]:
+    """The figures of so many seconds, from the first frame on."""
+    sockets: list[Any] = []
+    while len(sockets) < args.browsers:
+        try:
+            sockets.append(await websocket_connect(f'ws://127.0.0.1:{port}/messages'))
+        except OSError:
+            processes.check('view', 'slam', 'simulator')
+            await asyncio.sleep(0.2)
+    with socket.create_connection(('127.0.0.1', port)) as hanging:  # which never reads
+        hanging.sendall(HANDSHAKE.format(port=port).encode())
+        await _frame(sockets[0])
+        await asyncio.sleep(5.0)
+        before, began = processes.usage('view'), time.monotonic()
+        until = began + args.seconds
+        each = await asyncio.gather(*(_listen(s, until) for s in sockets))
+        after, elapsed = processes.usage('view'), time.monotonic() - began
+    assert before is not None
+    assert after is not None
+    latency = np.concatenate([np.array(times) for times in each])
+    return {
+        'browsers': args.browsers,
+        'per_second': round(min(len(times) for times in each) / elapsed, 2),
+        'latency_median_ms': round(float(np.median(latency)), 1),
+        'latency_p99_ms': round(float(np.percentile(latency, 99)), 1),
+        'core_share': round((after.cpu_s - before.cpu_s) / elapsed, 4),
+    }
+
+
+async def _frame(browser: Any) -> float:
+    """Latency [ms] of the next message that has a frame."""
+    while True:
+        text = await browser.read_message()
+        assert text is not None, 'the viewer has disconnected a browser'
+        stamp = json.loads(text).get('stamp')
+        if stamp is not None:
+            return float(1e3 * time.time() - stamp)
+
+
+async def _listen(browser: Any, until: float) -> list[float]:
+    out = [await _frame(browser)]
+    while time.monotonic() < until:
+        out.append(await _frame(browser))
+    browser.close()
+    return out
