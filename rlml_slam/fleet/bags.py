@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import posixpath
 import re
 from collections.abc import Sequence
@@ -76,7 +77,7 @@ def _protocols(fs: Any) -> tuple[str, ...]:
 
 def _bags_in(fs: Any, place: str) -> set[str]:
     """Folders with rosbag2 files, and bags of one file that are in none of them."""
-    files = [place] if fs.isfile(place) else fs.find(place)
+    files = [place] if fs.isfile(place) else _files_below(fs, place)
     folders = {
         posixpath.dirname(f)
         for f in files
@@ -84,6 +85,22 @@ def _bags_in(fs: Any, place: str) -> set[str]:
     }
     alone = {f for f in files if f.endswith(FILES) and posixpath.dirname(f) not in folders}
     return alone | {f for f in folders if fs.isdir(place)}
+
+
+def _files_below(fs: Any, place: str) -> list[str]:
+    """All files of a folder; on this machine also those of folders that are links."""
+    if 'file' not in _protocols(fs):
+        return list(fs.find(place))
+    found, known = list[str](), set[str]()
+    for folder, folders, files in os.walk(place, followlinks=True):
+        real = os.path.realpath(folder)
+        if real in known:  # a link to a folder that it is in, or a second one to the same
+            folders.clear()
+            continue
+        known.add(real)
+        folders.sort()
+        found += [posixpath.join(folder, f) for f in files]
+    return found
 
 
 def local_copy(url: str, into: Path) -> Path:

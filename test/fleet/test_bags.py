@@ -43,6 +43,14 @@ def test_bags_are_named_below_the_folder_given(here, in_memory):
     assert names(here / 'r2/b.bag', here / 'r1') == ['a', 'b.bag']
 
 
+def test_bags_below_links_are_found_and_links_in_a_circle_end(here, tmp_path_factory):
+    top = tmp_path_factory.mktemp('linked')
+    (top / 'robot').symlink_to(here / 'r2', target_is_directory=True)
+    (top / 'again').symlink_to(top, target_is_directory=True)
+    (top / 'gone').symlink_to(top / 'nothing')
+    assert names(top) == ['robot/a', 'robot/b.bag', 'robot/c.mcap']
+
+
 def test_globs_are_named_below_their_fixed_part(here, in_memory):
     assert names(here / 'r*/a') == names(f'{in_memory}/r*/a') == ['r1/a', 'r2/a']
     assert names(here / 'r2/*.bag') == ['b.bag']
