@@ -23,6 +23,7 @@ from rlml_slam.cli.support.live_session import node
 from rlml_slam.cli.support.processes import Processes, free_domain
 from rlml_slam.params import Simulator
 
+SETTLE = 5.0  # [s] before anything is counted
 HANDSHAKE = (
     'GET /messages HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nUpgrade: websocket\r\n'
     'Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n'
@@ -70,11 +71,15 @@ async def watch(processes: Processes, port: int, args: argparse.Namespace) -> di
     with socket.create_connection(('127.0.0.1', port)) as hanging:  # which never reads
         hanging.sendall(HANDSHAKE.format(port=port).encode())
         await _frame(sockets[0])
-        await asyncio.sleep(5.0)
+        # they read from the beginning: what waits for a reader is not the viewer's latency
+        settled = time.monotonic() + SETTLE
+        await asyncio.gather(*(_listen(s, settled) for s in sockets))
         before, began = processes.usage('view'), time.monotonic()
         until = began + args.seconds
         each = await asyncio.gather(*(_listen(s, until) for s in sockets))
         after, elapsed = processes.usage('view'), time.monotonic() - began
+    for s in sockets:
+        s.close()
     assert before is not None
     assert after is not None
     latency = np.concatenate([np.array(times) for times in each])
@@ -101,5 +106,4 @@ async def _listen(browser: Any, until: float) -> list[float]:
     out = [await _frame(browser)]
     while time.monotonic() < until:
         out.append(await _frame(browser))
-    browser.close()
     return out
