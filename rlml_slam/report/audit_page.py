@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from rlml_slam.maps.atomic_file import write_atomically
@@ -20,6 +21,7 @@ from rlml_slam.report.plan_page import cm
 from rlml_slam.types import Level
 
 CAPTION = 'Where the robot was, and what was found, by its rank in the table'
+MARGIN = 1.5  # [m] around what is drawn
 AREA_HEADER = ('area', 'scans', 'seen of expected', 'planned [cm]', 'measured [cm]',
                'published [cm]', 'residuals / sigma', 'OK')  # fmt: skip
 FINDING_HEADER = ('rank', 'kind', 'what', 'what to do')
@@ -75,7 +77,15 @@ def _picture(audit: Audit) -> bytes:
         )
         if f.kind is Kind.MIRROR:
             axes.plot(*f.wall.T, '-', color=draw.INK, lw=2.5, zorder=4)
-    axes.set_aspect('equal')
+    shown = np.concatenate(
+        [
+            at[:, :2],
+            e.site.reflectors.points,
+            np.array([(f.x, f.y) for f in audit.findings]).reshape(-1, 2),
+        ]
+    )
+    (x, y), (x_end, y_end) = shown.min(axis=0) - MARGIN, shown.max(axis=0) + MARGIN
+    axes.set(aspect='equal', xlim=(x, x_end), ylim=(y, y_end))  # a ghost may be far away
     draw.legend_above(axes)
     return draw.png(figure)
 
