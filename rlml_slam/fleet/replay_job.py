@@ -26,9 +26,9 @@ from rlml_slam.evaluation.relations import read_relations, relation_errors
 from rlml_slam.evaluation.run_record import Origin, Run
 from rlml_slam.fleet.bags import Bag, local_copy
 from rlml_slam.fleet.results import Record, Results
-from rlml_slam.params import Parameters
+from rlml_slam.params import Parameters, changed
 from rlml_slam.recordings.bag_replay import replay
-from rlml_slam.recordings.origin import changed, digest_of
+from rlml_slam.recordings.origin import digest_of
 from rlml_slam.report.outputs import write_outputs
 
 PAGE, MCAP = 'report.html', 'run.mcap'

@@ -8,7 +8,7 @@ tested against them.
 """
 
 from rlml_slam.params.back_end import BackEnd, LoopClosure, Relocalization, Solver
-from rlml_slam.params.declaration import Declaration, Group, declarations, param
+from rlml_slam.params.declaration import Declaration, Group, changed, declarations, param
 from rlml_slam.params.deformable import Deformable
 from rlml_slam.params.detector import Detector
 from rlml_slam.params.ekf import Ekf, Ransac, Spikes
@@ -66,6 +66,7 @@ __all__ = [
     'Submap',
     'Transport',
     'Wheels',
+    'changed',
     'declarations',
     'flatten',
     'from_mapping',

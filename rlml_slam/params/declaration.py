@@ -152,3 +152,12 @@ def declarations(of: type[Any]) -> Iterator[Declaration]:
                 f.default,
                 *(f.metadata[k] for k in ('unit', 'low', 'high', 'choices', 'meaning', 'live')),
             )
+
+
+def changed(params: Any) -> dict[str, Any]:
+    """The parameters of a set that differ from their defaults, by ROS name."""
+    values = {
+        d.name: (getattr(getattr(params, d.group), d.field), d.default)
+        for d in declarations(type(params))
+    }
+    return {name: value for name, (value, default) in values.items() if value != default}

@@ -18,12 +18,11 @@ from rlml_slam.evaluation.run_record import FrameLog, Run, Truth
 from rlml_slam.maps.map_container import Content
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.maps.survey import Survey
-from rlml_slam.params import EkfParameters, Parameters
+from rlml_slam.params import EkfParameters, Parameters, changed
 from rlml_slam.recordings.bag_inputs import BagInputs
 from rlml_slam.recordings.estimate_bag import EstimateBag
 from rlml_slam.recordings.products import collect, fates, survey_figures
 from rlml_slam.ros.bags.bag import BagReader, BagWriter
-from rlml_slam.ros.front_end.incident_file import changed
 from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.store import map_file

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rlml_slam.evaluation.run_record import Origin
-from rlml_slam.params import declarations
+from rlml_slam.params import changed
 
 CHUNK = 1 << 22  # [bytes] that are read at once
 
@@ -17,15 +17,6 @@ def origin(command: str, params: Any, bag: Path | None = None) -> Origin:
     """The origin of a run with the set ``params``, of a bag where there is one."""
     source = '' if bag is None else f'{bag.resolve().name}, SHA-256 {digest_of(bag)}'
     return Origin(command, changed(params), source)
-
-
-def changed(params: Any) -> dict[str, Any]:
-    """The parameters of a set, by their ROS names, that are not as by default."""
-    values = {
-        d.name: (getattr(getattr(params, d.group), d.field), d.default)
-        for d in declarations(type(params))
-    }
-    return {name: value for name, (value, default) in values.items() if value != default}
 
 
 def digest_of(path: Path) -> str:

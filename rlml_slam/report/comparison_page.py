@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import math
 from collections.abc import Sequence
@@ -23,6 +22,7 @@ from rlml_slam.evaluation.run_comparison import (
 )
 from rlml_slam.maps.atomic_file import write_atomically
 from rlml_slam.report.outputs import make_folder
+from rlml_slam.report.page import heading, page, picture, section, table
 from rlml_slam.se2 import Array, compose
 
 HEADER = ('figure', 'A', 'B', 'change', 'verdict')
@@ -127,34 +127,24 @@ def parting_table(c: RunComparison) -> list[tuple[str, ...]]:
 
 def write_comparison(c: RunComparison, folder: Path) -> None:
     """Write comparison.json, two pictures and comparison.html, each whole or not at all."""
-    # matplotlib takes half a second to import, which a comparison without a page need not wait for
-    from rlml_slam.report.report import page, section
-
     folder = make_folder(folder)
     text = json.dumps(figures_of(c), indent=2) + '\n'
     write_atomically(folder / 'comparison.json', text.encode())
     beyond = [r.title for r in c.rows if r.is_beyond]
     verdict = f'different: {"; ".join(beyond)}' if beyond else 'no difference beyond the limits'
     title = f'{c.a.name} against {c.b.name}'
-    parts = [f'<h1>{escape(title)}</h1><p class="sub">{escape(verdict)}</p>']
+    parts = [heading(title, verdict)]
     lines = ''.join(f'<p>{escape(line)}</p>' for line in text_of(c).splitlines())
     parts.append(section('Summary', lines, 'problem' if beyond else ''))
     for name, png in {'paths': _paths(c), 'distance': _distance(c)}.items():
         write_atomically(folder / f'{name}.png', png)
-        data, alt = base64.b64encode(png).decode('ascii'), escape(CAPTIONS[name])
-        parts.append(section(alt, f'<img alt="{alt}" src="data:image/png;base64,{data}">'))
+        parts.append(section(CAPTIONS[name], picture(png, CAPTIONS[name])))
     if c.parting:
-        parts.append(section('Where they part', _html(parting_table(c))))
-    parts.append(section('Figures', _html(table_of(c.rows))))
+        head, *rows = parting_table(c)
+        parts.append(section('Where they part', table(rows, head)))
+    head, *rows = table_of(c.rows)
+    parts.append(section('Figures', table(rows, head)))
     write_atomically(folder / 'comparison.html', page(title, parts).encode())
-
-
-def _html(rows: Sequence[Sequence[str]]) -> str:
-    head, *body = rows
-    cells = '<tr>' + ''.join(f'<th>{escape(c)}</th>' for c in head) + '</tr>'
-    for row in body:
-        cells += '<tr>' + ''.join(f'<td>{escape(c)}</td>' for c in row) + '</tr>'
-    return f'<table>{cells}</table>'
 
 
 def _paths(c: RunComparison) -> bytes:

@@ -11,9 +11,8 @@ import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from rlml_slam.params import Parameters, declarations
+from rlml_slam.params import Parameters, changed
 from rlml_slam.ros.bags.bag import BagWriter
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import bag_types, make_bag
@@ -21,13 +20,6 @@ from rlml_slam.ros.front_end.incident import PREFIX, Published, Received
 from rlml_slam.version import __version__
 
 STALE = 3600.0  # [s] after which what a killed process began is removed
-
-
-def changed(params: Any) -> dict[str, Any]:
-    """The parameters of a set that differ from their defaults, by name."""
-    every = tuple(declarations(type(params)))
-    given = {d.name: getattr(getattr(params, d.group), d.field) for d in every}
-    return {d.name: given[d.name] for d in every if given[d.name] != d.default}
 
 
 def write(
