@@ -22,6 +22,7 @@ from rlml_slam.cli.support.live_bag import LiveBag
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.evaluation.run_record import FrameLog, Run, Truth
 from rlml_slam.params import Parameters
+from rlml_slam.planning.audit.sightings import SightingLog
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.codecs.frame_messages import read_points, read_record
 from rlml_slam.ros.codecs.message_types import rclpy_class
@@ -43,6 +44,34 @@ NO_REFLECTORS = Reflectors(
 )  # fmt: skip
 
 
+class HeardSightings:
+    """Frames and their detections, which come in either order, joined in a log for an audit."""
+
+    def __init__(self, log: SightingLog) -> None:
+        self._log = log
+        self._frames: dict[int, Frame] = {}
+        self._detections: dict[int, Detections] = {}
+
+    def add_frame(self, frame: Frame) -> None:
+        """A frame, which has no detections."""
+        self._frames[frame.stamp] = frame
+        self._join(frame.stamp)
+
+    def add_detections(self, detections: Detections) -> None:
+        """The detections of one frame."""
+        self._detections[detections.stamp] = detections
+        self._join(detections.stamp)
+
+    def _join(self, stamp: int) -> None:
+        if stamp in self._frames and stamp in self._detections:
+            frame = self._frames[stamp]
+            seen = replace(frame.observation, detections=self._detections[stamp])
+            self._log.add(replace(frame, observation=seen))
+            for waiting in (self._frames, self._detections):
+                for old in [t for t in waiting if t <= stamp]:
+                    del waiting[old]
+
+
 class Recorder(Node):
     """Collects poses, truth, products and diagnostics; every callback may be called directly.
 
@@ -61,8 +90,7 @@ class Recorder(Node):
         self.distance = 0.0
         self._sensor_heard: dict[int, float] = {}
         self._healths: dict[int, Health] = {}
-        self._frame_of: dict[int, Frame] = {}
-        self._detections_of: dict[int, Detections] = {}
+        self._sightings = HeardSightings(self.frames.sightings)
         self._answers: dict[int, tuple[Level, float]] = {}
         self._seen: dict[int, tuple[int, int]] = {}
         self._updates: list[UpdateSummary] = []
@@ -130,8 +158,7 @@ class Recorder(Node):
         """What the front end says of one pose: its health and its cost."""
         frame = read_record(msg).of.frame
         self._answers[frame.stamp] = (frame.health.level, frame.wall_ms)
-        self._frame_of[frame.stamp] = frame
-        self._pair(frame.stamp)
+        self._sightings.add_frame(frame)
 
     def on_points(self, data: bytes) -> None:
         """The end points of one scan, serialized: few of them are looked into."""
@@ -146,20 +173,8 @@ class Recorder(Node):
         """The detections of one pose, and how many were used."""
         associated = read_associated(msg)
         used = int(np.sum(associated.statuses == Status.USED))
-        stamp = associated.detections.stamp
-        self._seen[stamp] = (len(associated.statuses), used)
-        self._detections_of[stamp] = associated.detections
-        self._pair(stamp)
-
-    def _pair(self, stamp: int) -> None:
-        """A frame and its detections, which come in either order, are what an audit needs."""
-        if stamp in self._frame_of and stamp in self._detections_of:
-            frame = self._frame_of[stamp]
-            seen = replace(frame.observation, detections=self._detections_of[stamp])
-            self.frames.sightings.add(replace(frame, observation=seen))
-            for waiting in (self._frame_of, self._detections_of):
-                for old in [t for t in waiting if t <= stamp]:
-                    del waiting[old]
+        self._seen[associated.detections.stamp] = (len(associated.statuses), used)
+        self._sightings.add_detections(associated.detections)
 
     def on_update(self, msg: PointCloud2) -> None:
         """What one keyframe did, and its cost."""
