@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernels of a library do what Numba's own do, and check what they are given."""
 
+import os
 import pickle
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from rlml_slam import compiled, warm_up  # noqa: F401, so that it is known whether there is one
-from rlml_slam.kernels import build, library, missing, native
+from rlml_slam.kernels import build, built, library, missing, native
 from rlml_slam.kernels.emit import check_of, entries_of, machine_for
 from rlml_slam.kernels.library import Index, Library
 
@@ -201,3 +202,63 @@ def test_without_a_compiler_it_says_what_to_install(monkeypatch):
     monkeypatch.setattr(build.shutil, 'which', lambda _: None)
     with pytest.raises(build.BuildError, match='install gcc'):
         build._compiler()
+
+
+@pytest.fixture
+def compilations(monkeypatch, tmp_path):
+    """How often the library is compiled: a stand-in whose content is the count."""
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
+    done = []
+
+    def make(folder, index, _progress):
+        done.append(index)
+        (folder / library.LIBRARY).write_text(str(len(done)))
+        (folder / library.INDEX).write_bytes(pickle.dumps(asdict(index)))
+
+    monkeypatch.setattr(build, '_make', make)
+    return done
+
+
+def build_in(folder, processor='x86-64', force=False):
+    return build.build(folder, processor, lambda *_: None, force).read_text()
+
+
+def test_same_sources_are_compiled_once_for_all_folders(compilations, tmp_path):
+    assert build_in(tmp_path / 'tree') == '1'
+    assert build_in(tmp_path / 'wheel') == '1'
+    assert library.read_index(tmp_path / 'wheel') == compilations[0]
+    assert sorted(os.listdir(tmp_path / 'wheel')) == sorted([library.LIBRARY, library.INDEX])
+    assert build_in(tmp_path / 'wheel', force=True) == '2'
+    assert build_in(tmp_path / 'other') == '2'
+
+
+@pytest.mark.parametrize('changed', ['processor', 'sources', 'numba', 'makers'])
+def test_what_was_made_otherwise_is_compiled_again(compilations, tmp_path, monkeypatch, changed):
+    build_in(tmp_path / 'tree')
+    if changed == 'sources':
+        monkeypatch.setattr(build, 'sources_of', lambda _: ('errors.py',))
+    elif changed == 'numba':
+        monkeypatch.setattr(built.importlib.metadata, 'version', lambda _: '0')
+    elif changed == 'makers':
+        monkeypatch.setattr(built, 'MAKERS', ('build.py',))
+    processor = 'x86-64-v2' if changed == 'processor' else 'x86-64'
+    assert build_in(tmp_path / 'wheel', processor) == '2'
+
+
+def test_libraries_not_used_for_longest_are_dropped(compilations, tmp_path, monkeypatch):
+    for k, version in enumerate('abcad'):
+        monkeypatch.setattr(built.importlib.metadata, 'version', lambda _, v=version: v)
+        build_in(tmp_path / 'tree')
+        place = built.place_of(PACKAGE, compilations[-1])
+        os.utime(place, (k, k))
+    assert len(compilations) == 4
+    monkeypatch.setattr(built.importlib.metadata, 'version', lambda _: 'a')
+    assert build_in(tmp_path / 'tree') == '1'
+    monkeypatch.setattr(built.importlib.metadata, 'version', lambda _: 'b')
+    assert build_in(tmp_path / 'tree') == '5'
+
+
+def test_without_a_cache_nothing_is_kept_and_all_is_built(compilations, tmp_path):
+    (tmp_path / 'cache').write_text('a file where a folder should be')
+    assert build_in(tmp_path / 'tree') == '1'
+    assert build_in(tmp_path / 'wheel') == '2'

@@ -23,7 +23,8 @@ def add_parser(subparsers: Any) -> None:
         'warm-up',
         help='compile the kernels once, into the package or else for this user',
         description='Compiles the kernels into a library beside the package, or where that is '
-        'read-only into ~/.cache/rlml_slam. An installation does it by itself.',
+        'read-only into ~/.cache/rlml_slam, or copies what was compiled there from the same '
+        'sources. An installation does it by itself.',
     )
     parser.add_argument(
         '--into', metavar='DIR', type=Path, help='folder of the package that the library is for'
@@ -32,7 +33,7 @@ def add_parser(subparsers: Any) -> None:
         '--processor', choices=[*library.LEVELS, 'generic'],
         help='the code runs on all processors of this level (default: the best that this one has)',
     )  # fmt: skip
-    parser.add_argument('--force', action='store_true', help='also if they are compiled already')
+    parser.add_argument('--force', action='store_true', help='compile though it was done already')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -47,14 +48,14 @@ def run(args: argparse.Namespace) -> int:
     if folder is None:
         raise InputError(f'{into[0]}: cannot be written to')
     try:
-        print(_build(folder, processor))
+        print(_build(folder, processor, args.force))
     except ImportError as e:
         raise InputError(f'the kernels cannot be compiled: {e}') from e
     return 0
 
 
-def _build(folder: Path, processor: str) -> str:
-    """Build with progress; what was written, and in which time."""
+def _build(folder: Path, processor: str, force: bool) -> str:
+    """Build with progress, or copy; what was written, and in which time."""
     from rlml_slam.kernels.build import build
 
     began = time.monotonic()
@@ -64,6 +65,7 @@ def _build(folder: Path, processor: str) -> str:
             lambda done, of, name: bar.update(
                 done / of, f'{time.monotonic() - began:.0f} s {name.removeprefix("rlml_slam.")}'
             ),
+            force,
         )  # fmt: skip
     return f'{path}: {path.stat().st_size / 1e6:.1f} MB in {time.monotonic() - began:.0f} s'
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from rlml_slam.errors import RlmlError
-from rlml_slam.kernels import library
+from rlml_slam.kernels import built, library
 from rlml_slam.kernels.cache import sources_of
 from rlml_slam.kernels.emit import Entry, entries_of, machine_for
 
@@ -32,18 +32,29 @@ class BuildError(RlmlError):
     """The library cannot be made here; kernels are then compiled when first called."""
 
 
-def build(folder: Path, processor: str, progress: Progress) -> Path:
+def build(folder: Path, processor: str, progress: Progress, force: bool = False) -> Path:
     """Make the library of the package's sources in ``folder``; its path.
 
+    One that this user has built of the same sources is copied, unless ``force``.
     Raises BuildError where there is no C compiler, and OSError where ``folder`` is read-only.
     """
     folder.mkdir(parents=True, exist_ok=True)
     sources = sources_of(PACKAGE)
     index = library.Index(sources, library.digest(PACKAGE, sources), processor, {})
+    place = built.place_of(PACKAGE, index)
+    if force or place is None or not built.take(place, folder):
+        _make(folder, index, progress)
+        if place is not None:
+            built.keep(folder, place)
+    return folder / library.LIBRARY
+
+
+def _make(folder: Path, index: library.Index, progress: Progress) -> None:
+    """Compile and link into ``folder``; fills the entries of ``index``."""
     with tempfile.TemporaryDirectory(prefix='.kernels-', dir=folder) as name:
         work = Path(name)
         runtime = _start_runtime(work)
-        entries = _compile(work, processor, progress)
+        entries = _compile(work, index.processor, progress)
         for entry in entries:
             index.entries.setdefault(entry.kernel, []).append((entry.check, entry.name))
         _write_table(work / 'entries.h', entries)
@@ -53,7 +64,6 @@ def build(folder: Path, processor: str, progress: Progress) -> Path:
         (folder / library.INDEX).unlink(missing_ok=True)
         os.replace(work / library.LIBRARY, folder / library.LIBRARY)
         os.replace(work / library.INDEX, folder / library.INDEX)
-    return folder / library.LIBRARY
 
 
 def _compile(work: Path, processor: str, progress: Progress) -> list[Entry]:

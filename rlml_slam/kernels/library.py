@@ -57,9 +57,14 @@ class Library:
 
 def folders(package: Path) -> tuple[Path, Path]:
     """Where a library may lie: the package itself, then the user's cache."""
-    cache = os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache')
     tag = hashlib.sha256(str(package).encode()).hexdigest()[:12]
-    return package, Path(cache) / 'rlml_slam' / f'kernels-{tag}'
+    return package, cache() / f'kernels-{tag}'
+
+
+def cache() -> Path:
+    """The user's folder for what can be made again."""
+    cache = os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache')
+    return Path(cache) / 'rlml_slam'
 
 
 def open_library(package: Path) -> Library | None:
