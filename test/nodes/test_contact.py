@@ -80,10 +80,13 @@ def test_message_of_another_sensor_delays_no_pose(live, topic, bad):
 
 
 def test_signal_is_answered_while_a_3d_lidar_publishes(live, start):
+    live.listen('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray')
     both = start('slam')
     data = serialize_message(of_a_3d_lidar())
     out = live.ear.create_publisher(PointCloud2, 'reflectors', 10)
     live.spin_until(lambda: out.get_subscription_count() == 1, timeout=60.0)
+    # it subscribes before it spins
+    live.spin_until(lambda: live.heard['/diagnostics'], timeout=60.0)
     end = time.monotonic() + 2.0
     while time.monotonic() < end:
         out.publish(data)
