@@ -3,15 +3,20 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import json
+from contextlib import asynccontextmanager
 from urllib.parse import urlsplit
 
 import chromium
 import numpy as np
 import pytest
 from made_runs import made_run
+from tornado.httpserver import HTTPServer
+from tornado.netutil import bind_sockets
 
+from rlml_slam.cli.view.server import Browsers, application
 from rlml_slam.report.outputs import write_outputs
 from rlml_slam.report.page import page as page_of
 from rlml_slam.report.viewer import columns, viewer_page
@@ -162,6 +167,40 @@ def test_page_prints(page):
     pdf = base64.b64decode(page.call('Page.printToPDF', printBackground=True)['data'])
     assert pdf.startswith(b'%PDF')
     assert len(pdf) > 20_000
+
+
+@asynccontextmanager
+async def served():
+    """Address of the page of `rlml view`, without nodes."""
+    html = page_of('Live', viewer_page.parts(), {}, viewer_page.head())
+    browsers = Browsers(lambda: {'start': True, 'replace': {}})
+    sockets = bind_sockets(0, '127.0.0.1')
+    server = HTTPServer(application(html, browsers, '127.0.0.1'))
+    server.add_sockets(sockets)
+    yield f'http://127.0.0.1:{sockets[0].getsockname()[1]}/', browsers
+    server.stop()
+    await server.close_all_connections()
+
+
+@pytest.mark.parametrize('has_truth', [False, True])
+def test_live_page_says_nothing_in_the_console(has_truth):
+    made = columns.frames(made_run().frames, 0)
+    if has_truth:
+        made['error'] = made['error_theta'] = np.zeros(len(made['t']))
+    message = {'stream': {'frames': columns.as_lists(made)}, 'state': ''}
+
+    async def look():
+        async with served() as (url, browsers):
+            await asyncio.to_thread(page.open, url)
+            while not browsers.open:
+                await asyncio.sleep(0.01)
+            browsers.send(message)
+            await asyncio.to_thread(page.wait_for, 'viewer.messages === 2')
+            await asyncio.to_thread(page.settle)
+            return list(page.problems)
+
+    with chromium.browser() as page:
+        assert not asyncio.run(look())
 
 
 def test_live_page_takes_messages(tmp_path):

@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,13 +30,14 @@ from rlml_slam.ros.codecs.frame_messages import read_points, read_record
 from rlml_slam.ros.codecs.reflector_clouds import read_associated, read_reflector_map
 from rlml_slam.ros.message_guard import LARGE, MessageGuard, guard_of
 from rlml_slam.ros.systems.simulator_messages import TRUE_REFLECTORS
-from rlml_slam.se2 import Array, wrap
+from rlml_slam.se2 import wrap
 from rlml_slam.types import Frame, Health, Level, Status
 
 HISTORY = 3000  # frames that a page gets when it opens
 PATH_POINTS = 3000  # of the optimised path
 WAIT = 0.12  # [s] that a frame waits for its scan and its detections
-SHARE = 40.0  # of the time that passes, one part is spent on each of map, path and graph
+SHARE = 40.0  # of the time that passes, one part is spent on map, path and graph together
+SLOWEST = 1.0  # [s] between two looks at the same one of them
 # best effort: the publishers never wait for a viewer
 QUICK = QoSProfile(depth=20, reliability=ReliabilityPolicy.BEST_EFFORT)
 NEWEST = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -47,18 +49,22 @@ class _Answer:
 
     frame: Frame
     heard: float
-    points: Array | None = None
+    scan: bytes = b''  # serialized: only the newest is shown
     seen: tuple[int, int] | None = None
 
 
 @dataclass
 class _Slow:
-    """The newest message of a topic, which is looked into from time to time."""
+    """A topic whose newest message is looked into from time to time."""
 
     kind: Any
     use: Callable[[Any], Mapping[str, Columns]]
-    data: bytes = b''
     due: float = 0.0
+
+    def columns(self, data: bytes) -> Mapping[str, Columns]:
+        """What a message shows, as lists."""
+        found = self.use(deserialize_message(data, self.kind))
+        return {name: as_lists(of) for name, of in found.items()}
 
 
 class ViewListener:
@@ -72,10 +78,11 @@ class ViewListener:
         self._guard: MessageGuard = guard_of(node)
         self._start: int | None = None
         self._answers: dict[int, _Answer] = {}
-        self._truth: dict[int, Array] = {}
+        self._truth: dict[int, bytes] = {}  # serialized: of five poses, one belongs to a frame
         self._reasons: dict[int, str] = {}
         self._rows: deque[Columns] = deque(maxlen=HISTORY)
         self._shown: dict[str, Columns] = {}
+        self._due = 0.0  # when there is time again for a slow one
         self._map = HeardMap()
         self._slow = {
             'map': _Slow(OccupancyGridMsg, self._on_grid),
@@ -84,7 +91,7 @@ class ViewListener:
             'reflector_map_points': _Slow(PointCloud2, self._on_reflectors),
             TRUE_REFLECTORS: _Slow(PointCloud2, self._on_true_reflectors),
         }
-        self._quick: dict[str, tuple[Any, Callable[[Any], None]]] = {
+        self._quick: dict[str, tuple[Any, Callable[[bytes], None]]] = {
             'rlml/frames': (PointCloud2, self._on_frame),
             'reflectors/associated': (PointCloud2, self._on_associated),
             'deskewed_points': (PointCloud2, self._on_points),
@@ -113,20 +120,14 @@ class ViewListener:
         """
         for topic, (kind, use) in self._quick.items():
             for data in self._taken(topic, kind, QUICK.depth):
-                self._guard.pass_on(topic, lambda k=kind, u=use, d=data: u(  # type: ignore[misc]
-                    deserialize_message(d, k)))  # fmt: skip
-        replaced: dict[str, Columns] = {}
+                self._guard.pass_on(topic, partial(use, data))
         now = time.monotonic()
-        for topic, slow in self._slow.items():
-            for data in self._taken(topic, slow.kind, NEWEST.depth):
-                slow.data = data
-            if is_watched and slow.data and now >= slow.due:
-                replaced |= self._look_into(topic, slow)
-        message = self._complete(now)
+        message = self._complete(now, is_watched)
+        replaced = self._look_into_next(now) if is_watched else {}
         if replaced:
             self._shown |= replaced
             message = message or {}
-            message['replace'] = {k: as_lists(v) for k, v in replaced.items()}
+            message['replace'] = replaced
             message['extent'] = self._extent()
         return message
 
@@ -134,8 +135,8 @@ class ViewListener:
         """All that a page needs that has just been opened."""
         names = columns.SOURCES['frames']
         frames = {c: [v for row in self._rows for v in row[c]] for c in names}
-        shown = {k: as_lists(v) for k, v in self._shown.items()}
-        return {'start': True, 'replace': {**shown, 'frames': frames}, 'extent': self._extent()}
+        shown = {**self._shown, 'frames': frames}
+        return {'start': True, 'replace': shown, 'extent': self._extent()}
 
     def _taken(self, topic: str, kind: Any, depth: int) -> list[bytes]:
         """Serialized messages that wait, of a size that can be meant."""
@@ -150,50 +151,52 @@ class ViewListener:
                     out.append(taken[0])
         return out
 
-    def _look_into(self, topic: str, slow: _Slow) -> Mapping[str, Columns]:
-        began = time.monotonic()
-        data, slow.data = slow.data, b''
-        found: Mapping[str, Columns] = self._guard.pass_on(
-            topic, lambda: slow.use(deserialize_message(data, slow.kind)), {}
-        )
-        now = time.monotonic()
-        slow.due = now + max(1.0, SHARE * (now - began))
-        return found
+    def _look_into_next(self, began: float) -> Mapping[str, Columns]:
+        """What is new of the slow topic that has waited longest, if it is time for one."""
+        topic, slow = min(self._slow.items(), key=lambda item: item[1].due)
+        if began < max(self._due, slow.due):
+            return {}
+        found: Mapping[str, Columns] = {}
+        slow.due = began + SLOWEST
+        for data in self._taken(topic, slow.kind, NEWEST.depth):
+            found = self._guard.pass_on(topic, partial(slow.columns, data), {})
+            self._due = began + SHARE * (time.monotonic() - began)
+        return {name: of for name, of in found.items() if of != self._shown.get(name)}
 
     # --- messages of one frame ---
 
-    def _on_frame(self, msg: Any) -> None:
-        frame = read_record(msg).of.frame
+    def _on_frame(self, data: bytes) -> None:
+        frame = read_record(deserialize_message(data, PointCloud2)).of.frame
         self._answers[frame.stamp] = _Answer(frame, time.monotonic())
 
-    def _on_points(self, msg: Any) -> None:
-        answer = self._answers.get(decode.stamp(msg, 'deskewed_points'))
+    def _on_points(self, data: bytes) -> None:
+        answer = self._answers.get(decode.serialized_stamp(data))
         if answer is not None:
-            answer.points = read_points(msg)
+            answer.scan = data
 
-    def _on_associated(self, msg: Any) -> None:
-        associated = read_associated(msg)
+    def _on_associated(self, data: bytes) -> None:
+        associated = read_associated(deserialize_message(data, PointCloud2))
         answer = self._answers.get(associated.detections.stamp)
         if answer is not None:
             used = int(np.sum(associated.statuses == Status.USED))
             answer.seen = (len(associated.statuses), used)
 
-    def _on_truth(self, msg: Any) -> None:
-        pose = decode.planar_pose(msg.pose.pose, 'ground_truth')
-        self._truth[decode.stamp(msg, 'ground_truth')] = pose
+    def _on_truth(self, data: bytes) -> None:
+        self._truth[decode.serialized_stamp(data)] = data
         while len(self._truth) > 1000:
             del self._truth[next(iter(self._truth))]
 
-    def _on_health(self, msg: Any) -> None:
+    def _on_health(self, data: bytes) -> None:
+        msg = deserialize_message(data, DiagnosticStatus)
         level = msg.level[0] if isinstance(msg.level, bytes) else msg.level
         self._reasons[int(level)] = msg.message if level else ''
 
-    def _complete(self, now: float) -> dict[str, Any] | None:
+    def _complete(self, now: float, is_watched: bool) -> dict[str, Any] | None:
         """The frames that have all that belongs to them, or have waited long enough."""
         log, newest = FrameLog(), None
         for stamp in sorted(self._answers):
             a = self._answers[stamp]
-            if now - a.heard < WAIT and (a.points is None or a.seen is None):
+            if now - a.heard < WAIT and not (a.scan and a.seen):
                 break
             del self._answers[stamp]
             if self._start is not None and stamp < self._start:
@@ -212,23 +215,28 @@ class ViewListener:
         if newest is None or self._start is None:
             return None
         made = columns.frames(log, self._start)
-        self._add_errors(made, log)
+        self._guard.pass_on('ground_truth', partial(self._add_errors, made, log))
         rows = as_lists(made)
         self._rows.extend({c: [v[k]] for c, v in rows.items()} for k in range(len(log.stamps)))
         message: dict[str, Any] = {'stream': {'frames': rows}, 'state': ''}
         message['stamp'] = round(1e3 * (time.time() - (now - newest.heard)), 1)
-        if newest.points is not None:
-            points = thinned(newest.points)
-            message['scan'] = {
-                't': rows['t'][-1], 'x': points[:, 0].tolist(), 'y': points[:, 1].tolist(),
-            }  # fmt: skip
+        if newest.scan and is_watched:
+            shown = partial(self._scan, newest.scan, rows['t'][-1])
+            message['scan'] = self._guard.pass_on('deskewed_points', shown)
         return message
+
+    @staticmethod
+    def _scan(data: bytes, t: float) -> Columns:
+        points = thinned(read_points(deserialize_message(data, PointCloud2)))
+        return {'t': t, 'x': points[:, 0].tolist(), 'y': points[:, 1].tolist()}
 
     def _add_errors(self, made: Columns, log: FrameLog) -> None:
         """Errors [cm, deg] of the frames whose truth was heard."""
         for k, (stamp, pose) in enumerate(zip(log.stamps, log.poses, strict=True)):
-            true = self._truth.get(stamp)
-            if true is not None:
+            data = self._truth.get(stamp)
+            if data is not None:
+                msg = deserialize_message(data, Odometry)
+                true = decode.planar_pose(msg.pose.pose, 'ground_truth')
                 made['error'][k] = 100.0 * np.hypot(*(pose - true)[:2])
                 made['error_theta'][k] = np.degrees(wrap(pose[2] - true[2]))
 

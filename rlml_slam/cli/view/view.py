@@ -23,7 +23,7 @@ from rlml_slam.errors import RlmlError
 from rlml_slam.report.page import heading, page
 from rlml_slam.report.viewer import viewer_page
 
-PERIOD = 0.04  # [s] between looks at what has come
+PERIOD = 0.05  # [s] between looks at what has come
 IDLE = 0.2  # [s] of the same while nobody watches
 NICE = 10  # a viewer yields to whatever drives the robot
 
@@ -91,9 +91,5 @@ async def _serve(
         if message is not None:
             browsers.send(message)
         period = PERIOD if browsers.open else IDLE
-        wait = max(0.005, period - (time.monotonic() - began))
-        try:
-            await asyncio.wait_for(ended.wait(), wait)
-        except asyncio.TimeoutError:
-            continue
+        await asyncio.sleep(max(0.005, period - (time.monotonic() - began)))
     server.stop()

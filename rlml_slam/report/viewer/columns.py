@@ -10,6 +10,7 @@ import base64
 import io
 import itertools
 from collections.abc import Mapping, Sequence
+from math import isfinite
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -251,8 +252,7 @@ def as_lists(of: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
         if isinstance(values, np.ndarray):
             values = values.tolist()
         out[name] = [
-            None if isinstance(v, float) and not np.isfinite(v)
-            else round(v, 4) if isinstance(v, float) else v
+            v if not isinstance(v, float) else round(v, 4) if isfinite(v) else None
             for v in values
         ]  # fmt: skip
     return out

@@ -195,6 +195,8 @@ def plot(of: Plot, by: Mapping[str, ColumnDataSource], x_range: Any) -> Any:
         tools=[zoom, PanTool(dimensions='width'), ResetTool()], active_drag=zoom,
     )  # fmt: skip
     _dress(f)
+    if not len(by['frames'].data['t']):  # a range of nothing is an error in the console
+        f.scatter(x=[0.0], y=[0.0], alpha=0.0, name='zero')
     last = None
     for s in of.series:
         draw = f.step if s.is_step else f.line
