@@ -83,7 +83,7 @@ def small(seed: int) -> dict[str, Any]:
     """A room: three more (accuracy) or two more (odd seeds, and unique), and the fewest."""
     site = sites.of_world(small_room(seed))
     places = sites.places(site, 1.0, 0.3)
-    mounts = _few(wall_mounts(site, 1.0))
+    mounts = _few(wall_mounts(site, 1.0, 0.3))
     is_unique, none = seed % 2 == 1, np.zeros((0, 2))
     wanted = Wanted(2 if is_unique else 3, Goal(0.011), is_unique=is_unique)
     of = coverage(site, mounts, places, P, SENSOR, wanted, none)
@@ -144,7 +144,7 @@ def layout(name: str, seeds: int) -> dict[str, Any]:
         ends = sites.inside(np.array([[0, -1.2], [60, -1.2], [60, 1.2], [0, 1.2]]), places)
         places = places[ends]
     wanted = Wanted(None, goal, is_accurate=name != 'symmetric', is_unique=name != 'corridor')
-    found, plan = suggested(site, wall_mounts(site, 1.0), places, P, SENSOR, wanted)
+    found, plan = suggested(site, wall_mounts(site, 1.0, 0.3), places, P, SENSOR, wanted)
     drives = [drive(world, plan.site, goal, seed) for seed in range(seeds)]
     error = float(np.sqrt(np.mean([d.error**2 for d in drives])))
     planned = float(np.sqrt(np.mean([d.planned**2 for d in drives])))
@@ -183,7 +183,7 @@ def speed() -> Rows:
         timed('plan with pictures', 10.0, lambda: write_plan(
             make_plan(site, places, P, SENSOR, goal), 'hall', Path(out)))  # fmt: skip
     timed('suggest 20', 60.0, lambda: suggested(
-        site, wall_mounts(site, 1.0), places, P, SENSOR, Wanted(20, goal)))  # fmt: skip
+        site, wall_mounts(site, 1.0, 0.3), places, P, SENSOR, Wanted(20, goal)))  # fmt: skip
     return rows
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a reflector can be mounted: on walls and pillars, on their side that robots can reach."""
+"""Where a reflector can be mounted: on walls, pillars and poles, and in the way of no robot."""
 
 from __future__ import annotations
 
@@ -8,18 +8,20 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from rlml_slam.planning.free_ways import leave_path, leave_ways
 from rlml_slam.planning.site import DIAMETER, OCCUPIED, Site
 from rlml_slam.se2 import Array, transform
 
 APART = 0.5  # [m] between reflectors: nearer ones may be merged
 MOST = 400  # mounts that are tried
+NO_PATH = np.zeros((0, 2))
 
 
-def wall_mounts(site: Site, spacing: float) -> Array:
+def wall_mounts(site: Site, spacing: float, clearance: float, path: Array = NO_PATH) -> Array:
     """Centres (c, 2) of reflectors on walls and pillars about ``spacing`` [m] apart.
 
     In free cells that one step separates from an occupied one, so that a post touches the wall
-    and does not stand in an aisle.
+    and does not stand in an aisle, and on the side that robots can reach.
     """
     grid = site.grid
     r = grid.resolution
@@ -29,7 +31,14 @@ def wall_mounts(site: Site, spacing: float) -> Array:
     least = 0.5 * DIAMETER + 0.75 * r
     i, j = np.nonzero((grid.cells == 0) & (away >= least) & (away < least + r))
     points = transform(grid.T_map_grid, r * (np.stack([j, i], -1) + 0.5))
-    return thin(points, spacing, site.reflectors.points)
+    kept = thin(points, spacing, site.reflectors.points)
+    return out_of_the_way(site, kept, clearance, path)
+
+
+def out_of_the_way(site: Site, posts: Array, clearance: float, path: Array = NO_PATH) -> Array:
+    """Those of the posts (k, 2) that robots, ``clearance`` [m] to each side, can pass."""
+    posts = posts[leave_path(path, posts, clearance)]
+    return posts[leave_ways(site, posts, clearance)]
 
 
 def thin(points: Array, spacing: float, present: Array) -> Array:

@@ -163,7 +163,7 @@ def coverage(
 def suggest(of: Coverage, wanted: Wanted) -> Suggestion:
     """The mounts to add to what is present; MapError without any mount."""
     if len(of.points) == of.num_present:
-        raise MapError('there is no place to mount a reflector; see --mountable')
+        raise MapError('there is no place to mount a reflector; see --mountable and --clearance')
     choice, at_least = start(of), None
     if wanted.number is not None:
         choice = _best_grown(choice, wanted.number)

@@ -156,3 +156,16 @@ def test_fewest_on_given_poles(tmp_path, capsys):
     mounts = found['suggested']['mounts']
     assert {(m['x_m'], m['y_m']) for m in mounts} <= set(poles)
     assert 'reach the goal' in out
+
+
+def test_no_reflector_is_suggested_on_a_path(tmp_path, capsys):
+    (tmp_path / 'poles.csv').write_text('x,y\n10,10\n30,9.7\n12,20\n30,20\n', encoding='utf-8')
+    poses = ('0 5 10 0 0 0 0 1\n', '1 35 10 0 0 0 0 1\n')  # far apart: the way between counts
+    (tmp_path / 'path.tum').write_text(''.join(poses), encoding='utf-8')
+    _, _, err = plan(
+        capsys, 'yard', '--out', tmp_path, '--path', tmp_path / 'path.tum', '--spacing', 2,
+        '--suggest', 4, '--goal', 0.002, '--mountable', tmp_path / 'poles.csv',
+    )  # fmt: skip
+    assert err == '2 of 4 poles are in the way of robots: they are not used\n'
+    found = json.loads((tmp_path / 'plan.json').read_text(encoding='utf-8'))
+    assert {m['y_m'] for m in found['suggested']['mounts']} == {20.0}

@@ -49,7 +49,7 @@ def test_places_that_lack_accuracy_are_those_of_the_plan(hidden):
 @pytest.mark.parametrize('hidden', [0, 1])
 def test_gains_are_the_losses_that_fall(hidden):
     site = empty('room')
-    of = covered(site, wall_mounts(site, 2.0), Wanted(1, Goal(0.01, hidden=hidden),
+    of = covered(site, wall_mounts(site, 2.0, 0.3), Wanted(1, Goal(0.01, hidden=hidden),
                                                       is_unique=False))  # fmt: skip
     rng = np.random.default_rng(3)
     for _ in range(5):
@@ -65,7 +65,7 @@ def test_gains_are_the_losses_that_fall(hidden):
 
 def test_fewest_are_the_fewest_of_all_choices():
     site = empty('room')
-    mounts = wall_mounts(site, 1.8)
+    mounts = wall_mounts(site, 1.8, 0.3)
     wanted = Wanted(None, Goal(0.012), is_unique=False)
     of = covered(site, mounts, wanted, 0.6)
     found = suggest(of, wanted)
@@ -77,7 +77,7 @@ def test_fewest_are_the_fewest_of_all_choices():
 
 def test_exchanges_are_near_the_best_choice():
     site = empty('room')
-    of = covered(site, wall_mounts(site, 1.8), Wanted(3, Goal(0.01), is_unique=False))
+    of = covered(site, wall_mounts(site, 1.8, 0.3), Wanted(3, Goal(0.01), is_unique=False))
     found = exchanged(grown(start(of), 3))
     best = min(with_mounts(of, c).loss for c in combinations(range(len(of.points)), 3))
     without = start(of).loss
@@ -88,7 +88,7 @@ def test_goal_holds_with_any_suggested_reflector_hidden():
     site = empty('room')
     places = sites.places(site, 1.0, 0.3)
     wanted = Wanted(None, Goal(0.015, hidden=1), is_unique=False)
-    found, plan = suggested(site, wall_mounts(site, 1.0), places, P, SENSOR, wanted)
+    found, plan = suggested(site, wall_mounts(site, 1.0, 0.3), places, P, SENSOR, wanted)
     assert found.is_complete
     assert plan.is_reached.all()
     for k in range(len(found.mounts)):
@@ -100,7 +100,7 @@ def test_symmetric_hall_becomes_unique():
     site = sites.of_world(load_world('symmetric'))
     places = sites.places(site, 1.0, 0.3)
     wanted = Wanted(None, Goal(0.02), is_accurate=False)
-    found, plan = suggested(site, wall_mounts(site, 2.0), places, P, SENSOR, wanted)
+    found, plan = suggested(site, wall_mounts(site, 2.0, 0.3), places, P, SENSOR, wanted)
     assert found.steps[0].unique_share == 0.0
     assert found.steps[-1].unique_share == 1.0
     assert plan.is_unique.all()
@@ -113,7 +113,7 @@ def test_each_step_names_what_is_reached_and_shares_never_fall():
     site = empty('hall')
     wanted = Wanted(6, Goal(0.02), is_unique=False)
     places = sites.places(site, 1.0, 0.3)
-    found, plan = suggested(site, wall_mounts(site, 2.0), places, P, SENSOR, wanted)
+    found, plan = suggested(site, wall_mounts(site, 2.0, 0.3), places, P, SENSOR, wanted)
     shares = [s.goal_share for s in found.steps]
     assert len(found.mounts) == 6
     assert shares == sorted(shares)
@@ -124,7 +124,7 @@ def test_laser_that_looks_forward_needs_more():
     site = empty('room')
     narrow = SimulatorParameters()
     narrow = type(narrow)(laser=type(narrow.laser)(field_of_view=np.pi))
-    places, mounts = sites.places(site, 1.5, 0.3), wall_mounts(site, 1.5)
+    places, mounts = sites.places(site, 1.5, 0.3), wall_mounts(site, 1.5, 0.3)
     wanted = Wanted(None, Goal(0.02), is_unique=False)
     counts = []
     for sensor in (SENSOR, narrow):
@@ -136,7 +136,7 @@ def test_laser_that_looks_forward_needs_more():
 @pytest.mark.parametrize('name', ['hall', 'symmetric', 'room'])
 def test_mounts_touch_walls_and_stand_in_no_aisle(name):
     site = sites.of_world(load_world(name))
-    mounts = wall_mounts(site, 1.0)
+    mounts = wall_mounts(site, 1.0, 0.3)
     grid = site.grid
     i, j = np.nonzero(grid.cells >= 65)
     walls = np.array(grid.origin) + grid.resolution * (np.stack([j, i], -1) + 0.5)
@@ -160,4 +160,6 @@ def test_no_mount_is_an_error():
     site = sites.of_world(load_world('yard'))
     wanted = Wanted(3, Goal(0.01))
     with pytest.raises(MapError, match='mountable'):
-        suggested(site, wall_mounts(site, 1.0), sites.places(site, 2.0, 0.3), P, SENSOR, wanted)
+        suggested(
+            site, wall_mounts(site, 1.0, 0.3), sites.places(site, 2.0, 0.3), P, SENSOR, wanted
+        )

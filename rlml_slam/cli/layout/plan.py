@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from rlml_slam.maps import saved_map, survey
 from rlml_slam.params import Parameters, SimulatorParameters, from_mapping, read_yaml
 from rlml_slam.plain_yaml import parse_yaml
 from rlml_slam.planning import site as sites
-from rlml_slam.planning.mounts import thin, wall_mounts
+from rlml_slam.planning.mounts import NO_PATH, out_of_the_way, thin, wall_mounts
 from rlml_slam.planning.plan import Goal, make_plan
 from rlml_slam.planning.site import Site
 from rlml_slam.planning.suggest import Wanted, suggested
@@ -57,7 +58,8 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--redundant', type=int, default=0, choices=(0, 1, 2), metavar='K',
                         help='the goal holds with the worst K reflectors hidden')  # fmt: skip
     parser.add_argument('--spacing', type=float, default=0.25, help='between places [m]')
-    parser.add_argument('--clearance', type=float, default=0.3, help='of places to walls [m]')
+    parser.add_argument('--clearance', type=float, default=0.3, help='half the width of robots '
+                        '[m]: places and ways are as far from walls and posts')  # fmt: skip
     more = parser.add_mutually_exclusive_group()
     more.add_argument('--suggest', type=int, metavar='N', help='add N reflectors where they help '
                       'most; layout.csv, .imk and .dxf')  # fmt: skip
@@ -126,9 +128,15 @@ def _print(found: dict[str, Any], args: argparse.Namespace) -> None:
 
 def _mounts(args: argparse.Namespace, site: Site) -> Array:
     """Where reflectors may be mounted (c, 2)."""
-    if args.mountable is not None:
-        return thin(survey.load(args.mountable).points, 0.0, site.reflectors.points)
-    return wall_mounts(site, args.mount_spacing)
+    path = NO_PATH if args.path is None else read_tum(args.path).poses[:, :2]
+    if args.mountable is None:
+        return wall_mounts(site, args.mount_spacing, args.clearance, path)
+    poles = thin(survey.load(args.mountable).points, 0.0, site.reflectors.points)
+    free = out_of_the_way(site, poles, args.clearance, path)
+    if len(free) < len(poles):
+        print(f'{len(poles) - len(free)} of {len(poles)} poles are in the way of robots: they are '
+              'not used', file=sys.stderr)  # fmt: skip
+    return free
 
 
 def _is_world(name: str) -> bool:
