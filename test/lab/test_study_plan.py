@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -32,7 +34,7 @@ def test_estimate_is_exact_without_noise():
 
 @pytest.fixture(scope='module')
 def ring():
-    return areas(WORLDS[5], 2)
+    return areas(WORLDS[5], 2, False)
 
 
 def test_errors_are_as_planned(ring):
@@ -51,6 +53,26 @@ def test_plan_of_another_noise_is_noticed(monkeypatch):
     monkeypatch.setattr(study_plan_bound, 'bound', optimistic)
     code = main(['study', 'plan-bound', '--seeds', '1', '--world', WORLDS[5]])
     assert code == 1
+
+
+def test_people_have_rows_of_their_own_that_do_not_count(monkeypatch, capsys):
+    def drive(name, seed, people):
+        ones, planned = np.ones(40), np.full(40, 0.01)
+        return np.ones((40, 2)), planned * (2.0 if people else 1.0), planned, ones, ones
+
+    monkeypatch.setattr(study_plan_bound, 'drive', drive)
+    arguments = ['study', 'plan-bound', '--seeds', '1', '--world', 'room', '--world', 'yard']
+    assert main([*arguments, '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found['tested'], found['good']) == (2, 2)
+    assert (found['tested_with_people'], found['good_with_people']) == (1, 0)
+    assert [(r['world'], r['people'], r['ratio']) for r in found['areas']] == [
+        ('room', False, 1.0),
+        ('room', True, 2.0),
+        ('yard', False, 1.0),
+    ]
+    assert main(arguments) == 0
+    assert 'with people: 0 of 1 areas' in capsys.readouterr().out
 
 
 def test_no_place_is_unique_in_a_symmetric_layout():

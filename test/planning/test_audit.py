@@ -17,7 +17,7 @@ from rlml_slam.planning.audit import sightings as record
 from rlml_slam.planning.audit.audit import Audit, in_frame_of, make_audit
 from rlml_slam.planning.audit.displacement import displacement
 from rlml_slam.planning.audit.evidence import gather
-from rlml_slam.planning.audit.findings import Kind
+from rlml_slam.planning.audit.findings import Finding, Kind, ranked
 from rlml_slam.planning.audit.sightings import SightingLog, Sightings
 from rlml_slam.planning.site import Site
 from rlml_slam.planning.visibility import visible
@@ -164,6 +164,35 @@ def test_spells_of_bad_health_name_area_and_reason():
     assert [f.kind for f in found] == [Kind.DEGRADED]
     assert 'wheels slip' in found[0].what
     assert 'A0' in found[0].what
+
+
+def test_findings_are_ranked_each_with_what_to_do():
+    """By kind in the order of Kind, and of one kind by how often it was due."""
+    rate = np.full(len(SITE.reflectors), 0.98)
+    rate[2], rate[6], rate[7] = 0.0, 0.5, 0.5
+    s = sightings(8, shifted(3, (0.04, -0.03)), rate=rate, more=np.array([[0.4, 1.3]]))
+    bad = (s.poses[:, 0] < -5.0) & (s.poses[:, 1] < -2.5)
+    s = replace(s, levels=bad.astype(int), texts=np.array(['', 'wheels slip', record.OTHER]),
+                reasons=bad.astype(int))  # fmt: skip
+    found = audit(s).findings
+    assert [f.kind for f in found] == [Kind.MOVED, Kind.HIDDEN, Kind.DIRTY, Kind.DIRTY, Kind.GHOST,
+                                       Kind.DEGRADED]  # fmt: skip
+    assert [f.subject for f in found[:2]] == [3, 2]
+    assert {f.subject for f in found[2:4]} == {6, 7}
+    assert found[2].share > found[3].share
+    words = ('mount it where', 'removed or something stands before it', 'clean or replace',
+             'clean or replace', 'add it to the layout', 'A0')  # fmt: skip
+    for f, word in zip(found, words, strict=True):
+        assert word in f'{f.what}; {f.advice}'
+
+
+@pytest.mark.parametrize('order', [(0, 1, 2, 3), (3, 2, 1, 0), (2, 0, 3, 1)])
+def test_rank_is_of_the_kind_before_the_share(order):
+    often, seldom = 0.9, 0.1
+    best = [Finding(kind, -1, 0.0, 0.0, '', '', share) for kind, share in
+            ((Kind.MOVED, seldom), (Kind.DIRTY, often), (Kind.DIRTY, seldom),
+             (Kind.RESIDUALS, often))]  # fmt: skip
+    assert ranked([best[k] for k in order]) == best
 
 
 def test_noise_above_the_plan_is_a_finding():
