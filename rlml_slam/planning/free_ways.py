@@ -26,7 +26,7 @@ def leave_ways(site: Site, posts: Array, clearance: float) -> NDArray[np.bool_]:
     """Which of the posts (k, 2) close no way, alone or with others, in the order given."""
     grid, r = site.grid, site.grid.resolution
     # to the nearest point of a cell, not to its centre: never more than it is
-    room = ndimage.distance_transform_edt(grid.cells == 0) * r - CORNER * r
+    room = ndimage.distance_transform_edt(site.free) * r - CORNER * r
     to_grid = inverse(grid.T_map_grid)
     for point, width in zip(transform(to_grid, site.reflectors.points), site.reflectors.widths,
                             strict=True):  # fmt: skip

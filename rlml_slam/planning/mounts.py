@@ -29,7 +29,7 @@ def wall_mounts(site: Site, spacing: float, clearance: float, path: Array = NO_P
         return np.zeros((0, 2))
     away = ndimage.distance_transform_edt(grid.cells < OCCUPIED) * r
     least = 0.5 * DIAMETER + 0.75 * r
-    i, j = np.nonzero((grid.cells == 0) & (away >= least) & (away < least + r))
+    i, j = np.nonzero(site.free & (away >= least) & (away < least + r))
     points = transform(grid.T_map_grid, r * (np.stack([j, i], -1) + 0.5))
     kept = thin(points, spacing, site.reflectors.points)
     return out_of_the_way(site, kept, clearance, path)

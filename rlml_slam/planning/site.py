@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from rlml_slam.maps.nav2_map import FREE_THRESH
 from rlml_slam.maps.occupancy import UNKNOWN, OccupancyGrid
 from rlml_slam.maps.survey import Survey
 from rlml_slam.se2 import Array, between, transform
@@ -26,7 +27,7 @@ WALLS = np.array([0.6, 0.0, 0.0, -1.0])  # surface of what a grid has
 
 @dataclass(frozen=True)
 class Site:
-    """``walls`` stop beams; ``grid`` has them as cells, and free where the robot can be.
+    """``walls`` stop beams; ``grid`` has them as cells, and is ``free`` where the robot can be.
 
     ``cov`` (m, 2, 2) are the covariances of the reflectors in the map. ``oriented``: it is known
     which reflectors are flat, and their normals.
@@ -37,6 +38,12 @@ class Site:
     cov: Array
     grid: OccupancyGrid
     oriented: bool = True
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Cells that are free: by the probability below which nav2 takes them as free."""
+        cells = self.grid.cells
+        return (cells >= 0) & (cells <= 100 * FREE_THRESH)
 
     def with_reflectors(self, survey: Survey) -> Site:
         """The same site with the reflectors of a survey, which is in the frame of the map."""
@@ -128,7 +135,7 @@ def places(site: Site, spacing: float, clearance: float) -> Array:
     """Places (n, 2) about every ``spacing`` [m], free and ``clearance`` [m] from what is not."""
     grid = site.grid
     step = max(1, round(spacing / grid.resolution))
-    room = ndimage.distance_transform_edt(grid.cells == 0) * grid.resolution
+    room = ndimage.distance_transform_edt(site.free) * grid.resolution
     i, j = np.nonzero(room[step // 2 :: step, step // 2 :: step] > clearance)
     cells = np.stack([j, i], -1) * step + step // 2 + 0.5
     return transform(grid.T_map_grid, grid.resolution * cells)

@@ -17,6 +17,7 @@ from rlml_slam.matching.reflectors.innovations import expected
 from rlml_slam.params import Detector, Parameters, Reflector, SimulatorParameters
 from rlml_slam.planning import site as sites
 from rlml_slam.planning.bound import bound, reflector_information, sigmas
+from rlml_slam.planning.mounts import wall_mounts
 from rlml_slam.planning.plan import Goal, figures, make_plan
 from rlml_slam.planning.visibility import close_pairs, remove_merged, visible
 from rlml_slam.se2 import Array
@@ -253,3 +254,17 @@ def test_neighbours_one_behind_the_other_are_not_merged():
     seen = np.ones((1, 2), dtype=np.bool_)
     remove_merged(seen, np.zeros((1, 2)), r, SENSOR)
     assert seen.all()
+
+
+def test_cells_that_are_probably_free_are_free():
+    """A saved map has probabilities: those that nav2 takes as free do not narrow the site."""
+    site = sites.of_world(load_world('room'))
+    rng = np.random.default_rng(2)
+    cells = site.grid.cells.copy()
+    some = (cells == 0) & (rng.random(cells.shape) < 0.05)
+    cells[some] = rng.integers(1, 20, some.sum())
+    likely = replace(site, grid=replace(site.grid, cells=cells))
+    for of in (lambda s: sites.places(s, 0.25, 0.3), lambda s: wall_mounts(s, 1.0, 0.3)):
+        np.testing.assert_array_equal(of(likely), of(site))
+    cells[some] = 30
+    assert len(sites.places(likely, 0.25, 0.3)) < 0.5 * len(sites.places(site, 0.25, 0.3))
