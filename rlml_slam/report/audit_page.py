@@ -30,7 +30,7 @@ FINDING_HEADER = ('rank', 'kind', 'what', 'what to do')
 def write_audit(audit: Audit, name: str, folder: Path) -> None:
     """Write audit.json, audit.png and audit.html, each whole or not at all."""
     folder = make_folder(folder)
-    image = _picture(audit)
+    image = picture_of(audit)
     write_atomically(folder / 'audit.png', image)
     text = json.dumps(audit.figures, indent=2) + '\n'
     write_atomically(folder / 'audit.json', text.encode())
@@ -54,7 +54,7 @@ def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, ...]]:
             for k, f in enumerate(found['findings'], 1))]  # fmt: skip
 
 
-def _picture(audit: Audit) -> bytes:
+def picture_of(audit: Audit) -> bytes:
     """The grid, the places of the scans by health, the layout, and the findings by rank."""
     e = audit.evidence
     figure = Figure(figsize=(9.0, 6.5), layout='constrained')
@@ -64,10 +64,12 @@ def _picture(audit: Audit) -> bytes:
     draw.draw_grid(axes, e.site.grid)
     at, levels = e.sightings.poses, e.sightings.levels
     for level in (Level.OK, Level.DEGRADED):
-        mine = levels == level
-        axes.plot(*at[mine, :2].T, '.', ms=3, color=draw.LEVELS[level], label=level.name, zorder=2)
+        if (mine := levels == level).any():
+            axes.plot(*at[mine, :2].T, '.', ms=3, color=draw.LEVELS[level], label=level.name,
+                      zorder=2)  # fmt: skip
     ghosts = e.points[e.match < 0]
-    axes.plot(*ghosts.T, '.', ms=2, color=draw.SOFT, label='not in the layout', zorder=2)
+    if len(ghosts):
+        axes.plot(*ghosts.T, 'x', ms=4, color=draw.INK, label='not in the layout', zorder=2)
     axes.plot(*e.site.reflectors.points.T, 'D', color=draw.REFLECTOR, mec='white', ms=5,
               label='layout', zorder=3)  # fmt: skip
     for k, f in enumerate(audit.findings, 1):

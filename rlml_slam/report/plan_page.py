@@ -36,6 +36,10 @@ MARGINS = (0.6, 1.2, 0.5, 0.15)  # [inch] left, right, below, above
 LABELS = {'view': 'reflectors', 'unique': 'unique'}
 LOWEST = 1.0  # [inch] a picture, even of a corridor
 LEGEND = 'White line: the goal. Red: not held.'
+SUGGESTED = (
+    'In the pictures, suggested reflectors are orange. Shares of this table are of the places at '
+    'which mounts were compared; those of all places may differ by tenths of a percent.'
+)
 CAPTIONS = {
     'view': 'Reflectors in view',
     'reflectors': 'Position sigma of one scan, by reflectors alone',
@@ -239,7 +243,7 @@ def _page(name: str, found: Mapping[str, Any], pictures: Mapping[str, bytes]) ->
         parts.append(section('Notes', _paragraphs(found['notes']), 'problem'))
     if 'suggested' in found:
         head, *rows = suggestion_rows(found)
-        notes = _paragraphs(suggestion_notes(found))
+        notes = _paragraphs([*suggestion_notes(found), SUGGESTED])
         parts.append(section('Suggested reflectors', table(rows, head) + notes))
     for key, image in pictures.items():
         legend = '' if key in LABELS else f'<p class="sub">{LEGEND}</p>'

@@ -21,6 +21,7 @@ from rlml_slam.planning.audit.findings import Finding, Kind, ranked
 from rlml_slam.planning.audit.sightings import SightingLog, Sightings
 from rlml_slam.planning.site import Site
 from rlml_slam.planning.visibility import visible
+from rlml_slam.report import audit_page
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.polar import polar_covariance
 from rlml_slam.simulation.world_file import load_world
@@ -163,7 +164,40 @@ def test_spells_of_bad_health_name_area_and_reason():
     found = audit(s).findings
     assert [f.kind for f in found] == [Kind.DEGRADED]
     assert 'wheels slip' in found[0].what
-    assert 'A0' in found[0].what
+    assert 'A0: DEGRADED in' in found[0].what
+    assert 'enough: see to the reason' in found[0].advice  # more reflectors do not help wheels
+    few = replace(SITE.reflectors, **{k: v[:2] for k, v in vars(SITE.reflectors).items()})
+    site = replace(SITE, reflectors=few, cov=SITE.cov[:2])
+    s = replace(sightings(8, site), levels=s.levels, texts=s.texts, reasons=s.reasons)
+    found = audit(s, site).findings
+    (degraded,) = (f for f in found if f.kind is Kind.DEGRADED)
+    assert degraded.advice.endswith('see rlml plan --suggest')
+
+
+def test_robot_that_was_lost_is_a_finding_where_it_last_knew_its_place():
+    s = sightings(8)
+    n = len(s.levels)
+    levels, reasons = np.zeros(n, dtype=int), np.zeros(n, dtype=int)
+    levels[:30] = 2  # not yet located, at the start
+    assert not audit(replace(s, levels=levels)).findings
+    levels[100:150] = levels[200:205] = 2
+    reasons[100:150] = 1
+    s = replace(s, levels=levels, reasons=reasons,
+                texts=np.array(['', 'nothing fits', record.OTHER]))  # fmt: skip
+    found = audit(s).findings
+    assert [f.kind for f in found] == [Kind.LOST]
+    assert found[0].what.startswith(f'LOST in 55 of {n} scans, 2 times, longest after (')
+    assert found[0].what.endswith('nothing fits')
+    np.testing.assert_allclose((found[0].x, found[0].y), s.poses[99, :2])
+
+
+def test_map_of_an_audit_shows_what_the_layout_has_not(monkeypatch):
+    drawn = []
+    monkeypatch.setattr(audit_page.draw, 'png', lambda figure: drawn.append(figure) or b'')
+    s = sightings(6, more=np.array([[0.4, 1.3]]))
+    audit_page.picture_of(audit(replace(s, levels=(s.poses[:, 0] < -5.0).astype(int))))
+    labels = [line.get_label() for line in drawn[0].axes[0].lines]
+    assert labels[:4] == ['OK', 'DEGRADED', 'not in the layout', 'layout']
 
 
 def test_findings_are_ranked_each_with_what_to_do():

@@ -14,10 +14,12 @@ from rlml_slam.params import Reflector
 from rlml_slam.planning.audit.displacement import Displacement
 from rlml_slam.planning.audit.evidence import Evidence
 from rlml_slam.planning.audit.findings import Finding, Kind
+from rlml_slam.planning.audit.sightings import Sightings
 from rlml_slam.planning.bound import bound
 from rlml_slam.types import Level
 
 FEW = 10  # scans below which nothing is said about an area
+ENOUGH = 3  # reflectors in view, with which more of them are not what an area lacks
 BAD_SHARE = 0.1  # of the scans of an area that are not OK
 BAD_RATIO = 1.5  # of the residuals to their sigma
 
@@ -81,7 +83,12 @@ def of_areas(
                 f'{name}: DEGRADED in {1.0 - row["ok_share"]:.0%} of {row["scans"]} scans, mostly '
                 f'near ({x:.1f}, {y:.1f}): {reason}'
             )
-            advice = f'{in_view:.0f} reflectors are planned in view there; see rlml plan --suggest'
+            advice = f'{in_view:.0f} reflectors are planned in view there'
+            advice += (
+                ', which are enough: see to the reason'
+                if in_view >= ENOUGH
+                else '; see rlml plan --suggest'
+            )
             found.append(Finding(Kind.DEGRADED, -1, x, y, what, advice, share))
         ratio = row['residual_ratio']
         if ratio is not None and row['scans'] >= FEW and ratio > BAD_RATIO:
@@ -89,6 +96,26 @@ def of_areas(
             advice = 'see sigma_range and sigma_bearing, the mounting of the laser, and the floor'
             found.append(Finding(Kind.RESIDUALS, -1, x, y, what, advice, share))
     return found
+
+
+def of_lost(s: Sightings) -> list[Finding]:
+    """Where the robot was LOST after it knew its place: beside the last place that it knew."""
+    known = np.flatnonzero(s.levels < Level.LOST)
+    lost = np.flatnonzero(s.levels == Level.LOST)
+    lost = lost[lost > known[0]] if len(known) else lost[:0]
+    if not len(lost):
+        return []
+    last = known[np.searchsorted(known, lost) - 1]
+    spells, count = np.unique(last, return_counts=True)
+    longest = spells[count.argmax()]
+    x, y = s.poses[longest, :2].tolist()
+    reason = s.texts[np.bincount(s.reasons[lost[last == longest]]).argmax()]
+    what = (
+        f'LOST in {len(lost)} of {len(s.levels)} scans, {len(spells)} times, longest after '
+        f'({x:.1f}, {y:.1f}): {reason}'
+    )
+    advice = 'see there whether the place is unique in the plan, and what is above'
+    return [Finding(Kind.LOST, -1, x, y, what, advice, len(lost) / len(s.levels))]
 
 
 def _median(values: Any) -> float | None:

@@ -14,7 +14,7 @@ from rlml_slam.errors import MapError
 from rlml_slam.maps.survey import Survey
 from rlml_slam.matching.reflectors.survey_alignment import place
 from rlml_slam.params import Parameters, SimulatorParameters
-from rlml_slam.planning.audit.areas import measured, of_areas
+from rlml_slam.planning.audit.areas import measured, of_areas, of_lost
 from rlml_slam.planning.audit.displacement import displacement
 from rlml_slam.planning.audit.evidence import GATE, Evidence, gather
 from rlml_slam.planning.audit.findings import Finding, of_reflectors, ranked
@@ -49,7 +49,9 @@ def make_audit(
     e = gather(site, s, p, sensor)
     there, shift = presence(e), displacement(e, tolerance)
     rows = measured(e, shift, plan, p.reflector)
-    found = ranked(of_reflectors(e, there, shift, ghosts(e)) + of_areas(e, rows, plan))
+    found = ranked(
+        of_reflectors(e, there, shift, ghosts(e)) + of_lost(s) + of_areas(e, rows, plan)
+    )
     return Audit(e, tuple(found), {
         'scans': len(e.sightings.stamps), 'detections': len(e.match),
         'unmatched': int((e.match < 0).sum()), 'usual_rate': there.usual,

@@ -30,6 +30,7 @@ class Kind(Enum):
     DIRTY = 'dirty'
     MIRROR = 'mirror'
     GHOST = 'ghost'
+    LOST = 'lost'
     DEGRADED = 'degraded'
     RESIDUALS = 'residuals'
 
