@@ -15,6 +15,7 @@ from rlml_slam.maps.survey import MM, Survey
 from rlml_slam.se2 import Array
 
 PRESENT, ADDED, WALLS = 'REFLECTORS', 'REFLECTORS_NEW', 'WALLS'
+COLOURS = {PRESENT: '1', ADDED: '30', WALLS: '8'}  # of AutoCAD: red, orange, grey
 TEXT = 0.25  # [m] height of a reflector's number
 
 
@@ -46,7 +47,13 @@ def imk(survey: Survey) -> str:
 
 def dxf(survey: Survey, walls: Array, num_present: int) -> str:
     """Reflectors as circles with their numbers, and walls as lines; units are metres."""
-    pairs: list[tuple[int, str | float]] = [(0, 'SECTION'), (2, 'ENTITIES')]
+    pairs: list[tuple[int, str | float]] = [(0, 'SECTION'), (2, 'TABLES')]
+    pairs += [(0, 'TABLE'), (2, 'LTYPE'), (70, '1'), (0, 'LTYPE'), (2, 'CONTINUOUS'), (70, '0'),
+              (3, 'Solid line'), (72, '65'), (73, '0'), (40, 0.0), (0, 'ENDTAB')]  # fmt: skip
+    pairs += [(0, 'TABLE'), (2, 'LAYER'), (70, str(len(COLOURS)))]
+    for layer, colour in COLOURS.items():
+        pairs += [(0, 'LAYER'), (2, layer), (70, '0'), (62, colour), (6, 'CONTINUOUS')]
+    pairs += [(0, 'ENDTAB'), (0, 'ENDSEC'), (0, 'SECTION'), (2, 'ENTITIES')]
     for x0, y0, x1, y1 in walls.tolist():
         pairs += [(0, 'LINE'), (8, WALLS), (10, x0), (20, y0), (11, x1), (21, y1)]
     for n, (k, x, y, d) in enumerate(_rows(survey)):

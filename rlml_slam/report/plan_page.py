@@ -27,11 +27,13 @@ from rlml_slam.report.outputs import make_folder
 from rlml_slam.report.page import heading, page, picture, section, table
 from rlml_slam.report.pictures import LIVE, REFLECTOR, draw_grid, dress, png
 from rlml_slam.se2 import Array
+from rlml_slam.simulation.world import Geometry
 
 PIXELS = 700  # of a side of the grid that is drawn
 MANY = 20_000  # places from which they are drawn as an image
 NEIGHBOURS = 2_000  # places by which their spacing is known
 FAST = 2  # compression of pictures
+SIDES = 24  # of a pillar in a drawing
 MARGINS = (0.6, 1.2, 0.5, 0.15)  # [inch] left, right, below, above
 LABELS = {'view': 'reflectors', 'unique': 'unique'}
 LOWEST = 1.0  # [inch] a picture, even of a corridor
@@ -65,7 +67,7 @@ def write_plan(
         r, added = plan.site.reflectors, len(suggestion.mounts)
         found['suggested'] = _suggested(suggestion, r.ids[len(r) - added :].tolist())
         layout = Survey(r.ids, r.points, r.widths)
-        survey_writer.save(layout, plan.site.walls.segments[:, :4], len(r) - added, folder)
+        survey_writer.save(layout, outlines(plan.site.walls), len(r) - added, folder)
     grid, raster = _coarse(plan.site.grid), _Raster.of(plan.places)
     pictures = {k: _map(plan, k, v, added, grid, raster) for k, v in _values(plan).items()}
     for key, image in pictures.items():
@@ -120,6 +122,16 @@ def suggestion_notes(found: Mapping[str, Any]) -> list[str]:
         return [f'no fewer than {count} reach the goal']
     least = f'; fewer than {s["at_least"]} do not' if s['at_least'] else ''
     return [f'{count} reach the goal{least}']
+
+
+def outlines(walls: Geometry) -> Array:
+    """Walls and pillars as lines (s, 4)."""
+    turn = np.linspace(0.0, 2.0 * np.pi, SIDES + 1)
+    around = np.stack([np.cos(turn), np.sin(turn)], -1)
+    x, y, radius = walls.discs[:, :3].T[..., None, None]
+    corners = np.concatenate([x, y], -1) + radius * around
+    lines = np.concatenate([corners[:, :-1], corners[:, 1:]], -1).reshape(-1, 4)
+    return np.concatenate([walls.segments[:, :4], lines])
 
 
 @dataclass(frozen=True)
