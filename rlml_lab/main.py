@@ -122,6 +122,9 @@ COMMANDS: Table = {
         },
     ),
     'convert': Command('rlml_lab.datasets.convert', 'public data sets become bags'),
+    'pictures': Command(
+        'rlml_lab.live.pictures', 'the pictures of the documentation, by Chromium'
+    ),
     'results': Command('rlml_lab.results', 'the page of benchmarks, from docs/benchmarks.json'),
     'bench': Group(
         'measured speed and quality against other libraries',

@@ -9,9 +9,10 @@ from typing import Any
 
 from rlml_slam.cli.support.live_session import LISTENERS, Source, drive
 from rlml_slam.cli.support.recorder import Recorder
-from rlml_slam.params import Parameters, Player, from_mapping, read_yaml
+from rlml_slam.evaluation.run_record import Origin
+from rlml_slam.params import Parameters, Player, changed, from_mapping, read_yaml
 from rlml_slam.recordings.bag_inputs import BagInputs
-from rlml_slam.recordings.origin import origin
+from rlml_slam.recordings.origin import source_of
 from rlml_slam.report.outputs import make_folder, write_outputs
 from rlml_slam.report.summary import print_summary
 from rlml_slam.ros.bags.bag import BagReader
@@ -48,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     out = make_folder(args.out)
     result = drive(played, out, args.json)
     result.truth = truth
-    result.origin = origin(args.command_line, params, args.bag)
+    result.origin = Origin(args.command_line, changed(params), source_of(args.bag))
     return print_summary(result, write_outputs(result, out), out, args.json)
 
 

@@ -18,7 +18,7 @@ from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Parameters, from_mapping, read_yaml
 from rlml_slam.recordings.bag_replay import SYSTEMS, Given, replay
 from rlml_slam.recordings.incident import recorded_parameters
-from rlml_slam.recordings.origin import origin
+from rlml_slam.recordings.origin import source_of
 from rlml_slam.report.outputs import make_folder, write_outputs
 from rlml_slam.report.summary import print_summary
 from rlml_slam.slam.store import map_file
@@ -89,7 +89,8 @@ def run(args: argparse.Namespace) -> int:
             args.mcap,
             progress.update,
         )
-    result.origin = origin(args.command_line, params, args.bag)
+    source = source_of(args.bag)
+    result.origin = replace(result.origin, command=args.command_line, source=source)
     return print_summary(result, write_outputs(result, args.out), args.out, args.json)
 
 

@@ -88,7 +88,7 @@ def metrics(run: Run, errors: RunErrors | None = None) -> dict[str, Any]:
         'topics': dict(run.topics),
         'health': {k: round(v, 4) for k, v in run.health_share().items()},
         'problem': run.problem,
-        'about': dict(run.about),
+        'about': run.origin.figures(),
     }
     errors = run_errors(run) if errors is None else errors
     if errors is not None and run.truth is not None:

@@ -21,6 +21,7 @@ from rlml_slam.planning.audit.sightings import SightingLog
 from rlml_slam.se2 import Array
 from rlml_slam.slam.landmarks.reflector_states import ReflectorState
 from rlml_slam.types import Frame, Health, Level, Reflectors, Status
+from rlml_slam.version import __version__
 
 
 @dataclass(frozen=True)
@@ -84,12 +85,18 @@ class Origin:
     """What a run was made by: the command line, and by name the parameters that it changed.
 
     ``source`` says what it was made from, such as the SHA-256 of a bag. Each is empty, or None, if
-    unknown.
+    unknown. ``system`` estimated it.
     """
 
     command: str = ''
     parameters: Mapping[str, Any] | None = None
     source: str = ''
+    system: str = 'rlml'
+
+    def figures(self) -> dict[str, Any]:
+        """What can be compared with another run."""
+        out: dict[str, Any] = {'version': __version__, 'system': self.system}
+        return out if self.parameters is None else {**out, 'parameters': dict(self.parameters)}
 
 
 @dataclass
@@ -102,8 +109,7 @@ class Run:
     (k,) has the cost per keyframe, ``reflector_states`` the state of each reflector. ``inputs``
     counts used, late and invalid messages by stream, ``topics`` has the topic of each.
     ``problem`` says in one line what ended the run early or what of it is missing, empty without
-    either. ``stored`` is the whole map. ``extra`` is added to metrics.json; ``about`` has version,
-    system and changed parameters. ``origin`` is for its report.
+    either. ``stored`` is the whole map. ``extra`` is added to metrics.json.
     """
 
     name: str
@@ -124,7 +130,6 @@ class Run:
     closure_table: str = ''
     reflector_states: tuple[ReflectorState, ...] = ()
     topics: dict[str, str] = field(default_factory=dict)
-    about: Mapping[str, Any] = field(default_factory=dict)
     origin: Origin = field(default_factory=Origin)
 
     @property

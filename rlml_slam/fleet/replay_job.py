@@ -23,10 +23,10 @@ from fsspec.core import url_to_fs
 import rlml_slam
 from rlml_slam.errors import ClusterError, RlmlError
 from rlml_slam.evaluation.relations import read_relations, relation_errors
-from rlml_slam.evaluation.run_record import Origin, Run
+from rlml_slam.evaluation.run_record import Run
 from rlml_slam.fleet.bags import Bag, local_copy
 from rlml_slam.fleet.results import Record, Results
-from rlml_slam.params import Parameters, changed
+from rlml_slam.params import Parameters
 from rlml_slam.recordings.bag_replay import replay
 from rlml_slam.recordings.origin import digest_of
 from rlml_slam.report.outputs import write_outputs
@@ -127,7 +127,7 @@ def _replay_bag(job: Job, scratch: Path) -> Record:
     run = replay(path, job.params, system=job.system, mcap=mcap)
     replayed = time.perf_counter()
     run.problem = run.problem.replace(str(path), job.bag.name)  # not where the copy was
-    run.origin = Origin('', changed(job.params), f'{job.bag.name}, SHA-256 {digest}')
+    run.origin = replace(run.origin, source=f'{job.bag.name}, SHA-256 {digest}')
     figures = write_outputs(run, folder, job.report)
     row = _row(job.bag.name, digest, figures) | _relation_figures(run, relations)
     row['results'] = _digest_of_results(folder)

@@ -14,7 +14,7 @@ from rlml_slam import warm_up
 from rlml_slam.ekf.slam import EkfSlam
 from rlml_slam.errors import BagError, InputError, ParameterError
 from rlml_slam.evaluation.metrics import run_errors
-from rlml_slam.evaluation.run_record import FrameLog, Run, Truth
+from rlml_slam.evaluation.run_record import FrameLog, Origin, Run, Truth
 from rlml_slam.maps.map_container import Content
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.maps.survey import Survey
@@ -26,7 +26,6 @@ from rlml_slam.ros.bags.bag import BagReader, BagWriter
 from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.store import map_file
-from rlml_slam.version import __version__
 
 # name -> the type of its parameters and its constructor
 SYSTEMS: Mapping[str, tuple[type[Any], Callable[[Any], Slam | EkfSlam]]] = {
@@ -62,7 +61,7 @@ def replay(
     ``Run.problem`` says so. Raises BagError if there is nothing to use at all.
     """
     warm_up.compile_loaded()
-    about = {'version': __version__, 'system': system, 'parameters': changed(params)}
+    origin = Origin(parameters=changed(params), system=system)
     with BagReader(path) as bag, ExitStack() as files:
         inputs = BagInputs(bag, patient(params))
         params = inputs.params
@@ -102,7 +101,7 @@ def replay(
         if recording is not None:
             recording.add(bag.end, frames, slam)
             recording.finish(slam, run_errors(result))
-    result.wall_s, result.about = wall, about
+    result.wall_s, result.origin = wall, origin
     ended = f'{problem}; the results hold what came before' if problem else ''
     result.problem = '; '.join(filter(None, (ended, result.problem)))
     return result

@@ -1,22 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run was made by and from, for its report."""
+"""What a run was made from, for its report."""
 
 from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Any
-
-from rlml_slam.evaluation.run_record import Origin
-from rlml_slam.params import changed
 
 CHUNK = 1 << 22  # [bytes] that are read at once
 
 
-def origin(command: str, params: Any, bag: Path | None = None) -> Origin:
-    """The origin of a run with the set ``params``, of a bag where there is one."""
-    source = '' if bag is None else f'{bag.resolve().name}, SHA-256 {digest_of(bag)}'
-    return Origin(command, changed(params), source)
+def source_of(bag: Path) -> str:
+    """Name and SHA-256 of a bag."""
+    return f'{bag.resolve().name}, SHA-256 {digest_of(bag)}'
 
 
 def digest_of(path: Path) -> str:

@@ -69,6 +69,8 @@ def test_footer_says_what_the_run_was_made_by():
     footer = html[html.index('<footer>') :]
     for part in (__version__, 'rlml replay a &lt;bag&gt;', 'use_odom=False', 'SHA-256 12ab'):
         assert part in footer
+    about = {'version': __version__, 'system': 'rlml', 'parameters': {'use_odom': False}}
+    assert metrics(run)['about'] == about  # what two runs are compared by
 
 
 def test_report_escapes_names_and_tells_what_was_wrong(written):

@@ -86,6 +86,13 @@ def test_slider_moves_robot_scan_cursors_and_readout(page):
     assert set(page.evaluate('viewer.cursors().map(c => c.location)')) == {25.0}
 
 
+def test_address_says_at_what_time_it_opens(page):
+    address = page.evaluate('location.href')
+    with chromium.browser() as other:
+        other.open(f'{address}#t=25')
+        assert '25.00 s' in other.evaluate('document.getElementById("now").textContent')
+
+
 def test_layers_are_switched(page):
     for name in ('grid', 'truth', 'live', 'path', 'closures', 'keyframes', 'reflectors', 'scan'):
         box = f'document.querySelector("[data-layer={name}]")'

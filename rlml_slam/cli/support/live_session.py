@@ -29,7 +29,6 @@ from rlml_slam.errors import RlmlError
 from rlml_slam.evaluation.metrics import distribution
 from rlml_slam.evaluation.run_record import Run
 from rlml_slam.ros.bags.bag import BagWriter
-from rlml_slam.version import __version__
 
 START_TIMEOUT = 90.0  # [s] for three processes to start and to find each other
 SILENCE = 15.0  # [s] without a pose while the source runs: something is broken
@@ -103,7 +102,6 @@ def drive(source: Source, out: Path, quiet: bool) -> Run:
             problem = live_map.take(result, Path(maps))
     result.problem = problem
     result.extra = _live_figures(recorder, load)
-    result.about = {'version': __version__, 'system': 'rlml'}
     return result
 
 

@@ -284,7 +284,8 @@
     for (const event of ['pan', 'wheel', 'pinch']) map.on_event(event, () => { touched = true; });
     map.on_event('reset', () => { touched = false; toScale(); });
     label();
-    show(0);
+    const asked = /^#t=([\d.]+)$/.exec(location.hash);
+    if (asked) seek(+asked[1]); else show(0);
     toScale();
     window.viewer = {
       ready: true, show, seek, take, map, source, messages: 0, latency: NaN,

@@ -114,8 +114,9 @@ class FrontEnd:
         """
         # an unmatched detection with an id is no contradiction here: the back end resolves it
         resolved = matches.num_unmatched_ids(observation.detections)
+        fits = scan.used and scan.open_direction is None and not self._map.grid_match.refutes
         contradicted = self.kidnapping.check(
-            observation.stamp, scan.misfit, scan.used and scan.open_direction is None,
+            observation.stamp, scan.misfit, fits,
             len(matches.status) - resolved, matches.num_used, bool(self.tracks.surveyed.any()),
         )  # fmt: skip
         patience = self._p.health.new_session_time

@@ -33,13 +33,22 @@ class GridMatch:
     """Result of a match with the grid; ``score`` is NaN if there was none.
 
     ``used``: it updated the pose; ``is_complete``: in every direction. ``contradicts``: the scan
-    does not fit the known part of the grid.
+    does not fit the known part of the grid; ``is_elsewhere``: it fits, beyond the gate.
     """
 
     score: float
     used: bool = False
     is_complete: bool = False
     contradicts: bool = False
+    is_elsewhere: bool = False
+
+    @property
+    def refutes(self) -> bool:
+        """Whether the scan does not fit the grid near this pose, unknown cells aside.
+
+        Submaps of the drive learn a new place within a few scans, a saved grid does not.
+        """
+        return self.contradicts or self.is_elsewhere
 
 
 def map_information(submap: Submap, points: Array, pose: Array, params: Parameters) -> Array:
@@ -98,7 +107,7 @@ class GridLocalizer:
         root = root @ se2.rotation3(yaw).T  # from here on in the axes of the map
         d2 = float(v @ np.linalg.solve(root @ cov @ root.T + np.eye(len(v)), v))
         if not len(v) or d2 > self._gate[len(v) - 1]:
-            return GridMatch(found.score)
+            return GridMatch(found.score, is_elsewhere=True)
         state.apply(POSE, root, np.eye(len(v)), v)
         self._last = state.pose
         weakest = self._p.health.degeneracy_sigma**-2

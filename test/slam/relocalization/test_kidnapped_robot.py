@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot that is carried to a place whose walls look like those where it was."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rlml_slam.cli.main import main
+from rlml_slam.params import Node, Parameters, Simulator
+from rlml_slam.recordings.bag_replay import Given, replay
+from rlml_slam.slam.store import map_file
+from rlml_slam.types import Level
+
+ROOM = Path(__file__).resolve().parents[3] / 'bags' / 'room'
+# the scan fits the submap of the drive again within a few scans; it fits the map elsewhere
+CARRIED = ((1, 6.02, 9.8), (12, 5.50, 9.8), (41, 6.91, 9.1))  # seed, time [s], distance [m]
+
+
+@pytest.fixture(scope='module')
+def known(tmp_path_factory):
+    out = tmp_path_factory.mktemp('room')
+    assert main(['replay', str(ROOM), '--out', str(out), '--json']) == 0
+    return map_file.saved_map(map_file.load(out / 'map.rlml'))
+
+
+@pytest.mark.parametrize(('seed', 'at', 'distance'), CARRIED)
+def test_saved_map_overrules_the_submaps_of_the_drive(tmp_path, known, seed, at, distance):
+    bag = tmp_path / 'bag'
+    made = {'kidnap_time': at, 'kidnap_distance': distance, 'laser.beams': 360}
+    sets = [word for name, value in made.items() for word in ('--set', f'{name}={value}')]
+    assert main(['simulate', 'room', str(bag), '--seed', str(seed), *sets]) == 0
+    node = Node(mode='localization', laser_pose=Simulator().laser_pose)
+    run = replay(bag, replace(Parameters(), node=node), given=Given(known))
+    true = run.truth.trajectory
+    stamps = np.array(run.frames.stamps)
+    x, y = (np.interp(stamps, true.stamps, true.poses[:, k]) for k in range(2))
+    error = np.hypot(*(np.array(run.frames.poses)[:, :2] - np.stack([x, y], axis=-1)).T)
+    levels = np.array(run.frames.levels)
+    wrong = error > 0.5
+    assert wrong.any()
+    assert wrong.sum() <= 15  # scans, of 10 Hz
+    assert Level.LOST in levels
+    assert error[-1] < 0.05
