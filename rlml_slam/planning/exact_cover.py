@@ -20,7 +20,7 @@ from rlml_slam.matching.reflectors.pair_votes import MIN_MATCHES
 from rlml_slam.planning.coverage import Choice, Coverage, Ints, Mask, Rivals
 from rlml_slam.se2 import Array
 
-TIME = 20.0  # [s] after which the best choice known is the answer
+TIME = 20.0  # [s] of the processor after which the best choice known is the answer
 CUTS = 40  # places that one round adds cuts of
 EXTENDED = 8  # lost places a round whose cut is made as strong as possible
 PAIRED = 60  # mounts that a place sees, up to which all pairs are tried
@@ -28,15 +28,15 @@ PAIRED = 60  # mounts that a place sees, up to which all pairs are tried
 
 def fewest(empty: Choice, known: Choice) -> tuple[Choice, int]:
     """The fewest mounts, no more than those ``known`` to be complete; how few were excluded."""
-    of, began = empty.of, time.monotonic()
+    of, began = empty.of, time.process_time()
     cuts = _Cuts(len(of.points) - of.num_present)
     if of.is_accurate:
         _add_least(cuts, empty)
     least = 0
     now = empty
-    while time.monotonic() - began < TIME:
+    while time.process_time() - began < TIME:
         _add_cuts(cuts, now)
-        x, least = cuts.solved(TIME - (time.monotonic() - began), least)
+        x, least = cuts.solved(TIME - (time.process_time() - began), least)
         if x is None or least >= len(known.added):
             break
         mounts = of.num_present + np.flatnonzero(x)
