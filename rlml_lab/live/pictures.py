@@ -8,7 +8,10 @@ robot that was carried away. ``intel``: the report of Intel Research Lab.
 from __future__ import annotations
 
 import argparse
+import asyncio
+import base64
 import csv
+import io
 import json
 import shutil
 import socket
@@ -19,6 +22,8 @@ import urllib.request
 from pathlib import Path
 
 from PIL import Image
+from tornado.httpclient import AsyncHTTPClient
+from tornado.websocket import websocket_connect
 
 from rlml_lab.live.study_incidents import drive
 from rlml_slam.cli.main import main as rlml
@@ -32,8 +37,8 @@ INTEL = Path('slam-benchmark') / 'intel' / 'intel.rebuilt.log.xz'
 PARTS = ('demo', 'incident', 'intel')
 BROWSERS = ('chromium', 'chromium-browser', 'google-chrome')
 OPTIONS = ('--headless=new', '--no-sandbox', '--disable-gpu', '--hide-scrollbars')
-SIZE = (1280, 1120)  # [pixels] of a window: the head of a page and its map
-DRAWN = 15_000  # [ms] of a page's time, after which it has been drawn
+SIZE = (1280, 1260)  # [pixels] of a window: the head of a page and its map
+DRAWN = 12.0  # [s] after which a page has been drawn
 WATCHED = 22.0  # [s] of the demo before the live page is opened
 END = 300.0  # [s] for the demo
 SEED = 0  # of the robot that is carried away
@@ -112,9 +117,9 @@ def incident(browser: str, folder: Path, out: Path) -> None:
 
 def intel(browser: str, folder: Path, log: Path, out: Path) -> None:
     """The map of Intel Research Lab."""
-    _rlml('convert', 'carmen', log, folder / 'log')
-    _rlml('replay', folder / 'log', '--out', folder / 'intel')
-    take_report(browser, folder / 'intel', out / 'intel.png', half(folder / 'intel'))
+    _rlml('convert', 'carmen', log, folder / 'intel')
+    _rlml('replay', folder / 'intel', '--out', folder / 'replay')
+    take_report(browser, folder / 'replay', out / 'intel.png', half(folder / 'replay'))
 
 
 def half(folder: Path) -> float:
@@ -132,19 +137,37 @@ def take_report(browser: str, folder: Path, picture: Path, at: float) -> None:
 def take(browser: str, url: str, picture: Path) -> None:
     """A picture of a page that has been drawn."""
     with tempfile.TemporaryDirectory(prefix='chromium_', ignore_cleanup_errors=True) as profile:
-        whole = Path(profile) / 'whole.png'
-        done = subprocess.run(
+        process = subprocess.Popen(
             [
-                browser, *OPTIONS, f'--user-data-dir={profile}', f'--virtual-time-budget={DRAWN}',
-                f'--window-size={SIZE[0]},{SIZE[1]}', f'--screenshot={whole}', url,
+                browser, *OPTIONS, f'--user-data-dir={profile}', '--remote-debugging-port=0',
+                f'--window-size={SIZE[0]},{SIZE[1]}', url,
             ],
-            capture_output=True, text=True, check=False, timeout=END,
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
-        if not whole.exists():
-            raise RlmlError(f'{browser} made no picture of {url}:\n{done.stderr[-2000:]}')
-        with Image.open(whole) as image:
-            image.convert('RGB').save(picture, optimize=True)
+        try:
+            time.sleep(DRAWN)
+            port = int((Path(profile) / 'DevToolsActivePort').read_text().split()[0])
+            data = asyncio.run(_screenshot(port))
+        finally:
+            process.terminate()
+            process.wait()
+    with Image.open(io.BytesIO(data)) as image:
+        image.convert('RGB').save(picture, optimize=True)
     print(f'{picture}: {picture.stat().st_size / 1e3:.0f} kB', flush=True)
+
+
+async def _screenshot(port: int) -> bytes:
+    """PNG of the page of a Chromium that is asked by its DevTools protocol."""
+    found = await AsyncHTTPClient().fetch(f'http://127.0.0.1:{port}/json/list')
+    page = next(t for t in json.loads(found.body) if t['type'] == 'page')
+    socket_url = page['webSocketDebuggerUrl']
+    connection = await websocket_connect(socket_url, max_message_size=1 << 28)
+    await connection.write_message(json.dumps({'id': 1, 'method': 'Page.captureScreenshot'}))
+    text = await connection.read_message()
+    connection.close()
+    if text is None:
+        raise RlmlError('Chromium has ended')
+    return base64.b64decode(json.loads(text)['result']['data'])
 
 
 def _answers(port: int) -> bool:

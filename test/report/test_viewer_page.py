@@ -229,7 +229,10 @@ def test_live_page_takes_messages(tmp_path):
         assert 'LOST' in text
         assert data(page, 'health', 'name') == ['OK', 'DEGRADED', 'OK', 'LOST']
         assert len(data(page, 'scan', 'x')) == 2
-        # nothing is known of a truth: its plots are hidden
+        # nothing is known of a truth: its plots and its layers are hidden
+        for layer, is_shown in (('truth', False), ('grid', False), ('scan', True), ('live', True)):
+            label = f'document.querySelector("[data-layer={layer}]").parentElement'
+            assert (page.evaluate(f'getComputedStyle({label}).display') != 'none') is is_shown
         hidden = 'document.querySelector("[data-needs=\'frames.error\']").hidden'
         assert page.evaluate(hidden)
         page.evaluate('document.getElementById("play").click()')

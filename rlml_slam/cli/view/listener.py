@@ -60,6 +60,7 @@ class _Slow:
     kind: Any
     use: Callable[[Any], Mapping[str, Columns]]
     due: float = 0.0
+    was_read: bool = False
 
     def columns(self, data: bytes) -> Mapping[str, Columns]:
         """What a message shows, as lists."""
@@ -152,13 +153,19 @@ class ViewListener:
         return out
 
     def _look_into_next(self, began: float) -> Mapping[str, Columns]:
-        """What is new of the slow topic that has waited longest, if it is time for one."""
-        topic, slow = min(self._slow.items(), key=lambda item: item[1].due)
-        if began < max(self._due, slow.due):
+        """What is new of the slow topic that has waited longest, if it is time for one.
+
+        The first message of each is looked into at once.
+        """
+        may = [t for t, s in self._slow.items() if began >= max(s.due, self._due * s.was_read)]
+        if not may:
             return {}
+        topic = min(may, key=lambda name: self._slow[name].due)
+        slow = self._slow[topic]
         found: Mapping[str, Columns] = {}
         slow.due = began + SLOWEST
         for data in self._taken(topic, slow.kind, NEWEST.depth):
+            slow.was_read = True
             found = self._guard.pass_on(topic, partial(slow.columns, data), {})
             self._due = began + SHARE * (time.monotonic() - began)
         return {name: of for name, of in found.items() if of != self._shown.get(name)}

@@ -181,7 +181,7 @@
   function hideEmpty() {
     for (const box of document.querySelectorAll('[data-needs]')) {
       const [of, name] = box.dataset.needs.split('.');
-      const values = column(of, name);
+      const values = of === 'scans' ? scans : column(of, name);
       box.hidden = !values.length || (of === 'frames' && !Array.from(values).some(Number.isFinite));
     }
   }
