@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 # Every target sets up what it needs by itself. PYTHON chooses the interpreter (3.10 to 3.13).
 PYTHON ?= python3
-PYTEST_ARGS ?= -n 2
+PYTEST_ARGS ?= -n 2 --dist worksteal
 VENV := .venv
 DOCS := .venv-docs
 BIN := $(VENV)/bin
