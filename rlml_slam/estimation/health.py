@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
 
 from rlml_slam.params import HealthLimits
 from rlml_slam.se2 import Array
@@ -20,6 +22,7 @@ class ScanEvidence:
 
     ``misfit``: the score is far below the usual one. ``open_direction`` [deg, 0..180) of the map
     is the one in which the scan does not observe the position, None if it observes all.
+    ``cov_submap`` (3, 3) is that of the pose relative to the ``submap`` that the scan matched.
     """
 
     has_scan: bool = False
@@ -28,6 +31,8 @@ class ScanEvidence:
     score: float = float('nan')
     open_direction: float | None = None
     iterations: int = 0
+    submap: object = None
+    cov_submap: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,8 @@ class HealthMonitor:
         self._first: int | None = None
         self._variance = 0.0  # [m^2] of the position, at the last step
         self._explored = 0.0  # [m^2] of that, what it has grown by while the map held the pose
+        self._submap: object = None  # of the last match, and the variance [m^2] relative to it
+        self._drifted = 0.0
 
     def evaluate(self, stamp: int, step: HealthInputs) -> Health:
         """Health at ``stamp`` [ns], after the first step."""
@@ -87,6 +94,9 @@ class HealthMonitor:
         sigma = math.sqrt(eigenvalues_2x2(step.cov_map[:2, :2])[1])
         if sigma > self._limits.sigma_degraded:
             reasons.append(f'position sigma is {sigma:.2f} m')
+        heading_sigma = math.sqrt(float(step.cov_map[2, 2]))
+        if heading_sigma > self._limits.heading_sigma_degraded:
+            reasons.append(f'heading sigma is {math.degrees(heading_sigma):.1f} deg')
         is_lost = step.is_lost or step.contradicted or self._is_adrift(stamp, step, sigma)
         if is_lost or (misfit and (unmatched or not step.matched)):
             return Health(Level.LOST, tuple(reasons))
@@ -96,15 +106,22 @@ class HealthMonitor:
         """Whether the position is too uncertain to be known in the map.
 
         A map in the making grows away from its start, and the robot's place in it stays known
-        while scan or reflectors hold the pose. What the variance grows by then does not count.
+        while scan or reflectors hold the pose. What the variance grows by then does not count. A
+        scan that leaves a direction open still holds the pose in its submap, but for what the
+        variance grows by relative to that.
         """
-        variance, last = sigma**2, self._variance
-        self._variance = variance
-        is_held = stamp in (self._held_by_scan, self._held_by_reflectors)
-        if step.maps and is_held:
-            self._explored += max(variance - last, 0.0)
-        self._explored = min(self._explored, variance)
-        return variance - self._explored > self._limits.sigma_lost**2
+        scan, grown = step.scan, sigma**2 - self._variance
+        self._variance = sigma**2
+        drifted, submap = self._drifted, self._submap
+        if scan.used:
+            self._drifted = eigenvalues_2x2(scan.cov_submap[:2, :2])[1]
+            self._submap = scan.submap
+        if step.maps and stamp in (self._held_by_scan, self._held_by_reflectors):
+            self._explored += max(grown, 0.0)
+        elif step.maps and scan.used and scan.submap is submap:
+            self._explored += grown - (self._drifted - drifted)
+        self._explored = min(max(self._explored, 0.0), self._variance)
+        return self._variance - self._explored > self._limits.sigma_lost**2
 
     def _note(self, stamp: int, step: HealthInputs) -> None:
         """Store the stamp of each input that is good in this step."""

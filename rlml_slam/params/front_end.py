@@ -282,6 +282,9 @@ class HealthLimits(Group, prefix='health.'):
     sigma_degraded: float = param(
         0.5, 'DEGRADED beyond this position sigma', 'm', 1e-3, 100.0, live=True
     )
+    heading_sigma_degraded: float = param(
+        0.1, 'DEGRADED beyond this heading sigma', 'rad', 1e-4, 10.0, live=True
+    )
     sigma_lost: float = param(2.0, 'LOST beyond this position sigma', 'm', 1e-3, 1000.0, live=True)
     contradiction_ratio: float = param(
         0.6,

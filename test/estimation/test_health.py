@@ -348,3 +348,31 @@ def test_what_odometry_alone_made_uncertain_stays_so_until_the_place_is_found():
     gap = [(6.0, False, True), *[(6.0, True, True)] * 40]
     assert levels([*explored, *gap])[-1] is Level.LOST
     assert levels([*explored, *gap, (4.0, True, True), (4.5, True, True)])[-1] is Level.DEGRADED
+
+
+def levels_in_corridor(steps):
+    """Levels while a scan holds all but one direction: sigma [m] in the map, and in the submap."""
+    monitor, out = HealthMonitor(HealthLimits()), []
+    submap = object()
+    for k, (sigma, drifted, used) in enumerate(steps):
+        cov, own = (np.diag([s, s, 0.01]) ** 2 for s in (sigma, drifted))
+        scan = ScanEvidence(
+            True, used, score=0.6, open_direction=0.0, submap=submap, cov_submap=own
+        )
+        step = HealthInputs(scan, True, None, 0, cov, maps=True)
+        out.append(monitor.evaluate(FIRST + k * STEP, step).level)
+    return out
+
+
+def test_heading_that_moves_the_end_of_a_corridor_is_no_reason_to_be_lost():
+    """The position in the map is uncertain by the way times the heading; not in the submap."""
+    assert Level.LOST not in levels_in_corridor([(0.1 * k, 0.02, True) for k in range(60)])
+
+
+def test_way_along_a_bare_corridor_is_by_odometry_alone():
+    assert levels_in_corridor([(0.1 * k, 0.1 * k, True) for k in range(60)])[-1] is Level.LOST
+
+
+def test_uncertainty_before_a_corridor_stays():
+    gap = [(0.1, 0.02, True), (4.0, 4.0, False), (4.0, 4.0, True)]
+    assert levels_in_corridor([*gap, *[(4.0, 4.0, True)] * 40])[-1] is Level.LOST

@@ -17,11 +17,13 @@ from dataclasses import replace
 import numpy as np
 
 from rlml_slam import se2
+from rlml_slam.estimation.odometry_noise import OdometryNoise
 from rlml_slam.params import MotionNoise, Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.front_end.constant_velocity import ConstantVelocity
 from rlml_slam.slam.front_end.joint_state import STANDING, JointState
 from rlml_slam.slam.front_end.motion_hypotheses import FRESH, Hypothesis, MotionHypotheses
+from rlml_slam.slam.front_end.scan_update import relative
 from rlml_slam.types import Observation
 
 # [ns] shortest time over which a velocity is computed. Scans that arrive in a burst are too close:
@@ -41,6 +43,8 @@ class MotionTerm:
         self._p = params.motion
         self._constant_velocity = ConstantVelocity(params.motion)
         self._hypotheses = MotionHypotheses(params)
+        self._odometry_noise = OdometryNoise(params.motion)
+        self._predicted: tuple[Array, Array] | None = None  # pose in the submap, covariance
         self.stamp: int | None = None
         self.has_odometry = self.is_constant_velocity = False
         self.forget_velocity()
@@ -55,6 +59,9 @@ class MotionTerm:
     def hypotheses(self, observation: Observation) -> list[Hypothesis]:
         """What may have happened since the last observation, the odometry's motion first."""
         velocity = self.velocity if self._is_velocity_known else None
+        if self.stamp is not None:
+            dt = (observation.stamp - self.stamp) * 1e-9
+            observation = self._odometry_noise.scaled(observation, dt)
         return self._hypotheses.of(observation, velocity)
 
     def predict(self, state: JointState, observation: Observation) -> None:
@@ -70,6 +77,7 @@ class MotionTerm:
         expected = expected_motion(self.velocity, dt, p) if motion.known else STANDING
         kept = math.exp(-dt / p.scale_error_time)
         state.predict(motion, p.imu_bias_walk**2 * dt, kept, expected)
+        self._predicted = relative(state.x, state.P)
 
     def corrected(self, state: JointState, observation: Observation) -> Observation:
         """The observation with its motion as estimated now; measures the velocity."""
@@ -78,6 +86,9 @@ class MotionTerm:
         if self.is_constant_velocity:
             motion = self._constant_velocity.estimated(state, observation.motion)
         else:
+            assert self._predicted is not None
+            now = relative(state.x, state.P)
+            self._odometry_noise.learn(observation.motion, self._predicted, now)
             motion = state.corrected(observation.motion)
         return replace(observation, motion=motion)
 

@@ -162,6 +162,8 @@ class ScanTerm:
             score=found.score,
             open_direction=open_direction(information, heading, self._p.health.degeneracy_sigma),
             iterations=found.iterations,
+            submap=submap,
+            cov_submap=relative(self._state.x, self._state.P)[1],
         )
 
     def _match(
