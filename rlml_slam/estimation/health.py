@@ -22,7 +22,8 @@ class ScanEvidence:
 
     ``misfit``: the score is far below the usual one. ``open_direction`` [deg, 0..180) of the map
     is the one in which the scan does not observe the position, None if it observes all.
-    ``cov_submap`` (3, 3) is that of the pose relative to the ``submap`` that the scan matched.
+    ``cov_submap`` (3, 3) is that of the pose relative to the ``submap`` that the scan matched,
+    which is None for a robot without odometry.
     """
 
     has_scan: bool = False
@@ -107,8 +108,8 @@ class HealthMonitor:
 
         A map in the making grows away from its start, and the robot's place in it stays known
         while scan or reflectors hold the pose. What the variance grows by then does not count. A
-        scan that leaves a direction open still holds the pose in its submap, but for what the
-        variance grows by relative to that.
+        scan that leaves a direction open to odometry still holds the pose in its submap, but for
+        what the variance grows by relative to that.
         """
         scan, grown = step.scan, sigma**2 - self._variance
         self._variance = sigma**2
@@ -118,7 +119,7 @@ class HealthMonitor:
             self._submap = scan.submap
         if step.maps and stamp in (self._held_by_scan, self._held_by_reflectors):
             self._explored += max(grown, 0.0)
-        elif step.maps and scan.used and scan.submap is submap:
+        elif step.maps and scan.submap is not None and scan.submap is submap:
             self._explored += grown - (self._drifted - drifted)
         self._explored = min(max(self._explored, 0.0), self._variance)
         return self._variance - self._explored > self._limits.sigma_lost**2

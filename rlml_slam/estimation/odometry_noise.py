@@ -40,7 +40,7 @@ class OdometryNoise:
         self._floors = np.array([noise.speed_noise_floor, noise.turn_noise_floor])
         self._slopes = np.array([noise.speed_noise, noise.turn_noise])
         self._sums = np.zeros((2, 2, 2))  # of a Q / S^2 and of Q^2 / S^2
-        self._applied: tuple[Array, Array] | None = None
+        self._applied: tuple[Array, Array, Array] | None = None
 
     @property
     def shares(self) -> Array:
@@ -56,7 +56,7 @@ class OdometryNoise:
             return observation
         fast = (self._slopes * moved > self._floors * dt).astype(int)
         share = self.shares[[0, 1], fast]
-        self._applied = fast, motion.cov[AXES, AXES]
+        self._applied = motion.delta, fast, motion.cov[AXES, AXES]
         scale = np.ones(3)
         scale[AXES] = np.sqrt(share)
         cov = motion.cov * np.outer(scale, scale)
@@ -65,14 +65,13 @@ class OdometryNoise:
     def learn(
         self, motion: Motion, before: tuple[Array, Array], after: tuple[Array, Array]
     ) -> None:
-        """Take a step whose ``motion`` was scaled.
+        """Take a step; one with another ``motion`` than that scaled last says nothing.
 
         ``before`` and ``after`` its updates: pose (3,) in the submap, and covariance (3, 3).
         """
-        if self._applied is None:
+        if self._applied is None or motion.delta is not self._applied[0]:
             return
-        (fast, Q), (pose, P), (corrected, P_new) = self._applied, before, after
-        self._applied = None
+        (_, fast, Q), (pose, P), (corrected, P_new) = self._applied, before, after
         error = se2.between(pose, corrected)
         P, P_new = (se2.rotate_cov(p, -pose[2]) for p in (P, P_new))
         for axis, k in enumerate(AXES.tolist()):

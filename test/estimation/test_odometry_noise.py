@@ -92,3 +92,16 @@ def test_gap_and_unknown_motion_keep_their_noise(dt, known):
     drive(noise, 1000, np.random.default_rng(0), sigmas=0.2)
     given = Observation(SECOND, motion=replace(motion(0.5, 0.0, 3.0), known=known))
     assert noise.scaled(given, dt) is given
+
+
+def test_motion_that_is_not_the_wheels_says_nothing_of_them():
+    noise = OdometryNoise(NOISE)
+    given = Observation(SECOND, motion=motion(0.8, 0.0, 0.1))
+    noise.scaled(given, 0.1)
+    onward = motion(0.7, 0.0, 0.1)
+    far = np.array([9.0, 0.0, 1.0])
+    noise.learn(onward, (np.zeros(3), onward.cov + SEEN), (far, SEEN))
+    assert not noise._sums.any()
+    scaled = noise.scaled(given, 0.1).motion
+    noise.learn(scaled, (np.zeros(3), scaled.cov + SEEN), (far, SEEN))
+    assert noise._sums.any()

@@ -162,7 +162,7 @@ class ScanTerm:
             score=found.score,
             open_direction=open_direction(information, heading, self._p.health.degeneracy_sigma),
             iterations=found.iterations,
-            submap=submap,
+            submap=submap if self._motion.has_odometry else None,
             cov_submap=relative(self._state.x, self._state.P)[1],
         )
 

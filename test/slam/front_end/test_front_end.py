@@ -438,7 +438,9 @@ def test_stamps_and_observations_are_copied_from_the_input():
     # all but the motion, which is as the front end has come to know the wheels
     for f, o in zip(frames, observed, strict=True):
         assert replace(f.observation, motion=o.motion) == o
-        np.testing.assert_array_equal(f.observation.motion.cov, o.motion.cov)
+        cov = f.observation.motion.cov
+        np.testing.assert_allclose(cov, o.motion.cov, rtol=0.02)  # of two steps little is learned
+        assert (np.diag(cov) <= np.diag(o.motion.cov)).all()
 
 
 def test_scans_that_come_in_bursts_tell_no_velocity():
