@@ -49,10 +49,13 @@ class OdometryNoise:
         return np.clip((PRIOR + up) / (PRIOR + down), LEAST, 1.0)
 
     def scaled(self, observation: Observation, dt: float) -> Observation:
-        """The observation with the noise of this robot's odometry in the last ``dt`` [s]."""
+        """The observation with the noise of this robot's odometry in the last ``dt`` [s].
+
+        One that stands, but for what its wheels jitter, says nothing of how it drives.
+        """
         motion, self._applied = observation.motion, None
         moved = np.abs(motion.delta[AXES])
-        if not motion.known or not 0.0 < dt <= LONGEST or not moved.any():
+        if not motion.known or not 0.0 < dt <= LONGEST or (moved < self._floors * dt).all():
             return observation
         fast = (self._slopes * moved > self._floors * dt).astype(int)
         share = self.shares[[0, 1], fast]

@@ -105,3 +105,10 @@ def test_motion_that_is_not_the_wheels_says_nothing_of_them():
     scaled = noise.scaled(given, 0.1).motion
     noise.learn(scaled, (np.zeros(3), scaled.cov + SEEN), (far, SEEN))
     assert noise._sums.any()
+
+
+def test_wheels_that_jitter_where_the_robot_stands_say_nothing():
+    noise, rng = OdometryNoise(NOISE), np.random.default_rng(0)
+    drive(noise, 2000, rng, sigmas=0.0, v=0.001, w=0.001)
+    assert not noise._sums.any()
+    assert drive(noise, 1, rng, v=0.15)[0] == 1.0  # it creeps off
