@@ -53,10 +53,18 @@ class Robot:
         for edited in self.edit(topic, msg):
             self.publishers[topic].publish(edited)
 
+    def _wait_for_a_listener(self):
+        """However long the command takes to start, it sees the same part of the drive."""
+        end = time.monotonic() + 20.0
+        while not self.publishers['/scan'].get_subscription_count() and time.monotonic() < end:
+            if self.ended.wait(0.02):
+                return
+
     def _drive(self):
         laser = encode.transform(make_rclpy, 1, ('base_link', 'laser'), self.place)
         for edited in self.edit('/tf_static', laser):
             self.static.publish(encode.tf_message(make_rclpy, [edited]))
+        self._wait_for_a_listener()
         first = decode.stamp(self.messages[0][1], '') + int(BEGIN * SECOND)
         began, clock = time.monotonic(), self.node.get_clock().now().nanoseconds
         for stream, msg in self.messages:
