@@ -82,6 +82,18 @@ COMMANDS: Table = {
             'lifecycle': Command(
                 'rlml_lab.live.study_lifecycle', 'transitions at random instants, over DDS'
             ),
+            'tf-now': Command(
+                'rlml_lab.dropin.study_tf_now', "tf2's own buffer asks where the robot is now"
+            ),
+            'shadow': Command(
+                'rlml_lab.dropin.study_shadow', 'in shadow mode beside another localization, live'
+            ),
+            'tf-only': Command(
+                'rlml_lab.dropin.study_tf_only', 'bags as robots record, against topics'
+            ),
+            'nav2-maps': Command(
+                'rlml_lab.dropin.study_nav2_maps', 'localization by the size of a cell'
+            ),
             'site': Command(
                 'rlml_lab.site.study_site', 'many sessions of a large site become one map'
             ),

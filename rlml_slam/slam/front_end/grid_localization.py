@@ -25,6 +25,8 @@ from rlml_slam.slam.relocalization.grid_submap import possible, submap_of
 
 GATE_PROBABILITY = 0.9999  # of the gate of a match against the prior
 BEAM_STEP = 4  # of a scan that does not match, every n-th beam is traced through the grid
+MARGIN = 1e-4  # of a covariance that is never taken as shared
+KNOWN = 1e-12  # [m², rad²] smallest eigenvalue of the covariance of a pose that is given
 POSE = np.arange(3)
 
 
@@ -62,8 +64,40 @@ def map_information(submap: Submap, points: Array, pose: Array, params: Paramete
     return np.asarray(0.5 * (out + out.T), dtype=np.float64)
 
 
+def at_most(shared: Array, cov: Array) -> Array:
+    """The part (3, 3) of a shared covariance that a covariance may contain, less MARGIN."""
+    if not shared.any() or np.linalg.eigvalsh(cov)[0] < KNOWN:
+        return np.zeros_like(cov)
+    L = np.linalg.cholesky(cov)
+    values, axes = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, shared).T))
+    root = L @ axes * np.sqrt(np.clip(values, 0.0, 1.0 - MARGIN))
+    return np.asarray(root @ root.T, dtype=np.float64)
+
+
+def relative_update(cov: Array, shared: Array, root: Array, v: Array) -> tuple[Array, Array]:
+    """Rows (m, 3) and their values (m,) of unit variance that update a pose as a match does.
+
+    A match with ``root`` and ``v`` measures the pose relative to a map that is off by an error of
+    covariance ``shared``, which ``cov`` (3, 3) contains and which no match lowers:
+    cov' = ((cov - shared)^-1 + I)^-1 + shared (a consider state, Schmidt 1966). What is returned
+    has the same mean and covariance of the pose, and keeps that of all else positive definite.
+    """
+    relative = np.linalg.inv(np.linalg.inv(cov - shared) + root.T @ root)
+    inverse = np.linalg.inv(relative + shared)
+    moved = inverse @ (relative @ (root.T @ v))
+    information = inverse - np.linalg.inv(cov)
+    values, axes = np.linalg.eigh(0.5 * (information + information.T))
+    values, axes = values[-len(v) :], axes[:, -len(v) :]
+    scale = np.sqrt(np.maximum(values, 1e-9 * values[-1]))
+    return (axes * scale).T, (axes.T @ moved) / scale
+
+
 class GridLocalizer:
-    """Matches scans with a grid."""
+    """Matches scans with a grid.
+
+    All matches share the error of the cells: the filter runs relative to a map that is off by it,
+    so that no number of matches makes the pose surer than the cells are.
+    """
 
     def __init__(self, grid: OccupancyGrid, params: Parameters) -> None:
         self._p = params
@@ -105,9 +139,13 @@ class GridLocalizer:
         offset[2] = se2.wrap(offset[2])
         v = root @ offset
         root = root @ se2.rotation3(yaw).T  # from here on in the axes of the map
-        d2 = float(v @ np.linalg.solve(root @ cov @ root.T + np.eye(len(v)), v))
+        S = root @ (cov + self._saved.cov_cell) @ root.T + np.eye(len(v))
+        d2 = float(v @ np.linalg.solve(S, v))
         if not len(v) or d2 > self._gate[len(v) - 1]:
             return GridMatch(found.score, is_elsewhere=True)
+        shared = at_most(self._saved.cov_cell, cov)
+        if shared.any():
+            root, v = relative_update(cov, shared, root, v)
         state.apply(POSE, root, np.eye(len(v)), v)
         self._last = state.pose
         weakest = self._p.health.degeneracy_sigma**-2

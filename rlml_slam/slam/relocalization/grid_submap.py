@@ -8,6 +8,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from rlml_slam import params, se2
 from rlml_slam.maps.occupancy import OccupancyGrid
@@ -20,6 +21,7 @@ from rlml_slam.se2 import Array
 # often where the wall lies near their border, have become free: given back half of the wall's.
 BESIDE = 50
 WALL = 0.25  # probability from which a cell of the map may stop a beam
+RUN = 10  # cells in line from which on a wall lies along the lattice
 MAX_STEPS = 4096  # along a beam, 205 m in cells of 0.05 m: a message may have far smaller ones
 
 
@@ -28,11 +30,13 @@ class GridSubmap:
     """``submap`` with the lattice of the grid, and ``T_map_submap`` (3,).
 
     The frames are the same where the grid is not turned and its origin is a multiple of the
-    resolution, as those are that the back end draws.
+    resolution, as those are that the back end draws. ``cov_cell`` (3, 3) is that of the error
+    that all matches share, as walls lie anywhere in their cells, in the axes of the map.
     """
 
     submap: Submap
     T_map_submap: Array
+    cov_cell: Array
 
     @property
     def yaw(self) -> float:
@@ -63,7 +67,10 @@ def submap_of(grid: OccupancyGrid, parameters: params.Submap) -> GridSubmap:
     """A grid as a submap; unknown cells stay unknown. That of the latest grid is kept."""
     submap, cells = Submap(parameters), grid.cells
     submap.resolution = grid.resolution
+    cov_cell = np.zeros((3, 3))
     if not ((cells > 0) & (cells < 100)).any():
+        R = se2.rotation(grid.yaw)
+        cov_cell[:2, :2] = R @ np.diag(grid.resolution**2 / 12.0 * along_lattice(cells)) @ R.T
         beside = np.where(_beside(cells) > 0, np.int8(BESIDE), np.int8(-1))
         cells = np.maximum(cells, beside)
     # of cells from 0 on, then of the unknown ones from -1 down
@@ -74,7 +81,20 @@ def submap_of(grid: OccupancyGrid, parameters: params.Submap) -> GridSubmap:
     lattice = np.round(corner / grid.resolution)
     submap.corner = (int(lattice[0]), int(lattice[1]))
     rest = se2.rotation(grid.yaw) @ (corner - lattice * grid.resolution)
-    return GridSubmap(submap, np.array([*rest, grid.yaw]))
+    return GridSubmap(submap, np.array([*rest, grid.yaw]), cov_cell)
+
+
+def along_lattice(cells: NDArray[np.int8]) -> Array:
+    """Share (2,) of the walls that tell x, and y, of which all cells lie in line.
+
+    Such a wall is off by the same all along, uniformly within half a cell. One across the lattice
+    is drawn as stairs, whose mean is where it stands.
+    """
+    walls = cells > 0
+    upright, level = (ndimage.binary_opening(walls, np.ones(n)) for n in ((RUN, 1), (1, RUN)))
+    both, number = np.count_nonzero(upright & level), np.count_nonzero(walls)
+    lines = np.array([np.count_nonzero(upright), np.count_nonzero(level)])
+    return np.asarray(lines / np.maximum(number - lines[::-1] + both, 1))
 
 
 def _beside(cells: NDArray[np.int8]) -> NDArray[np.int8]:
