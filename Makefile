@@ -21,7 +21,7 @@ MADE := $(VENV)/.made-for-$(ROS)
 # the wheels mark a process that has set itself up; another environment's Python must not see it
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help env demo test lint types docs ci tf config clean
+.PHONY: help env kernels demo test lint types docs ci tf config clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile | expand -t 16
@@ -33,10 +33,13 @@ $(MADE): setup.py $(wildcard requirements/python*.txt) requirements/ros.txt requ
 	@PYTHON='$(PYTHON)' requirements/install $(VENV) $(ROS)
 	@touch $@
 
-demo: env  ## simulator, front end and back end live over DDS, with a report in out/demo
+kernels: env  ## compile the kernels, where their sources changed since
+	@$(BIN)/rlml warm-up
+
+demo: kernels  ## simulator, front end and back end live over DDS, with a report in out/demo
 	@$(BIN)/rlml demo
 
-test: env  ## all tests
+test: kernels  ## all tests
 	@$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 lint: env  ## ruff: rules and format
