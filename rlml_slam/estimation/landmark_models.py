@@ -20,9 +20,10 @@ from rlml_slam.se2 import Array
 class Model:
     """A kind of landmark, two numbers in the map, measured as two numbers from the robot.
 
-    ``observe(pose (3,), landmarks (m, 2))`` gives h (m, 2), dh/dpose (m, 2, 3), dh/dlandmark
-    (m, 2, 2); ``place(pose (3,), z (k, 2))`` the landmark (k, 2), its J_xr (k, 2, 3) and its J_z
-    (k, 2, 2); ``innovation(z, h)`` their difference, over leading dimensions.
+    ``observe(pose, landmarks (m, 2))`` gives h (m, 2), dh/dpose (m, 2, 3), dh/dlandmark (m, 2, 2);
+    ``place(pose, z (k, 2))`` the landmark (k, 2), its J_xr (k, 2, 3) and its J_z (k, 2, 2);
+    ``innovation(z, h)`` their difference, over leading dimensions. The pose is one (3,), or one
+    of each landmark (m, 3).
     """
 
     observe: Callable[[Array, Array], tuple[Array, Array, Array]]
@@ -32,10 +33,10 @@ class Model:
 
 def observe_points(pose: Array, landmarks: Array) -> tuple[Array, Array, Array]:
     """Range and bearing of points (eq. 17) and their Jacobian H (eq. 18)."""
-    d = landmarks - pose[:2]
+    d = landmarks - pose[..., :2]
     q = d[:, 0] ** 2 + d[:, 1] ** 2
     r = np.sqrt(q)
-    h = np.stack([r, se2.wrap(np.arctan2(d[:, 1], d[:, 0]) - pose[2])], -1)
+    h = np.stack([r, se2.wrap(np.arctan2(d[:, 1], d[:, 0]) - pose[..., 2])], -1)
     H_m = np.empty((len(d), 2, 2))
     H_m[:, 0] = d / r[:, None]
     # bearing row of H: [(ly - y) / r^2, -(lx - x) / r^2, -1]; the note has the second sign wrong
@@ -48,9 +49,9 @@ def observe_points(pose: Array, landmarks: Array) -> tuple[Array, Array, Array]:
 
 def place_points(pose: Array, z: Array) -> tuple[Array, Array, Array]:
     """Points seen at range and bearing z (k, 2), with J_xr and J_z (last sign corrected)."""
-    a = pose[2] + z[:, 1]
+    a = pose[..., 2] + z[:, 1]
     c, s = np.cos(a), np.sin(a)
-    m = pose[:2] + z[:, :1] * np.stack([c, s], -1)
+    m = pose[..., :2] + z[:, :1] * np.stack([c, s], -1)
     J_z = np.empty((len(z), 2, 2))
     J_z[:, 0, 0], J_z[:, 0, 1] = c, -z[:, 0] * s
     J_z[:, 1, 0], J_z[:, 1, 1] = s, z[:, 0] * c
@@ -86,8 +87,8 @@ def line_model(origin: Array) -> Model:
         n = e / d[:, None]
         t = np.stack([-n[:, 1], n[:, 0]], -1)
         a = np.arctan2(e[:, 1], e[:, 0])
-        away = (o - pose[:2]) @ np.stack([n, t], -1)  # (m, 2): along n and t
-        h = np.stack([d + away[:, 0], se2.wrap(a - pose[2])], -1)
+        away = ((o - pose[..., :2])[..., None] * np.stack([n, t], -1)).sum(axis=-2)  # along n, t
+        h = np.stack([d + away[:, 0], se2.wrap(a - pose[..., 2])], -1)
         H_m = np.empty((len(e), 2, 2))
         H_m[:, 1] = t / d[:, None]
         H_m[:, 0] = n + away[:, 1:] * H_m[:, 1]
@@ -97,12 +98,12 @@ def line_model(origin: Array) -> Model:
         return h, H_r, H_m
 
     def place(pose: Array, z: Array) -> tuple[Array, Array, Array]:
-        a = pose[2] + z[:, 1]
+        a = pose[..., 2] + z[:, 1]
         n = np.stack([np.cos(a), np.sin(a)], -1)
         t = np.stack([-n[:, 1], n[:, 0]], -1)
-        from_origin = pose[:2] - o
-        d = z[:, 0] + n @ from_origin
-        by_angle = n * (t @ from_origin)[:, None] + t * d[:, None]
+        from_origin = pose[..., :2] - o
+        d = z[:, 0] + (n * from_origin).sum(axis=-1)
+        by_angle = n * (t * from_origin).sum(axis=-1)[:, None] + t * d[:, None]
         J_z = np.stack([n, by_angle], -1)
         J_xr = np.empty((len(z), 2, 3))
         J_xr[:, :, :2] = n[:, :, None] * n[:, None, :]

@@ -155,8 +155,14 @@ class _Problem:
     def __init__(self, start: Start, steps: Sequence[Step], model: Model) -> None:
         self._start, self._model = start, model
         motions = [s.motion for s in steps]
-        self._steps = steps
-        self.keys = np.unique([q.key for s in steps for q in s.sights]).astype(np.int64)
+        # of all measurements: row of their state, and of their landmark
+        self._row = np.repeat(np.arange(1, len(steps) + 1), [len(s.sights) for s in steps])
+        sights = [q for s in steps for q in s.sights]
+        self.keys, self._slot = np.unique(
+            np.array([q.key for q in sights], dtype=np.int64), return_inverse=True
+        )
+        self._z = np.array([q.z for q in sights]).reshape(-1, 2)
+        self._R = np.array([q.R for q in sights]).reshape(-1, 2, 2)
         self._delta, self._bias_gain, self._turn_gain = (
             np.array([getattr(m, name) for m in motions])
             for name in ('delta', 'bias_gain', 'turn_gain')
@@ -227,17 +233,17 @@ class _Problem:
         out.add(self._bias_var[:, None, None], e[:, None], (columns, H))
 
     def _measurements(self, out: _Rows, x: Array, points: Array, at: NDArray[np.int64]) -> None:
-        first = ROBOT * len(x)
-        for k, step in enumerate(self._steps, 1):
-            if not step.sights:
-                continue
-            slots = np.searchsorted(self.keys, [q.key for q in step.sights])
-            h, H_r, H_m = self._model.observe(x[k, :3], points[slots])
-            nu = self._model.innovation(np.array([q.z for q in step.sights]), h)
-            columns = first + 2 * slots[:, None] + np.arange(2)
-            robot = np.broadcast_to(at[k, :3], (len(slots), 3))
-            R = np.array([q.R for q in step.sights])
-            out.add(R, -nu, (robot, H_r), (columns, H_m))
+        """Residuals of the measured landmarks."""
+        h, H_r, H_m = self._model.observe(x[self._row, :3], points[self._slot])
+        columns = ROBOT * len(x) + 2 * self._slot[:, None] + np.arange(2)
+        nu = self._model.innovation(self._z, h)
+        out.add(self._R, -nu, (at[self._row, :3], H_r), (columns, H_m))
+
+    def first_points(self, poses: Array) -> Array:
+        """Start (m, 2) of each landmark by its last measurement, from the ``poses`` (n, 3)."""
+        last = np.zeros(len(self.keys), dtype=np.int64)
+        np.maximum.at(last, self._slot, np.arange(len(self._slot)))
+        return self._model.place(poses[self._row[last] - 1], self._z[last])[0]
 
 
 def smooth(
@@ -247,7 +253,7 @@ def smooth(
     problem = _Problem(start, steps, model)
     x = np.tile(start.x, (len(steps) + 1, 1))
     x[1:, :3] = poses
-    points = _first_points(problem.keys, steps, model, poses)
+    points = problem.first_points(poses)
     rows = problem.rows(x, points)
     cost = float(rows.errors() @ rows.errors())
     for _ in range(iterations):
@@ -274,14 +280,3 @@ def _smoothed(problem: _Problem, rows: _Rows, x: Array, points: Array) -> Smooth
     """The result, with the landmarks' covariances by the ``rows`` there."""
     covs = rows.covariances(x.size + points.size, x.size)
     return Smoothed(x[0], x[1:], problem.keys, points, covs)
-
-
-def _first_points(
-    keys: NDArray[np.int64], steps: Sequence[Step], model: Model, poses: Array
-) -> Array:
-    """Start of each landmark by its last measurement."""
-    out = np.zeros((len(keys), 2))
-    for pose, step in zip(poses, steps, strict=True):
-        for q in step.sights:
-            out[np.searchsorted(keys, q.key)] = model.place(pose, q.z[None])[0][0]
-    return out

@@ -38,6 +38,16 @@ def test_jxr_and_jz_are_the_derivatives(name, pose):
     close(J_z[0], central_differences(lambda q: model.place(pose, q[None])[0][0], z))
 
 
+@pytest.mark.parametrize('name', MODELS)
+def test_a_pose_of_each_landmark_gives_what_each_pose_gives(name):
+    model, poses = MODELS[name], np.array(POSES)
+    given = np.random.default_rng(0).uniform(1.0, 4.0, (len(poses), 2))
+    for of in (model.observe, model.place):
+        alone = [of(pose, row[None]) for pose, row in zip(poses, given, strict=True)]
+        for k, together in enumerate(of(poses, given)):
+            np.testing.assert_allclose(together, np.concatenate([a[k] for a in alone]), atol=1e-12)
+
+
 def test_polar_noise_is_turned_by_the_derivative():
     p, C = np.array([1.2, -0.7]), np.array([[0.04, 0.01], [0.01, 0.09]])
     J = central_differences(lambda q: to_polar(q[None], C[None])[0][0], p)

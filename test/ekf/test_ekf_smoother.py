@@ -27,12 +27,12 @@ def linear_model():
         shape = (len(landmarks), 2)
         H_r = np.zeros((*shape, 3))
         H_r[:, :, :2] = -np.eye(2)
-        return landmarks - pose[:2], H_r, np.broadcast_to(np.eye(2), (*shape, 2))
+        return landmarks - pose[..., :2], H_r, np.broadcast_to(np.eye(2), (*shape, 2))
 
     def place(pose, z):
         J = np.zeros((len(z), 2, 3))
         J[:, :, :2] = np.eye(2)
-        return pose[:2] + z, J, np.broadcast_to(np.eye(2), (len(z), 2, 2))
+        return pose[..., :2] + z, J, np.broadcast_to(np.eye(2), (len(z), 2, 2))
 
     return Model(observe, place, lambda z, h: z - h)
 

@@ -57,12 +57,12 @@ class Pairs(NamedTuple):
 
 
 class BatchAssociation:
-    """All detections of a run."""
+    """All detections of a run, ``z`` (n, 2) with covariances ``R``, of the frames ``frame_of``."""
 
     def __init__(self, seen: Sequence[Detections | None], params: Reflector) -> None:
         kept = [(k, d) for k, d in enumerate(seen) if d is not None and len(d)]
-        self._frame_of = np.concatenate([np.full(len(d), k) for k, d in kept])
-        self._z, self._R = (
+        self.frame_of = np.concatenate([np.full(len(d), k) for k, d in kept])
+        self.z, self.R = (
             np.concatenate([getattr(d, name) for _, d in kept]) for name in ('points', 'cov')
         )
         self._ids = np.concatenate([d.ids for _, d in kept])
@@ -89,10 +89,10 @@ class BatchAssociation:
         ``extra_variance`` [m²] per axis, or a larger one that the residuals show, is added to the
         covariances. All reflectors have detections.
         """
-        T = poses[self._frame_of]
-        self._points = se2.transform(T, self._z[:, None])[:, 0]
+        T = poses[self.frame_of]
+        self._points = se2.transform(T, self.z[:, None])[:, 0]
         R = se2.rotation(T[:, 2])
-        cov = R @ self._R @ np.swapaxes(R, 1, 2)
+        cov = R @ self.R @ np.swapaxes(R, 1, 2)
         self._cov = cov + max(extra_variance, self._spread2(cov, reflectors)) * np.eye(2)
         self._W = np.linalg.inv(self._cov)
         self._peak = 0.5 * np.linalg.slogdet(self._W)[1] - math.log(2.0 * math.pi) - OUTLIER
@@ -132,7 +132,7 @@ class BatchAssociation:
             a, b = pairs[k].tolist()
             of_a, of_b = np.flatnonzero(associations == a), np.flatnonzero(associations == b)
             is_named = (reflectors.ids[pairs[k]] != ANONYMOUS).all()
-            if is_named or len(np.intersect1d(self._frame_of[of_a], self._frame_of[of_b])):
+            if is_named or len(np.intersect1d(self.frame_of[of_a], self.frame_of[of_b])):
                 continue
             own = self._points[np.append(of_a, of_b)] - reflectors.points[a]
             along = own @ apart[k] / (apart[k] @ apart[k])
@@ -199,10 +199,10 @@ class BatchAssociation:
         best = pairs.gain.argmax(axis=1)
         out = np.where(pairs.gain[rows, best] > 0.0, pairs.reflector[rows, best], -1)
         used = np.flatnonzero(out >= 0)
-        seen = np.stack([self._frame_of[used], out[used]])
+        seen = np.stack([self.frame_of[used], out[used]])
         _, first, count = np.unique(seen, axis=1, return_inverse=True, return_counts=True)
         # in most looks each has one of its own, and there is nothing to be weighed
-        for k in np.unique(self._frame_of[used][count[first.ravel()] > 1]).tolist():
+        for k in np.unique(self.frame_of[used][count[first.ravel()] > 1]).tolist():
             look = slice(self._ends[k - 1] if k else 0, self._ends[k])
             out[look] = _assigned(pairs.reflector[look], pairs.gain[look])
         return out
@@ -224,7 +224,7 @@ class BatchAssociation:
             group = left[group[free[group]]]
             point = self._mean(group)
             own = group[np.argsort(-self._gain(group, point))]
-            own = own[np.unique(self._frame_of[own], return_index=True)[1]]
+            own = own[np.unique(self.frame_of[own], return_index=True)[1]]
             gain = self._gain(own, point)
             own, gain = own[gain > 0.0], gain[gain > 0.0]
             # what is seen less often is no reflector to the back end, and most of it are ghosts
@@ -257,7 +257,7 @@ class BatchAssociation:
         order = np.argsort(at, kind='stable')
         ends = np.searchsorted(at[order], np.arange(m + 1))
         own_gain = self._gain_of(pairs, at)
-        keys = self._frame_of * m + at  # of (look, reflector), sorted below to be searched
+        keys = self.frame_of * m + at  # of (look, reflector), sorted below to be searched
         used = np.flatnonzero(at >= 0)
         used = used[np.argsort(keys[used], kind='stable')]
         sorted_keys = keys[used]
@@ -269,7 +269,7 @@ class BatchAssociation:
                 continue
             reflector = pairs.reflector[own]
             gain = np.where(reflector == k, 0.0, np.maximum(pairs.gain[own], 0.0))
-            key = self._frame_of[own, None] * m + reflector
+            key = self.frame_of[own, None] * m + reflector
             slot = np.minimum(np.searchsorted(sorted_keys, key), len(sorted_keys) - 1)
             taken = (sorted_keys[slot] == key) & (reflector >= 0)
             gain -= np.where(taken, np.minimum(own_gain[used[slot]], gain), 0.0)
@@ -280,9 +280,7 @@ class BatchAssociation:
             out[k] = loss - self._cost(own)
             if len(to):
                 j = int(np.bincount(to).argmax())
-                out[k] -= _entropy(
-                    self._frame_of[own], self._frame_of[order[ends[j] : ends[j + 1]]]
-                )
+                out[k] -= _entropy(self.frame_of[own], self.frame_of[order[ends[j] : ends[j + 1]]])
         return out
 
     @staticmethod

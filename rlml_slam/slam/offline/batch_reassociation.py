@@ -123,21 +123,17 @@ class BatchReassociation:
 
         ``extra_variance`` [m²] is added to the covariance of each detection.
         """
-        steps = []
-        for step, frame, at, pose in zip(
-            self._steps, self._frames, match.by_frame(associations), poses, strict=True
-        ):
-            d, used = frame.observation.detections, np.flatnonzero(at >= 0)
-            if d is None or not len(used):
-                steps.append(step)
-                continue
-            z, R = to_polar(d.points[used], d.cov[used] + extra_variance * np.eye(2))
-            nu = POINT.innovation(z, POINT.observe(pose, points[at[used]])[0])
-            d2 = _distance2(nu, R)
-            R *= (1.0 + d2 / self._p.reflector.robust_scale**2)[:, None, None]
-            sights = tuple(map(Sight, at[used].tolist(), z, R))
-            steps.append(dataclasses.replace(step, sights=sights))
-        return steps
+        used = np.flatnonzero(associations >= 0)
+        keys, of = associations[used], match.frame_of[used]
+        z, R = to_polar(match.z[used], match.R[used] + extra_variance * np.eye(2))
+        nu = POINT.innovation(z, POINT.observe(poses[of], points[keys])[0])
+        R *= (1.0 + _distance2(nu, R) / self._p.reflector.robust_scale**2)[:, None, None]
+        sights = [Sight(*one) for one in zip(keys.tolist(), z, R, strict=True)]
+        counts = np.bincount(of, minlength=len(self._steps)).tolist()
+        return [
+            dataclasses.replace(step, sights=tuple(sights[end - count : end])) if count else step
+            for step, count, end in zip(self._steps, counts, np.cumsum(counts), strict=True)
+        ]
 
     def _corrected(self, smoothed: Smoothed, looks: Sequence[Indices]) -> list[Frame]:
         """Frames whose measurements agree with the smoothed path and reflectors.
