@@ -117,3 +117,8 @@ def local_copy(url: str, into: Path) -> Path:
         here.parent.mkdir(parents=True, exist_ok=True)
         fs.get_file(file, str(here))
     return target
+
+
+def in_words(n: int) -> str:
+    """A number of bags for people."""
+    return '1 bag' if n == 1 else f'{n} bags'

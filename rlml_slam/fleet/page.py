@@ -10,8 +10,10 @@ from urllib.parse import quote
 
 import numpy as np
 
+from rlml_slam.fleet.bags import in_words
 from rlml_slam.fleet.comparison import LIMITS, Effect, Limit, Verdict, effect_rows
 from rlml_slam.fleet.results import Record
+from rlml_slam.fleet.run import span
 from rlml_slam.report.page import heading, html_table, page, section
 
 COLUMNS = (
@@ -41,10 +43,9 @@ def fleet_page(
     """The whole page; links are relative to the folder of the results."""
     ok = sum(r.row['status'] == 'ok' for r in records)
     worse = {v.name: v.worse for v in verdicts if v.worse}
-    hours = sum(r.row.get('duration_s', 0.0) for r in records) / 3600.0
-    parts = [
-        heading('Fleet', f'{len(records)} bags, {hours:.1f} h; {ok} without a problem'),
-    ]
+    driven = span(sum(r.row.get('duration_s', 0.0) for r in records))
+    text = f'{in_words(len(records))}, {driven}; {ok} without a problem'
+    parts = [heading('Fleet', text)]
     if verdicts:
         parts += [_verdict(verdicts, worse, records), _effects(found), _limits(limits)]
     parts.append(section('Worst runs', _worst(records)))
@@ -58,9 +59,9 @@ def _verdict(
 ) -> str:
     by_name = {r.name: r for r in records}
     same = sum(v.is_same for v in verdicts)
-    head = f'<p>{len(verdicts)} bags compared, {same} with the same bytes.</p>'
+    head = f'<p>{in_words(len(verdicts))} compared, {same} with the same bytes.</p>'
     rows = [[_link(by_name[n]), escape('; '.join(why))] for n, why in worse.items()]
-    title = f'{len(worse)} bags got worse' if worse else 'No bag got worse'
+    title = f'{in_words(len(worse))} got worse' if worse else 'No bag got worse'
     return section(title, head + (html_table(rows, ('bag', 'what')) if rows else ''),
                    'problem' if worse else '')  # fmt: skip
 
@@ -117,7 +118,7 @@ def _histogram(title: str, values: Sequence[float]) -> str:
     """A picture as SVG, nothing without values."""
     if not values:
         return ''
-    counts, edges = np.histogram(values, BINS)
+    counts, _ = np.histogram(values, BINS)
     step, top = WIDTH / BINS, max(int(counts.max()), 1)
     bars = ''.join(
         f'<rect x="{k * step:.1f}" y="{HEIGHT * (1 - c / top):.1f}" width="{step - 1:.1f}" '
@@ -125,7 +126,7 @@ def _histogram(title: str, values: Sequence[float]) -> str:
         for k, c in enumerate(counts.tolist())
     )
     median, p95 = np.percentile(values, (50, 95))
-    text = (f'{title}: {edges[0]:.4g} to {edges[-1]:.4g}, median {median:.4g}, '
+    text = (f'{title}: {min(values):.4g} to {max(values):.4g}, median {median:.4g}, '
             f'95 % below {p95:.4g}')  # fmt: skip
     return (
         f'<figure style="display:inline-block;width:{WIDTH}px;margin:8px 16px 8px 0">'

@@ -41,7 +41,7 @@ def replay_all(
         n = len(records)
         left = (time.monotonic() - began) / n * (len(jobs) - n)
         progress(n, f'{n} of {len(jobs)}, {found} found again, {problems} with a problem, '
-                    f'{_span(left)} left')  # fmt: skip
+                    f'{span(left)} left')  # fmt: skip
     return [records[k] for k in range(len(jobs))]
 
 
@@ -61,7 +61,7 @@ def _record_of(future: Any, job: Job) -> Record:
     return record
 
 
-def _span(seconds: float) -> str:
+def span(seconds: float) -> str:
     """A time for people."""
     if seconds < 90.0:
         return f'{seconds:.0f} s'

@@ -90,3 +90,17 @@ def test_page_names_what_got_worse_and_needs_no_network():
     assert '&lt;b&gt;' in html
     assert '<b>' not in html.replace('<b>0', '')
     assert 'http' not in html.replace('http-equiv', '')
+
+
+def test_one_bag_is_one_in_the_page():
+    one = record(duration_s=8.0)
+    html = fleet_page([one], compare([one], [record(lost_s=9.0)]))
+    for text in ('1 bag, 8 s;', '1 bag compared', '1 bag got worse'):
+        assert text in html
+    assert '2 bags, 16 s;' in fleet_page([one, one])
+
+
+def test_distribution_of_equal_figures_invents_no_others():
+    html = fleet_page([record(), record()])
+    assert 'LOST [s]: 0 to 0, median 0' in html
+    assert '-0.5' not in html

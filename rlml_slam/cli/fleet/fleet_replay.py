@@ -12,7 +12,7 @@ from typing import Any
 from rlml_slam.cli.fleet.fleet_options import add_options, values_of
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.cli.support.text_table import aligned
-from rlml_slam.fleet.bags import find_bags
+from rlml_slam.fleet.bags import find_bags, in_words
 from rlml_slam.fleet.cluster import open_client
 from rlml_slam.fleet.comparison import (
     LIMITS,
@@ -106,8 +106,8 @@ def _figures(
 def _text(f: dict[str, Any], found: Sequence[Effect], results: Results) -> str:
     s = f['status']
     lines = [
-        f'{f["bags"]} bags: {s["ok"]} without a problem, {s["partial"]} in part, {s["failed"]} '
-        f'failed; {f["found_again"]} found again'
+        f'{in_words(f["bags"])}: {s["ok"]} without a problem, {s["partial"]} in part, '
+        f'{s["failed"]} failed; {f["found_again"]} found again'
     ]
     lines += [f'  {name}: {why}' for name, why in list(f['problems'].items())[:SHOWN]]
     if f['compared']:
@@ -118,5 +118,5 @@ def _text(f: dict[str, Any], found: Sequence[Effect], results: Results) -> str:
         lines += [f'  {n}: {"; ".join(why)}' for n, why in list(f['worse'].items())[:SHOWN]]
         lines.append(aligned([['figure', 'bags', 'mean change', '95 %', ''], *effect_rows(found)]))
     if f['not_replayed']:
-        lines.append(f'{len(f["not_replayed"])} bags of the baseline were not replayed')
+        lines.append(f'not replayed of the baseline: {in_words(len(f["not_replayed"]))}')
     return '\n'.join([*lines, f'report: {results.path("fleet.html")}'])

@@ -12,7 +12,7 @@ from rlml_slam.cli.fleet.fleet_options import add_options, values_of
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.cli.support.text_table import aligned
 from rlml_slam.errors import ParameterError
-from rlml_slam.fleet.bags import find_bags
+from rlml_slam.fleet.bags import find_bags, in_words
 from rlml_slam.fleet.cluster import open_client
 from rlml_slam.fleet.comparison import effect_rows, effects
 from rlml_slam.fleet.replay_job import Job, code_digest
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({'bags': n, 'failed': failed, 'effects': rows}))
     else:
-        print(f'{n} bags, {len(runs)} variants; {failed} of {len(jobs)} runs failed')
+        print(f'{in_words(n)}, {len(runs)} variants; {failed} of {len(jobs)} runs failed')
         head = ['value', 'figure', 'bags', 'mean change', '95 %', '']
         print(aligned([head, *([v, *r] for v, f in table.items() for r in effect_rows(f))]))
     return 1 if failed == len(jobs) else 0
