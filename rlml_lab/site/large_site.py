@@ -28,10 +28,10 @@ MIN_GAP = 1.5  # [m] between two reflectors
 MATT = (0.6, 0.0, 0.0, float(NO_REFLECTOR))
 # few rays and few scans: forty sessions in minutes
 CHEAP = {
-    'laser.rate': 4.0, 'laser.beams': 240, 'laser.ray_times': False, 'wheels.rate': 20.0,
-    'gyro.rate': 40.0, 'truth_rate': 4.0, 'speed': 1.5, 'markers.sigma_range': 0.02,
+    'laser.beams': 240, 'laser.ray_times': False, 'speed': 1.5, 'markers.sigma_range': 0.02,
     'markers.false_detections': 0.01,
 }  # fmt: skip
+RATES = {'laser.rate': 1.0, 'wheels.rate': 5.0, 'gyro.rate': 10.0, 'truth_rate': 1.0}  # per scan
 
 
 @dataclass(frozen=True)
@@ -95,16 +95,17 @@ def make_route(side: float, start: Array, length: float, rng: np.random.Generato
     return np.array(points)
 
 
-def simulation(site: LargeSite, route: Array, seed: int) -> Simulation:
+def simulation(site: LargeSite, route: Array, seed: int, scans: float) -> Simulation:
     """One drive."""
     first = route[1] - route[0]
     heading = float(np.arctan2(first[1], first[0]))
-    return Simulation(site.world(route, heading), simulator_parameters(), seed)
+    return Simulation(site.world(route, heading), simulator_parameters(scans), seed)
 
 
-def simulator_parameters() -> SimulatorParameters:
-    """Cheap sensors."""
-    return from_mapping(CHEAP, SimulatorParameters)
+def simulator_parameters(scans: float) -> SimulatorParameters:
+    """Cheap sensors, with ``scans`` a second."""
+    rates = {name: scans * each for name, each in RATES.items()}
+    return from_mapping(CHEAP | rates, SimulatorParameters)
 
 
 def docks(side: float) -> Array:

@@ -8,8 +8,8 @@ of chance: nothing says where a session lies, or that two belong to another site
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -62,10 +62,13 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         '--length', type=float, default=300.0, help='of a drive [m] (default: %(default)s)'
     )
+    parser.add_argument(
+        '--scans', type=float, default=4.0, help='per second (default: %(default)s)'
+    )
     parser.add_argument('--seed', type=int, default=0, help='default: %(default)s')
     parser.add_argument('--jobs', type=int, default=1, help='processes (default: %(default)s)')
     parser.add_argument('--cluster', help='scheduler of Dask')
-    parser.add_argument('--out', type=Path, help='keep the maps in this folder')
+    parser.add_argument('--out', type=Path, help='keep the maps here, and use those that are')
     parser.add_argument('--json', action='store_true', help='print one JSON object and no more')
 
 
@@ -73,6 +76,8 @@ def run(args: argparse.Namespace) -> int:
     """Map, merge and print a row per number of sessions."""
     if min(args.sessions) < ANYWHERE + STRANGERS + 1:
         raise ParameterError('study site: --sessions must be 6 or more')
+    if not 1.0 <= args.scans <= 40.0:
+        raise ParameterError('study site: --scans must be 1 to 40')
     warm_up.compile_loaded()
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
@@ -92,18 +97,18 @@ def study(number: int, args: argparse.Namespace, folder: Path) -> dict[str, Any]
     with mapper(args.cluster, args.jobs) as workers:
         n = [number] * number
         starts = workers(
-            map_session, range(number), n, [args.length] * number, [args.seed] * number,
-            [folder] * number,
+            map_session, range(number), n, [args.length] * number, [args.scans] * number,
+            [args.seed] * number, [folder] * number,
         )  # fmt: skip
     mapped = time.perf_counter() - begin
     order = np.random.default_rng(args.seed).permutation(number)
     files = [name_of(folder, k) for k in order]
     engine = ['--jobs', str(args.jobs), *(['--cluster', args.cluster] if args.cluster else [])]
-    merged, seconds, megabytes = merge(files, folder / 'site.rlml', engine)
+    merged, seconds = merge(files, folder / 'site.rlml', engine)
     truth = make(number, args.seed)[0].reflectors
     return {
         'sessions': number, 'area_m2': AREA * number, 'reflectors': len(truth),
-        'map_s': mapped, 'merge_s': seconds, 'merge_mb': megabytes,
+        'map_s': mapped, 'merge_s': seconds, 'merge_mb': merged['peak_rss_mb'],
         **evaluate(merged, folder, np.array(starts), truth),
         'left_out': {Path(f).stem: why for f, why in merged['left_out'].items()},
     }  # fmt: skip
@@ -123,8 +128,19 @@ def name_of(folder: Path, k: int) -> Path:
     return folder / f'session-{k:02d}.rlml'
 
 
-def map_session(k: int, number: int, length: float, seed: int, folder: Path) -> Array:
-    """Drive and map one session, and save it; its true first pose (3,) in the site."""
+def map_session(
+    k: int, number: int, length: float, scans: float, seed: int, folder: Path
+) -> Array:  # fmt: skip
+    """Drive and map one session, and save it; its true first pose (3,) in the site.
+
+    A session that is in the folder already is not driven again.
+    """
+    path = name_of(folder, k)
+    asked = {'sessions': number, 'length': length, 'scans': scans, 'seed': seed}
+    with contextlib.suppress(OSError):
+        known = json.loads(path.with_suffix('.json').read_text())
+        if asked.items() <= known.items() and path.exists():
+            return np.array(known['T_world_map'])
     sites = make(number, seed)
     site = sites[k >= number - STRANGERS]
     rng = np.random.default_rng([seed, number, 2, k])
@@ -132,31 +148,26 @@ def map_session(k: int, number: int, length: float, seed: int, folder: Path) -> 
     start = places[k % len(places)]
     if k < ANYWHERE:
         start = AISLE * rng.integers(0, round(site.side / AISLE) + 1, 2)
-    drive = simulation(site, make_route(site.side, start, length, rng), seed + k)
+    drive = simulation(site, make_route(site.side, start, length, rng), seed + k, scans)
     slam = Slam(Parameters())
-    node = simulator_parameters().node
+    node = simulator_parameters(scans).node
     slam.set_sensor_pose(node.laser_frame, np.array(node.laser_pose))
     feed(slam, [event.message for event in drive])
-    map_file.save(name_of(folder, k), slam.back_end, Parameters())
+    map_file.save(path, slam.back_end, Parameters())
+    known = asked | {'T_world_map': drive.T_world_map.tolist()}
+    path.with_suffix('.json').write_text(json.dumps(known))
     return drive.T_world_map
 
 
-def merge(
-    files: Sequence[Path], out: Path, engine: Sequence[str]
-) -> tuple[dict[str, Any], float, float]:
-    """Run ``rlml map merge`` as a process: what it printed, its time [s] and memory [MB]."""
+def merge(files: Sequence[Path], out: Path, engine: Sequence[str]) -> tuple[dict[str, Any], float]:
+    """Run ``rlml map merge`` as a process: what it printed, and its time [s]."""
     begin = time.perf_counter()
     command = [sys.executable, '-m', 'rlml_slam', 'map', 'merge', *map(str, files)]
-    with subprocess.Popen(
-        [*command, '--out', str(out), '--json', *engine], stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
-        printed = process.stdout.read()
-        _, status, used = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise MapError(f'rlml map merge ended with {process.returncode}')
-    return json.loads(printed), time.perf_counter() - begin, used.ru_maxrss / 1024.0
+    command += ['--out', str(out), '--json', *engine]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+    if done.returncode:
+        raise MapError(f'rlml map merge ended with {done.returncode}')
+    return json.loads(done.stdout), time.perf_counter() - begin
 
 
 def evaluate(

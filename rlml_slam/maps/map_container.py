@@ -25,7 +25,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from rlml_slam.errors import FileFormatError, MapError
 from rlml_slam.maps.atomic_file import write_atomically
+from rlml_slam.maps.pieces import Pieces
 
 MAGIC, VERSION = b'RLMLMAP', 1
 HEAD = struct.Struct('<7sBQ32s')
@@ -40,6 +41,7 @@ SIZE = HEAD.size + 16
 DESCRIPTION = 'description.json'
 PREVIOUS = '.previous'
 PACKED = 1 << 16  # bytes; smaller arrays are not worth a compressor's start
+PIECE = 1 << 20  # bytes that are unpacked at a time
 UNPACKED = 1 << 28  # bytes that any file may unpack to,
 RATIO = 20  # and how many times its own size a larger one
 # what the readers of zip, JSON and arrays raise for files that are none of ours
@@ -126,8 +128,21 @@ def _archive(content: Content) -> memoryview:
             plain = array.dtype.kind in PLAIN or array.nbytes < PACKED
             member = _member(f'{name}.npy', zipfile.ZIP_STORED if plain else zipfile.ZIP_DEFLATED)
             with archive.open(member, 'w', force_zip64=array.nbytes > 1 << 30) as f:
-                npy.write_array(f, np.ascontiguousarray(array), allow_pickle=False)
+                _write_array(f, array)
     return out.getbuffer()
+
+
+def _write_array(f: IO[bytes], array: NDArray[Any] | Pieces) -> None:
+    """In numpy's format."""
+    if not isinstance(array, Pieces):
+        npy.write_array(f, np.ascontiguousarray(array), allow_pickle=False)
+        return
+    descr = npy.dtype_to_descr(array.dtype)
+    npy.write_array_header_1_0(
+        f, {'descr': descr, 'fortran_order': False, 'shape': array.shape}
+    )  # fmt: skip
+    for piece in array.pieces():
+        f.write(piece.data)
 
 
 def _member(name: str, method: int = zipfile.ZIP_STORED) -> zipfile.ZipInfo:
@@ -210,7 +225,8 @@ def _unpacked(path: Path, body: memoryview) -> Content:
             description = json.loads(archive.read(DESCRIPTION))
             for name in archive.namelist():
                 if name.endswith('.npy'):
-                    arrays[name.removesuffix('.npy')] = _array(archive.read(name))
+                    with archive.open(name) as f:
+                        arrays[name.removesuffix('.npy')] = _array(f)
     # a checksum that fits says that the file is as it was written, not that we wrote it
     except FOREIGN as e:
         raise FileFormatError(f'{path}: not a map of this program: {e}') from e
@@ -219,13 +235,15 @@ def _unpacked(path: Path, body: memoryview) -> Content:
     return Content(arrays, description)
 
 
-def _array(data: bytes) -> NDArray[Any]:
+def _array(f: IO[bytes]) -> NDArray[Any]:
     """The array of a file in numpy's format; ValueError where it declares another size."""
-    f = io.BytesIO(data)
     version = npy.read_magic(f)
     read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-    shape, _, dtype = read(f)
-    if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(data) - f.tell():
+    shape, is_fortran, dtype = read(f)
+    data = bytearray()  # the numbers are there once, whatever their size
+    for piece in iter(lambda: f.read(PIECE), b''):
+        data += piece
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(data):
         raise ValueError(f'an array of {shape} {dtype} in {len(data)} bytes')
-    f.seek(0)
-    return npy.read_array(f, allow_pickle=False)
+    out: NDArray[Any] = np.frombuffer(data, dtype).reshape(shape, order='F' if is_fortran else 'C')
+    return out

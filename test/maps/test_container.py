@@ -8,6 +8,7 @@ import struct
 import subprocess
 import sys
 import textwrap
+import tracemalloc
 import zipfile
 
 import numpy as np
@@ -16,6 +17,7 @@ import pytest
 from rlml_slam.errors import FileFormatError, MapError
 from rlml_slam.maps import map_container
 from rlml_slam.maps.map_container import Content
+from rlml_slam.maps.pieces import Pieces
 
 OLD, NEW = (
     Content(
@@ -51,6 +53,31 @@ def test_what_was_written_is_read(tmp_path):
 def test_equal_maps_are_equal_files(tmp_path):
     a, b = (map_container.write(tmp_path / name, NEW).read_bytes() for name in 'ab')
     assert a == b
+
+
+def test_pieces_are_one_array_in_the_file(tmp_path):
+    rows = [np.arange(5, dtype=np.uint16), np.full(200_000, 7, dtype=np.uint16)]
+    pieces = Pieces(np.uint16, [lambda a=a: a for a in rows], [len(a) for a in rows])
+    path = map_container.write(tmp_path / 'a.rlml', Content({'cells': pieces}, {}))
+    same(map_container.read(path), Content({'cells': np.concatenate(rows)}, {}))
+    np.testing.assert_array_equal(pieces, np.concatenate(rows))
+    empty = Content({'cells': Pieces(np.uint16, [], [])}, {})
+    assert map_container.read(map_container.write(path, empty)).arrays['cells'].shape == (0,)
+
+
+def test_a_large_array_is_never_there_twice(tmp_path):
+    size = 8 << 20  # bytes of a piece, of which there are eight
+    pieces = Pieces(np.uint8, [lambda: np.zeros(size, dtype=np.uint8)] * 8, [size] * 8)
+    tracemalloc.start()
+    path = map_container.write(tmp_path / 'a.rlml', Content({'cells': pieces}, {}))
+    written = tracemalloc.get_traced_memory()[1]
+    tracemalloc.reset_peak()
+    content = map_container.read(path)
+    read = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert written < 4 * size
+    assert content.arrays['cells'].nbytes == 8 * size
+    assert read < 12 * size
 
 
 def test_map_before_stays(tmp_path):

@@ -6,12 +6,14 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from rlml_slam import warm_up
+from rlml_slam.cli.support.usage import usage
 from rlml_slam.fleet.cluster import open_client
 from rlml_slam.maps import map_container, survey
 from rlml_slam.params import Parameters, from_mapping, read_yaml
@@ -62,9 +64,19 @@ def run(args: argparse.Namespace) -> int:
         'reflectors': len(merged.back_end.reflector_graph.keys()),
         'reflectors_joined': merged.joined,
         'closures_between': merged.closures,
+        'peak_rss_mb': peak_mb(),
     }
     print(json.dumps(figures) if args.json else text(figures, args.out))
     return 0
+
+
+def peak_mb() -> float | None:
+    """Largest memory of this process so far [MB], without that of workers; None if unknown.
+
+    Linux counts the memory of who started a process in ``ru_maxrss``, but not here.
+    """
+    used = usage(os.getpid(), 0.0)
+    return None if used is None else round(used.peak_rss_mb, 1)
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlml_slam.matching.scans.submap import Submap
 
@@ -35,7 +36,7 @@ class PackedSubmap(Submap):
     def __init__(self, submap: Submap, unpacked: Unpacked) -> None:
         super().__init__(submap.parameters)
         self.corner, self.insertions = submap.corner, submap.insertions
-        self._shape, self._unpacked = submap.values.shape, unpacked
+        self.shape, self._unpacked = submap.values.shape, unpacked
         self._packed = zlib.compress(submap.values.tobytes(), LEVEL)
         del self.values
 
@@ -43,7 +44,10 @@ class PackedSubmap(Submap):
         """Unpack ``values``: Python asks here for what is not there."""
         if name != 'values':
             raise AttributeError(name)
-        cells = bytearray(zlib.decompress(self._packed))
-        self.values = np.frombuffer(cells, dtype=np.uint16).reshape(self._shape)
+        self.values = self.cells().reshape(self.shape)
         self._unpacked.add(self)
         return self.values
+
+    def cells(self) -> NDArray[np.uint16]:
+        """All cells (n,) in a row, which are not kept."""
+        return np.frombuffer(bytearray(zlib.decompress(self._packed)), dtype=np.uint16)

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from rlml_slam import params, se2
 from rlml_slam.graph import Graph
+from rlml_slam.maps.pieces import Pieces
 from rlml_slam.matching.scans import scan_information, voxel_filter
+from rlml_slam.matching.scans.packed_submap import PackedSubmap
 from rlml_slam.matching.scans.scan_match import match
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import Parameters
@@ -134,11 +136,15 @@ class ScanGraph:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The submaps, to be saved."""
         maps = [m for m in self.finished + self._active if m.size]
-        shapes = [m.submap.values.shape for m in maps]
-        ends = np.cumsum([0, *(rows * columns for rows, columns in shapes)])
-        cells = np.empty(ends[-1], dtype=np.uint16)
-        for m, begin, end in zip(maps, ends[:-1].tolist(), ends[1:].tolist(), strict=True):
-            cells[begin:end] = m.submap.values.ravel()
+        packed = [m.submap for m in maps if isinstance(m.submap, PackedSubmap)]
+        cells: Any
+        if packed and len(packed) == len(maps):
+            shapes = [m.shape for m in packed]
+            cells = Pieces(np.uint16, [m.cells for m in packed], [r * c for r, c in shapes])
+        else:
+            shapes = [m.submap.values.shape for m in maps]
+            rows = [m.submap.values.ravel() for m in maps]
+            cells = np.concatenate([np.zeros(0, dtype=np.uint16), *rows])
 
         def pairs(rows: Iterable[tuple[int, int]]) -> NDArray[np.int64]:
             return np.array(list(rows), dtype=np.int64).reshape(-1, 2)
@@ -198,11 +204,11 @@ class SavedSubmap(NamedTuple):
 
 def saved_submaps(arrays: Mapping[str, NDArray[Any]], p: params.Submap) -> Iterator[SavedSubmap]:
     """The submaps of a saved map, one at a time."""
-    a = arrays
+    a, all_cells = arrays, np.asarray(arrays['submap_cells'])
     ends = np.cumsum(a['submap_shape'].prod(-1))
     for k, (rows, columns) in enumerate(a['submap_shape'].tolist()):
         submap = Submap(p)
-        cells = a['submap_cells'][ends[k] - rows * columns : ends[k]]
+        cells = all_cells[ends[k] - rows * columns : ends[k]]
         submap.values = cells.reshape(rows, columns).copy()
         submap.corner = (int(a['submap_corner'][k, 0]), int(a['submap_corner'][k, 1]))
         size, submap.insertions = a['submap_size'][k].tolist()

@@ -127,12 +127,16 @@ def assemble(
     submaps: list[SavedSubmap] = []
     sizes, unpacked = [Sizes()], Unpacked()
     for session, T in zip(site.sessions, poses, strict=True):
-        content = read(session)
-        own = _moved(dict(content.arrays), T, is_first=not maps)
-        maps.append(_shifted(own, sizes[-1]))
-        submaps += _packed(maps[-1], params, unpacked)
-        sizes.append(sizes[-1].after(own))
-    arrays, description = _joined(maps), content.description
+        given, description = read(session)
+        own = _moved(dict(given), T, is_first=not maps)
+        del given
+        own.pop('grid', None)  # another one is drawn
+        after = sizes[-1].after(own)
+        own = _shifted(own, sizes[-1])
+        submaps += _packed(own, params, unpacked)
+        maps.append(own)
+        sizes.append(after)
+    arrays = _joined(maps)
     if survey is not None and placed.is_in_survey_frame:
         arrays |= {f'survey_{name}': array for name, array in survey._asdict().items()}
     back_end = BackEnd(params, survey)
@@ -195,7 +199,7 @@ def _packed(a: Arrays, params: Parameters, unpacked: Unpacked) -> Iterator[Saved
     """The submaps of a map, with compressed cells, which leave its arrays."""
     own = {name: a[name] for name in list(a) if name.startswith('submap_')}
     for name, array in own.items():
-        a[name] = array[:0]
+        a[name] = array[:0].copy()  # a view would hold all of them
     for s in saved_submaps(own, params.submap):
         yield s._replace(submap=PackedSubmap(s.submap, unpacked))
 
@@ -285,7 +289,7 @@ def _joined(maps: list[Arrays]) -> Arrays:
     out['closures_tried'] = np.sum([a['closures_tried'] for a in maps], axis=0)
     path = np.concatenate([a['path'] for a in maps])
     out['path'] = path[np.argsort(path['stamp'], kind='stable')]
-    skipped = ('grid', *out, 'reflector_num_added')
+    skipped = (*out, 'reflector_num_added')
     for name in list(maps[0]):
         if name not in skipped and not name.startswith(('survey_', 'reflector_map')):
             out[name] = np.concatenate([a.pop(name) for a in maps])

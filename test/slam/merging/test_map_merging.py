@@ -2,6 +2,7 @@
 """Two maps are merged where their reflectors determine the relative pose, and only there."""
 
 import json
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -12,11 +13,13 @@ from rlml_slam import se2
 from rlml_slam.cli.main import main
 from rlml_slam.errors import MapError
 from rlml_slam.maps import map_container
+from rlml_slam.maps.pieces import Pieces
 from rlml_slam.matching.reflectors.constellation import locate
+from rlml_slam.matching.scans.packed_submap import Unpacked
 from rlml_slam.params import Parameters, Relocalization
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.back_end.trajectory import poses_of
-from rlml_slam.slam.merging.map_merging import assemble, merge_files, merge_maps
+from rlml_slam.slam.merging.map_merging import _packed, assemble, merge_files, merge_maps
 from rlml_slam.slam.merging.placement import UNMATCHED_SHARE
 from rlml_slam.slam.merging.site_map import session_of, site_of
 from rlml_slam.slam.merging.site_tree import Placed
@@ -228,4 +231,14 @@ def test_submaps_of_a_place_that_is_mapped_again_do_not_add_up(two, kept):
     number = len(made.content.arrays['submap_anchor'])
     assert number == 3 * once if kept == 0 else number <= 1.5 * once
     cells = made.content.arrays['submap_shape'].prod(axis=1).sum()
-    assert len(made.content.arrays['submap_cells']) == cells
+    packed = made.content.arrays['submap_cells']
+    assert isinstance(packed, Pieces)  # they are never all unpacked
+    assert len(packed) == len(np.asarray(packed)) == cells
+
+
+def test_cells_of_a_session_go_as_soon_as_they_are_packed(two):
+    arrays = {name: array.copy() for name, array in two[0].arrays.items()}
+    cells = weakref.ref(arrays['submap_cells'])
+    packed = list(_packed(arrays, PARAMS, Unpacked()))
+    assert len(packed) == len(two[0].arrays['submap_anchor'])
+    assert cells() is None
