@@ -26,6 +26,7 @@ from rlml_slam.slam.relocalization.grid_submap import possible, submap_of
 GATE_PROBABILITY = 0.9999  # of the gate of a match against the prior
 BEAM_STEP = 4  # of a scan that does not match, every n-th beam is traced through the grid
 MARGIN = 1e-4  # of a covariance that is never taken as shared
+LEAST = 1e-9  # information relative to that of the prior, below which there is none
 KNOWN = 1e-12  # [m², rad²] smallest eigenvalue of the covariance of a pose that is given
 POSE = np.arange(3)
 
@@ -82,14 +83,18 @@ def relative_update(cov: Array, shared: Array, root: Array, v: Array) -> tuple[A
     cov' = ((cov - shared)^-1 + I)^-1 + shared (a consider state, Schmidt 1966). What is returned
     has the same mean and covariance of the pose, and keeps that of all else positive definite.
     """
-    relative = np.linalg.inv(np.linalg.inv(cov - shared) + root.T @ root)
-    inverse = np.linalg.inv(relative + shared)
-    moved = inverse @ (relative @ (root.T @ v))
-    information = inverse - np.linalg.inv(cov)
-    values, axes = np.linalg.eigh(0.5 * (information + information.T))
+    L = np.linalg.cholesky(cov)  # from here on relative to cov, which is then the unit matrix
+    unit, inside = np.eye(3), np.linalg.solve(L, np.linalg.solve(L, shared).T)
+    H = root @ L
+    relative = np.linalg.inv(np.linalg.inv(unit - inside) + H.T @ H)
+    inverse = np.linalg.inv(relative + inside)
+    moved = inverse @ (relative @ (H.T @ v))
+    values, axes = np.linalg.eigh(0.5 * (inverse + inverse.T) - unit)
     values, axes = values[-len(v) :], axes[:, -len(v) :]
+    if values[-1] < LEAST:  # the match tells nothing that was not known
+        return np.zeros_like(root), np.zeros_like(v)
     scale = np.sqrt(np.maximum(values, 1e-9 * values[-1]))
-    return (axes * scale).T, (axes.T @ moved) / scale
+    return np.linalg.solve(L.T, axes * scale).T, (axes.T @ moved) / scale
 
 
 class GridLocalizer:

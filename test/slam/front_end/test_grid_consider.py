@@ -47,3 +47,19 @@ def test_of_a_pose_that_is_surer_only_a_part_is_shared():
     assert np.linalg.eigvalsh(cov - shared).min() > 0.0
     np.testing.assert_allclose(np.diag(shared), [0.9999e-6, 2e-4, 0.0], atol=1e-10)
     assert not at_most(SHARED, np.zeros((3, 3))).any()
+
+
+def test_pose_stays_finite_and_gets_no_less_sure_at_any_scale():
+    rng = np.random.default_rng(0)
+    for _ in range(2000):
+        A = rng.normal(size=(3, 3)) * 10.0 ** rng.uniform(-4.0, 1.0, 3)
+        cov = A @ A.T + 1e-12 * np.eye(3)
+        shared = at_most(SHARED * 10.0 ** rng.uniform(-4.0, 2.0), cov)
+        rank = int(rng.integers(1, 4))
+        root = rng.normal(size=(rank, 3)) * 10.0 ** rng.uniform(-4.0, 4.0, (rank, 1))
+        rows, values = relative_update(cov, shared, root, rng.normal(size=rank))
+        assert np.isfinite(rows).all()
+        assert np.isfinite(values).all()
+        # what the rows add is no more than what the match tells
+        gain = root @ cov @ root.T - rows @ cov @ rows.T
+        assert np.trace(gain) > -1e-6 * np.trace(root @ cov @ root.T)
