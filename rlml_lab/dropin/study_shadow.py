@@ -41,7 +41,9 @@ SYSTEM = ('slam', 'robot', 'amcl')
 
 def add_parser(subparsers: Any) -> None:
     """Declare ``rlml-lab study shadow``."""
-    parser = subparsers.add_parser('shadow', help='shadow mode beside another localization')
+    parser = subparsers.add_parser(
+        'shadow', help='in shadow mode beside another localization, live'
+    )
     parser.add_argument('--minutes', type=float, default=10.0, help='(default: %(default)s)')
 
 

@@ -47,7 +47,7 @@ def place(finding):
 def test_live_drive_names_what_is_not_as_planned(faulty, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv('ROS_DOMAIN_ID', str(DOMAIN))
     run, plan = tmp_path / 'run', tmp_path / 'plan'
-    assert main(['live', str(faulty), '--out', str(run), '--rate', '2']) == 0
+    assert main(['live', str(faulty), '--out', str(run)]) == 0
     main(['plan', 'room', '--out', str(plan), '--spacing', '0.5'])
     found = findings(capsys, run, '--plan', plan)
     assert [f['kind'] for f in found] == ['moved', 'hidden']

@@ -44,10 +44,10 @@ class PackedSubmap(Submap):
         """Unpack ``values``: Python asks here for what is not there."""
         if name != 'values':
             raise AttributeError(name)
-        self.values = self.cells().reshape(self.shape)
+        self.values = self.row_of_cells().reshape(self.shape)
         self._unpacked.add(self)
         return self.values
 
-    def cells(self) -> NDArray[np.uint16]:
+    def row_of_cells(self) -> NDArray[np.uint16]:
         """All cells (n,) in a row, which are not kept."""
         return np.frombuffer(bytearray(zlib.decompress(self._packed)), dtype=np.uint16)

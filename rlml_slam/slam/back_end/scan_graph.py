@@ -140,7 +140,7 @@ class ScanGraph:
         cells: Any
         if packed and len(packed) == len(maps):
             shapes = [m.shape for m in packed]
-            cells = Pieces(np.uint16, [m.cells for m in packed], [r * c for r, c in shapes])
+            cells = Pieces(np.uint16, [m.row_of_cells for m in packed], [r * c for r, c in shapes])
         else:
             shapes = [m.submap.values.shape for m in maps]
             rows = [m.submap.values.ravel() for m in maps]
