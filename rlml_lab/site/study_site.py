@@ -137,7 +137,7 @@ def map_session(
     """
     path = name_of(folder, k)
     asked = {'sessions': number, 'length': length, 'scans': scans, 'seed': seed}
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError, ValueError):  # none, or cut short
         known = json.loads(path.with_suffix('.json').read_text())
         if asked.items() <= known.items() and path.exists():
             return np.array(known['T_world_map'])
