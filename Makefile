@@ -21,10 +21,10 @@ MADE := $(VENV)/.made-for-$(ROS)
 # the wheels mark a process that has set itself up; another environment's Python must not see it
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: help env kernels demo test lint types docs ci tf config clean
+.PHONY: help env kernels demo test lint types docs ci tf s3 config clean
 
 help:  ## this list
-	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile | expand -t 16
+	@sed -n 's/^\([a-z0-9]*\):.*## /  make \1\t/p' Makefile | expand -t 16
 
 env: $(MADE)  ## make .venv, in which .venv/bin/rlml is the command
 	@echo "== $(VENV) is ready"
@@ -57,6 +57,10 @@ $(DOCS)/.made: $(wildcard requirements/docs-*.txt)
 	  $(PYTHON) -m venv --clear $(DOCS) && \
 	  $(DOCS)/bin/python -m pip --disable-pip-version-check --quiet install -r $$lock
 	@touch $@
+
+s3: env  ## install a server of S3 for tests into .venv
+	@lock=$$($(BIN)/python -c 'import sys; print("requirements/s3-python%d.%d.txt" % sys.version_info[:2])') && \
+	  $(BIN)/python -m pip --disable-pip-version-check --quiet install -r $$lock
 
 config: env  ## write config/*.yaml from the declared parameters
 	@for name in default simulator deformable_slam ekf_slam reflector_detector; do \

@@ -14,6 +14,7 @@ from typing import Any
 from fsspec.core import url_to_fs
 
 from rlml_slam.errors import BagError
+from rlml_slam.fleet.store_errors import naming
 
 METADATA = 'metadata.yaml'
 FILES = ('.bag', '.mcap')  # bags of one file
@@ -54,14 +55,12 @@ def find_bags(urls: Sequence[str]) -> list[Bag]:
 
 def _bags_below(url: str) -> list[Bag]:
     """The bags of one place."""
-    try:
+    with naming(url, 'cannot be read', BagError):
         fs, path = url_to_fs(url)
         path = path.rstrip('/')
         fixed = re.split(r'[*?[]', path, maxsplit=1)[0]
         places = [path] if fixed == path else [p.rstrip('/') for p in fs.glob(path)]
         found = {bag for place in places for bag in _bags_in(fs, place)}
-    except (ImportError, OSError, ValueError) as e:
-        raise BagError(f'{url}: cannot be read: {e}') from e
     root = posixpath.dirname(fixed) if fixed != path or path in found else path
     return [Bag(posixpath.relpath(p, root), _url(fs, p)) for p in found]
 

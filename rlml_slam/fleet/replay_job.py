@@ -21,11 +21,12 @@ from typing import Any
 from fsspec.core import url_to_fs
 
 import rlml_slam
-from rlml_slam.errors import ClusterError, RlmlError
+from rlml_slam.errors import BagError, ClusterError, RlmlError
 from rlml_slam.evaluation.relations import read_relations, relation_errors
 from rlml_slam.evaluation.run_record import Run
 from rlml_slam.fleet.bags import Bag, local_copy
 from rlml_slam.fleet.results import Record, Results
+from rlml_slam.fleet.store_errors import naming
 from rlml_slam.params import Parameters
 from rlml_slam.recordings.bag_replay import replay
 from rlml_slam.recordings.origin import digest_of
@@ -112,8 +113,9 @@ def failed(job: Job, why: str) -> Record:
 
 def _replay_bag(job: Job, scratch: Path) -> Record:
     began = time.perf_counter()
-    path = local_copy(job.bag.url, scratch)
-    relations = _relations(job.bag, scratch)
+    with naming(job.bag.url, 'cannot be fetched', BagError):
+        path = local_copy(job.bag.url, scratch)
+        relations = _relations(job.bag, scratch)
     digest = digest_of(path)
     key = job.key(digest + (digest_of(relations) if relations else ''))
     results = Results(job.out)

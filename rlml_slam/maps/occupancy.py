@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,29 +51,39 @@ def render(
     a cell is occupied from ``occupied_share`` of hits on: beams that graze a wall cross its
     cells more often than they end there. Raises MapError if the poses spread the grid too wide.
     """
-    ends, starts, counts = [], [], []
-    for pose, p, o in zip(poses, points, origins, strict=True):
-        if len(p):
-            ends.append(transform(pose, p))
-            starts.append(transform(pose, np.reshape(o, (1, 2))))
-            counts.append(len(p))
-    if not ends:
+    if not any(map(len, points)):
         return OccupancyGrid(resolution, (0.0, 0.0), np.full((1, 1), UNKNOWN, dtype=np.int8))
-    end = np.concatenate(ends)
-    start = np.repeat(np.concatenate(starts), counts, axis=0)
-    low = np.floor(np.minimum(end.min(0), start.min(0)) / resolution) - 1.0
-    high = np.floor(np.maximum(end.max(0), start.max(0)) / resolution) + 2.0
+    # one keyframe after the other: all end points at once would be the largest array of a site
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for start, end in _beams(poses, points, origins):
+        low = np.minimum(low, np.minimum(end.min(0), start))
+        high = np.maximum(high, np.maximum(end.max(0), start))
+    low = np.floor(low / resolution) - 1.0
+    high = np.floor(high / resolution) + 2.0
     columns, rows = float(high[0] - low[0]), float(high[1] - low[1])
     if not columns * rows <= MAX_CELLS:
         raise MapError(f'map of {columns:.0f} x {rows:.0f} cells is too large to be drawn')
     hits = np.zeros((int(rows), int(columns)), dtype=np.int32)
     visits = np.zeros_like(hits)
-    count_beams(hits, visits, start / resolution - low, end / resolution - low)
-    share = hits / np.maximum(visits, 1)
-    value = np.minimum(np.rint(share * (50.0 / occupied_share)), 100.0)
-    cells = np.where(visits == 0, UNKNOWN, value).astype(np.int8)
+    for start, end in _beams(poses, points, origins):
+        begin = np.repeat((start / resolution - low)[None], len(end), axis=0)
+        count_beams(hits, visits, begin, end / resolution - low)
+    cells = np.full(hits.shape, UNKNOWN, dtype=np.int8)
+    for row in range(len(cells)):
+        seen = visits[row] > 0
+        share = hits[row, seen] / visits[row, seen]
+        cells[row, seen] = np.minimum(np.rint(share * (50.0 / occupied_share)), 100.0)
     origin = (float(low[0]) * resolution, float(low[1]) * resolution)
     return OccupancyGrid(resolution, origin, cells)
+
+
+def _beams(
+    poses: Array, points: Sequence[NDArray[np.floating[Any]]], origins: Sequence[Array]
+) -> Iterator[tuple[Array, Array]]:
+    """Sensor (2,) and end points (n, 2) in the map of each keyframe that has a scan."""
+    for pose, p, o in zip(poses, points, origins, strict=True):
+        if len(p):
+            yield transform(pose, np.reshape(o, (1, 2)))[0], transform(pose, p)
 
 
 @kernel

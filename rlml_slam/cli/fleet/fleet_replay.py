@@ -70,6 +70,7 @@ def run(args: argparse.Namespace) -> int:
         Job(bag, params, out, code, args.system, not args.no_report, args.mcap)
         for bag in find_bags(args.bags)
     ]
+    results.try_to_write()
     with (
         open_client(args.cluster, args.jobs) as client,
         Progress('fleet', len(jobs), args.json) as bar,

@@ -54,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
         for name, p in params.items()
         for bag in bags
     ]
+    results.try_to_write()
     with (
         open_client(args.cluster, args.jobs) as client,
         Progress('sweep', len(jobs), args.json) as bar,
