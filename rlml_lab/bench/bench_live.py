@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     Simulator(world=args.world, rate=args.rate, duration=duration)
     Laser(rate=args.hz, beams=args.beams)
     with tempfile.TemporaryDirectory() as folder:
-        result = drive(source(args, duration), Path(folder), args.json)
+        result = drive(source(args, duration, folder), Path(folder), args.json)
     figures = metrics(result)
     scans = figures['inputs'].get('scan', {})
     arrived = sum(n for what, n in scans.items() if what not in ALSO_USED)
@@ -74,8 +74,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def source(args: argparse.Namespace, duration: float) -> Source:
-    """The simulator, which drives its route again and again."""
+def source(args: argparse.Namespace, duration: float, folder: str) -> Source:
+    """The simulator, which drives its route again and again; the map is saved in ``folder``."""
     return Source(
         'bench',
         'simulator',
@@ -86,7 +86,7 @@ def source(args: argparse.Namespace, duration: float) -> Source:
             'wait_for_subscribers': LISTENERS,
         },
         lambda recorder: recorder.elapsed() / duration,
-        {'laser_pose': list(Simulator().laser_pose)},
+        {'laser_pose': list(Simulator().laser_pose), 'map_directory': folder},
     )  # fmt: skip
 
 

@@ -13,7 +13,8 @@ from rlml_lab.bench.bench_live import text
 from rlml_lab.main import main
 
 
-def test_every_scan_that_is_sent_gets_its_pose(capsys):
+def test_every_scan_that_is_sent_gets_its_pose(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     arguments = ['bench', 'live', '--minutes', '0.17', '--hz', '20', '--beams', '360', '--json']
     assert main(arguments) == 0
     f = json.loads(capsys.readouterr().out)
@@ -27,6 +28,7 @@ def test_every_scan_that_is_sent_gets_its_pose(capsys):
     lines = text(f).splitlines()
     assert lines[0].startswith(f'{f["poses"]} scans sent, {f["poses"]} poses received, 0 scans')
     assert len(lines) == 6
+    assert list(tmp_path.iterdir()) == []  # no map is left where it was started
 
 
 @pytest.mark.parametrize(
