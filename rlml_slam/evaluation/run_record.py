@@ -7,13 +7,15 @@ Everything that is written and drawn is made from a Run.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rlml_slam import se2
 from rlml_slam.datasets.tum import Trajectory
+from rlml_slam.evaluation.ate import interpolate
 from rlml_slam.evaluation.scan_log import ScanLog
 from rlml_slam.maps.map_container import Content
 from rlml_slam.maps.occupancy import OccupancyGrid
@@ -22,6 +24,8 @@ from rlml_slam.se2 import Array
 from rlml_slam.slam.landmarks.reflector_states import ReflectorState
 from rlml_slam.types import Frame, Health, Level, Reflectors, Status
 from rlml_slam.version import __version__
+
+STANDS = 1e-6  # [m], [rad] below which the robot has not moved since the truth began
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,23 @@ class Truth:
     is_map: bool
     reflector_ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     reflectors: Array = field(default_factory=lambda: np.zeros((0, 2)))
+
+    def in_map_of(self, log: FrameLog) -> Truth:
+        """The truth in the map of a run, which may begin later than the truth.
+
+        A map has its origin at the first pose. Where the scans before it were lost, the robot has
+        moved since the recording began. Aligned where nobody knows how far.
+        """
+        if not self.is_map or not log.poses or np.any(log.poses[0]) or np.any(log.covs[0]):
+            return self  # of a map that was there before
+        at, known = interpolate(self.trajectory, np.array(log.stamps[:1]))
+        if not np.isfinite(at).all() or np.abs(at).max() < STANDS:
+            return self
+        if not known[0]:
+            return replace(self, is_map=False)
+        T = se2.inverse(at[0])
+        path = Trajectory(self.trajectory.stamps, se2.compose(T, self.trajectory.poses))
+        return replace(self, trajectory=path, reflectors=se2.transform(T, self.reflectors))
 
 
 @dataclass

@@ -259,17 +259,17 @@ class Recorder(Node):
     def run(self, name: str) -> Run:
         """Everything that was heard."""
         self.map.read()
-        stamps = np.array(sorted(self.true), dtype=np.int64)
+        stamps, log = np.array(sorted(self.true), dtype=np.int64), self._log()
         truth = None
         if len(stamps):
             path = Trajectory(stamps, np.array([self.true[t] for t in sorted(self.true)]))
             known = self._true_reflectors
             truth = (
                 Truth(path, True) if known is None else Truth(path, True, known.ids, known.points)
-            )
+            ).in_map_of(log)
         wall = 0.0 if self._began is None else self._heard - self._began
         return Run(
-            name, self._log(), self.trajectory(), self._reflectors, self.map.grid,
+            name, log, self.trajectory(), self._reflectors, self.map.grid,
             self.map.keyframes, self.map.closures, sum(u.rejected for u in self._updates),
             np.array([u.wall_ms for u in self._updates]),
             inputs=self.inputs(), truth=truth, wall_s=wall,
