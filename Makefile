@@ -55,12 +55,12 @@ $(DOCS)/.made: $(wildcard requirements/docs-*.txt)
 	@echo "== making $(DOCS) for the documentation"
 	@lock=$$($(PYTHON) -c 'import sys; print("requirements/docs-python%d.%d.txt" % sys.version_info[:2])') && \
 	  $(PYTHON) -m venv --clear $(DOCS) && \
-	  $(DOCS)/bin/python -m pip --disable-pip-version-check --quiet install -r $$lock
+	  $(DOCS)/bin/python -m pip --disable-pip-version-check --quiet install --no-compile -r $$lock
 	@touch $@
 
 s3: env  ## install a server of S3 for tests into .venv
 	@lock=$$($(BIN)/python -c 'import sys; print("requirements/s3-python%d.%d.txt" % sys.version_info[:2])') && \
-	  $(BIN)/python -m pip --disable-pip-version-check --quiet install -r $$lock
+	  $(BIN)/python -m pip --disable-pip-version-check --quiet install --no-compile -r $$lock
 
 config: env  ## write config/*.yaml from the declared parameters
 	@for name in default simulator deformable_slam ekf_slam reflector_detector; do \

@@ -57,3 +57,13 @@ def test_loss_of_the_prior_saturates_per_component():
     assert correlative_search.prior_loss(0.0, 0.0, 0.0, W, 3.0) == 0.0
     assert correlative_search.prior_loss(0.3, 0.0, 0.0, W, 3.0) == pytest.approx(0.5)
     assert correlative_search.prior_loss(1e6, 0.15, 0.1, W, 3.0) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize('far', [np.nan, np.inf, 1e16, 4.7e17, -1e19, 1e30, -1e300])
+@pytest.mark.parametrize('place', [0, 1])
+def test_pose_that_no_cell_can_have_meets_nothing(room, points, far, place):
+    """No integer holds it: what its cast to one gives had passed for a cell of the grid."""
+    pose = np.zeros(3)
+    pose[place] = far
+    with np.errstate(invalid='ignore'):
+        assert correlative_search.window(room, points, pose, 0.5, 0.1).score == P_MIN

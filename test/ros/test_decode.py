@@ -15,6 +15,7 @@ from rlml_slam.params import Reflector
 from rlml_slam.ros.codecs import decode, encode
 from rlml_slam.ros.codecs.message_types import Make, make_bag, make_rclpy, rclpy_class
 from rlml_slam.ros.codecs.point_cloud import build_cloud, read_cloud
+from rlml_slam.sensing.deskew import project
 from rlml_slam.types import ANONYMOUS, Detections, Health, Imu, Level, Scan
 
 NOISE = Reflector()
@@ -88,8 +89,16 @@ def test_stamp_that_is_not_positive_is_refused(make, stamp):
 
 def test_stamp_that_no_message_can_answer_is_refused(make):
     msg = encode.laser_scan(make, a_scan(stamp=1))
-    msg.header.stamp.sec, msg.header.stamp.nanosec = (1 << 31) - 1, 1_000_000_000
-    with pytest.raises(InputError, match=r'header\.stamp is 2147483648000000000 ns'):
+    msg.header.stamp.sec, msg.header.stamp.nanosec = (1 << 31) - 1, 999_999_999
+    with pytest.raises(InputError, match=r'header\.stamp is 2147483647999999999 ns'):
+        decode.scan(msg)
+
+
+@pytest.mark.parametrize('nanosec', [1_000_000_000, 2**32 - 1])
+def test_nanoseconds_of_a_second_or_more_are_refused(make, nanosec):
+    msg = encode.laser_scan(make, a_scan())
+    msg.header.stamp.nanosec = nanosec
+    with pytest.raises(InputError, match=f'scan: header.stamp.nanosec is {nanosec}, a second'):
         decode.scan(msg)
 
 
@@ -364,3 +373,12 @@ def test_diagnostics_give_level_and_reasons():
     assert status.level == bytes([1])
     assert status.message == 'scan is 210 ms late; saw 2 of 7 expected reflectors'
     assert [(v.key, v.value) for v in status.values] == [('scans', '3')]
+
+
+def test_ranges_below_zero_are_none_though_the_least_range_is_lower(make):
+    """As far below 0 as a float goes, their end points had no cell that an integer holds."""
+    msg = encode.laser_scan(make, a_scan())
+    msg.range_min, msg.ranges[2] = -3.4e38, -3.3e38
+    got = decode.scan(msg)
+    assert got.range_min == 0.0
+    assert np.abs(project(got, np.zeros(3), np.zeros(3), 30.0)).max() <= 30.0

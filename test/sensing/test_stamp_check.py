@@ -77,3 +77,11 @@ def test_clock_that_was_set_back_is_an_error():
         assert stamps.wrong_after('odom', newest - 10 * SECOND, newest) is None
     with pytest.raises(InputError, match=r'the clock of odom jumped back by 10\.0 s'):
         stamps.wrong_after('odom', newest - 10 * SECOND, newest)
+
+
+def test_random_stamps_far_ahead_confirm_nothing():
+    stamps, newest = running()
+    for k in range(4 * CONFIRM):
+        assert stamps.holds('imu', Imu(newest + (100 + 37 * (k % 5)) * SECOND, 0.0))
+        assert list(stamps.release_held(CONFIRM)) == []
+    assert stamps._inputs.totals() == {'imu': {'future': 4 * CONFIRM - 1}}

@@ -13,6 +13,8 @@ from rlml_slam.matching.scans.branch_and_bound import Candidate
 from rlml_slam.matching.scans.submap import LEVELS, P_MAX, P_MIN, Submap
 from rlml_slam.se2 import Array, wrap
 
+FARTHEST = 1e15  # [cells] beyond which nothing is in any grid
+
 
 def window(
     submap: Submap,
@@ -98,12 +100,13 @@ def search_window(
             px, py = points[k, 0], points[k, 1]
             u = (pose[0] + c * px - s * py) * scale - corner_j
             v = (pose[1] + s * px + c * py) * scale - corner_i
-            j, i = int(np.floor(u)) - reach, int(np.floor(v)) - reach
-            if j >= 0 and i >= 0 and j + 2 * reach < columns and i + 2 * reach < rows:
-                offsets[inside] = i * columns + j
+            # numbers that no integer holds, and NaN, are in no grid
+            left, low = np.floor(u) - reach, np.floor(v) - reach
+            if left >= 0 and low >= 0 and left + 2 * reach < columns and low + 2 * reach < rows:
+                offsets[inside] = int(low) * columns + int(left)
                 inside += 1
-            else:
-                add_block(values, j, i, stride, sums)
+            elif abs(left) < FARTHEST and abs(low) < FARTHEST:
+                add_block(values, int(left), int(low), stride, sums)
         for r in range(width):
             for q in range(width):
                 shift = (r * columns + q) * stride

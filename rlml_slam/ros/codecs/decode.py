@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rlml_slam.errors import InputError
 from rlml_slam.maps.occupancy import OccupancyGrid
-from rlml_slam.motion import MAX_VARIANCE
+from rlml_slam.motion import MAX_VARIANCE, SECOND
 from rlml_slam.params import Reflector
 from rlml_slam.ros.codecs.point_cloud import bounded, column, read_cloud
 from rlml_slam.se2 import Array
@@ -31,7 +31,8 @@ _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # (x, y, yaw) of ROS's 6 x 6 covariances
 _ROUNDING = 1e-9  # of the largest variance
 LARGEST_VARIANCE = 1e15  # [m^2], [rad^2] of what another node of this package sends
 LARGEST_SIGMA = 100.0  # [m], [rad] of a detection
-LAST_STAMP = (1 << 31) * 1_000_000_000  # [ns] seconds are 32 bits in a message
+# [ns] seconds are 32 bits in a message; transforms are published some seconds ahead
+LAST_STAMP = ((1 << 31) - 60) * SECOND
 FASTEST = 1e3  # [m/s], [rad/s]
 FARTHEST = 1e4  # [m] beyond any laser
 LARGE = 50  # rows of a covariance whose eigenvalues are not computed
@@ -83,7 +84,9 @@ def frame(frame_id: str) -> str:
 def stamp(msg: Any, topic: str) -> int:
     """The header's stamp [ns]; InputError if no clock can have it."""
     t = msg.header.stamp
-    ns = int(t.sec) * 1_000_000_000 + int(t.nanosec)
+    if int(t.nanosec) >= SECOND:  # a stamp up to 3.3 s ahead, which would be believed
+        raise InputError(f'{topic}: header.stamp.nanosec is {int(t.nanosec)}, a second or more')
+    ns = int(t.sec) * SECOND + int(t.nanosec)
     if not 0 < ns < LAST_STAMP:
         raise InputError(f'{topic}: header.stamp is {ns} ns')
     return ns
@@ -101,7 +104,8 @@ def size(msg: Any) -> int:
 def scan(msg: Any, topic: str = 'scan') -> Scan:
     """LaserScan; ranges are passed on as they are, NaN and Inf included.
 
-    A range_max of Inf says that the driver does not know it, not that Inf is a range.
+    A range_max of Inf says that the driver does not know it, not that Inf is a range; a range_min
+    below 0 makes no range of what is below 0.
     """
     ranges = np.array(msg.ranges, dtype=np.float32)
     intensities = np.array(msg.intensities, dtype=np.float32)
@@ -113,7 +117,7 @@ def scan(msg: Any, topic: str = 'scan') -> Scan:
         float(msg.angle_min),
         float(msg.angle_increment),
         float(msg.time_increment),
-        float(msg.range_min),
+        max(float(msg.range_min), 0.0),
         min(float(msg.range_max), FARTHEST),
         ranges,
         intensities,
@@ -314,4 +318,4 @@ def serialized_stamp(data: bytes, skipped: int = 0) -> int:
     # CDR: four bytes of encapsulation, then the header's stamp (int32 sec, uint32 nanosec)
     order = '<' if data[1] & 1 else '>'
     sec, nanosec = struct.unpack_from(f'{order}iI', data, 4 + skipped)
-    return int(sec) * 1_000_000_000 + int(nanosec)
+    return int(sec) * SECOND + int(nanosec)

@@ -59,8 +59,13 @@ class StampCheck:
     def holds(self, stream: str, message: Message) -> bool:
         """Hold a message back if its stamp is too far ahead; whether it is."""
         stamp = message.stamp
-        ahead = stamp - self.newest
-        if self.first is not None and ahead > MAX_AHEAD + 3 * self._step.get(stream, 0):
+        ahead, limit = stamp - self.newest, MAX_AHEAD + 3 * self._step.get(stream, 0)
+        if self.first is not None and ahead > limit:
+            # messages of one clock are near each other; random stamps confirm nothing
+            for other, held in self._held:
+                if abs(held.stamp - stamp) > limit:
+                    self._count_future(other, held.stamp)
+            self._held = [h for h in self._held if abs(h[1].stamp - stamp) <= limit]
             self._held.append((stream, message))
             self._num_passed = 0
             return True
@@ -85,12 +90,15 @@ class StampCheck:
                 yield stream, message
 
     def _is_reached(self, stream: str, message: Message) -> bool:
-        ahead = message.stamp - self.newest
-        if ahead <= MAX_AHEAD:
+        if message.stamp - self.newest <= MAX_AHEAD:
             return True
-        error = f'{stream} at {message.stamp} ns is {ahead / SECOND:.1f} s ahead of all '
-        self._inputs.count(stream, 'future', error + 'other stamps: rejected')
+        self._count_future(stream, message.stamp)
         return False
+
+    def _count_future(self, stream: str, stamp: int) -> None:
+        ahead = (stamp - self.newest) / SECOND
+        error = f'{stream} at {stamp} ns is {ahead:.1f} s ahead of all other stamps: rejected'
+        self._inputs.count(stream, 'future', error)
 
     def accept(self, stream: str, stamp: int, limit: int | None, source: str = '') -> bool:
         """Accept a stamp if it is after ``limit`` [ns]; else count it as late."""

@@ -210,10 +210,12 @@ class Synchronizer:
 def _invalid_geometry(scan: Scan) -> str:
     """Why a scan cannot be used, empty if it can."""
     n = len(scan.ranges)
-    geometry = (scan.angle_min, scan.angle_increment, scan.time_increment, scan.range_max)
+    geometry = (
+        scan.angle_min, scan.angle_increment, scan.time_increment, scan.range_min, scan.range_max,
+    )  # fmt: skip
     if n == 0:
         return 'it is empty'
-    if not np.all(np.isfinite(geometry)) or scan.angle_increment == 0.0:
+    if not np.all(np.isfinite(geometry)) or scan.angle_increment == 0.0 or scan.range_min < 0.0:
         return 'its angles, times or ranges are not valid'
     if not 0.0 <= sweep_time(scan) <= MAX_SWEEP:
         return (
