@@ -54,7 +54,7 @@ class ReflectorShapes:
         """
         self._forget(self._stamps < stamp - MEMORY)
         n = len(points)
-        before = self._nearest(points)
+        before = nearest_once(points, self._points)
         seen = before >= 0
         odds, view = rows[:, ODDS].copy(), np.arctan2(*(points - origin).T[::-1])
         odds[seen] += self._odds[before[seen]]
@@ -72,19 +72,6 @@ class ReflectorShapes:
         self._stamps = np.concatenate([self._stamps[kept], np.full(n, stamp, np.int64)])
         return np.asarray(odds + self.prior)
 
-    def _nearest(self, points: Array) -> NDArray[np.int64]:
-        """Index (n,) of the known reflector at each point, each once; -1 for none."""
-        out = np.full(len(points), -1)
-        if not len(self._points):
-            return out
-        distance = np.linalg.norm(points[:, None] - self._points, axis=-1)
-        for i in np.argsort(distance.min(axis=1)):
-            j = int(distance[i].argmin())
-            if distance[i, j] < NEAR:
-                out[i] = j
-                distance[:, j] = np.inf
-        return out
-
     def _forget(self, old: NDArray[np.bool_]) -> None:
         """Drop reflectors that are out of view; what they were is what others are likely to be."""
         for is_flat in (0, 1):
@@ -92,3 +79,17 @@ class ReflectorShapes:
             self._decided[is_flat] += np.sum(sign * self._odds[old] > DECIDED)
         self._points, self._odds = self._points[~old], self._odds[~old]
         self._views, self._stamps = self._views[~old], self._stamps[~old]
+
+
+def nearest_once(points: Array, known: Array) -> NDArray[np.int64]:
+    """Index (n,) of the known reflector at each point (n, 2), each once; -1 for none."""
+    out = np.full(len(points), -1)
+    if not len(known):
+        return out
+    distance = np.linalg.norm(points[:, None] - known, axis=-1)
+    for i in np.argsort(distance.min(axis=1)):
+        j = int(distance[i].argmin())
+        if distance[i, j] < NEAR:
+            out[i] = j
+            distance[:, j] = np.inf
+    return out
