@@ -9,14 +9,15 @@ import pytest
 from rlml_slam.sensing.reflectors.bright_spots import LIT
 from rlml_slam.sensing.reflectors.reflector_size import WIDTHS, ReflectorSize
 
-STEP = 2.0 * np.pi / 1440
 DIVERGENCE = 0.003
 PERIOD = 10**8  # [ns]
 
 
-def drive(size, diameter, flat_width, num_round, num_flat, seed=0, scans=120, speed=0.1):
+def drive(
+    size, diameter, flat_width, num_round, num_flat, seed=0, scans=120, speed=0.1, beams=1440
+):
     """Spots that a laser on a straight way sees of reflectors around it."""
-    rng = np.random.default_rng(seed)
+    rng, step = np.random.default_rng(seed), 2.0 * np.pi / beams
     points = rng.uniform([-2.0, -8.0], [14.0, 8.0], (num_round + num_flat, 2))
     points[:, 1] += np.where(points[:, 1] > 0.0, 1.5, -1.5)
     for k in range(scans):
@@ -28,21 +29,23 @@ def drive(size, diameter, flat_width, num_round, num_flat, seed=0, scans=120, sp
             np.arange(len(p)) < num_round, diameter, flat_width * np.abs(np.sin(bearing))
         )
         half = 0.5 * (width / r + DIVERGENCE)
-        first, last = np.ceil((bearing - half) / STEP), np.floor((bearing + half) / STEP)
+        first, last = np.ceil((bearing - half) / step), np.floor((bearing + half) / step)
         count = last - first + 1.0
-        spots = np.stack([r, count * r * STEP, r * STEP, 0.5 * (first + last)], -1)
+        spots = np.stack([r, count * r * step, r * step, 0.5 * (first + last)], -1)
         seen = count > 0
         size.add(k * PERIOD, p[seen], pose, spots[seen])
     return size.estimate()
 
 
+@pytest.mark.parametrize(
+    ('beams', 'num_flat'), [(720, 0), (1440, 0), (1440, 7), (7200, 0), (7200, 7)]
+)
 @pytest.mark.parametrize('given', [0.08, 0.3])
 @pytest.mark.parametrize('diameter', [0.05, 0.08, 0.12, 0.2])
-@pytest.mark.parametrize('num_flat', [0, 7])
-def test_the_size_of_cylinders_is_found_among_flat_reflectors(given, diameter, num_flat):
+def test_the_size_of_cylinders_is_found_among_flat_reflectors(beams, num_flat, given, diameter):
     """4 %: half of the distance between two widths of the table, and a bit of the noise."""
     size, divergence, sigma = drive(
-        ReflectorSize(given, DIVERGENCE), diameter, 1.5 * diameter, 10, num_flat
+        ReflectorSize(given, DIVERGENCE), diameter, 1.5 * diameter, 10, num_flat, beams=beams
     )
     assert size == pytest.approx(diameter, rel=0.04)
     assert divergence == pytest.approx(DIVERGENCE, abs=0.001)

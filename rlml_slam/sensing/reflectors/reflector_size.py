@@ -18,6 +18,7 @@ from rlml_slam.sensing.reflectors.reflector_shapes import MEMORY, VIEW, nearest_
 
 WIDEST = 0.6  # [m] of a reflector; wider surfaces are walls
 WIDTHS = np.geomspace(0.02, WIDEST, 60)  # [m]
+RATIO = float(WIDTHS[1] / WIDTHS[0])
 DIVERGENCES = np.array([0.001, 0.002, 0.003, 0.005, 0.008, 0.012, 0.016])  # [rad]
 STRAY = 0.05  # share of sightings with a lost beam, or a part of the reflector hidden
 ODD = 0.25  # share of reflectors of another size, or of none: a flat one looks narrower turned
@@ -37,7 +38,7 @@ class ReflectorSize:
         self._given = size, divergence
         self._divergences = np.append(DIVERGENCES, divergence)
         # a cylinder of the given diameter shines over LIT to all of it, to half a step of WIDTHS
-        half = math.sqrt(WIDTHS[1] / WIDTHS[0])
+        half = math.sqrt(RATIO)
         is_given = (LIT * size / half <= WIDTHS) & (size * half >= WIDTHS)
         self._by_given = GIVEN * is_given / max(is_given.sum(), 1)
         width = self._by_given + (1.0 - GIVEN) / len(WIDTHS)
@@ -81,11 +82,15 @@ class ReflectorSize:
     def _likelihood(self, spots: Array) -> Array:
         """Log of the likelihood (n, widths, divergences) of spots.
 
-        A thing of width W takes k beams that lie s apart with probability 1 - |k - W / s|.
+        A thing of width W takes k beams that lie s apart with probability 1 - |k - W / s|, here
+        blurred by the distance between two widths of the table. No beam, if it is narrower than
+        s, is no spot: what is seen has the rest of the probability, W / s.
         """
         r, width, spacing = (spots[:, k, None, None] for k in range(3))
         want = WIDTHS[:, None] + self._divergences * r
-        fits = np.maximum(1.0 - np.abs(width - want) / spacing, 0.0)
+        blurred = spacing + (RATIO - 1.0) * WIDTHS[:, None]
+        fits = np.maximum(1.0 - np.abs(width - want) / blurred, 0.0) * (spacing / blurred)
+        fits /= np.minimum(want / spacing, 1.0)
         out: Array = np.log((1.0 - STRAY) * fits + STRAY * np.minimum(spacing / WIDEST, 1.0))
         return out
 
