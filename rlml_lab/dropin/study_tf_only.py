@@ -5,7 +5,8 @@ Both have the same scans and the same odometry, and no IMU. Reflectors are those
 against those of the simulated detector, whose noise is another one: so a single pair of drives
 says little, and the mean of the logarithms of the ratios is what is tested. The frame of a map
 is the first pose: the few scans until the robot drives decide how far all of it is off. "Fitted"
-errors are those of path and reflectors after the path was laid onto the true one.
+errors are those of path and reflectors after the path was laid onto the true one. A reflector that
+one of both drives alone has found, such as one at grazing incidence, is not "of both".
 """
 
 from __future__ import annotations
@@ -19,11 +20,14 @@ from typing import Any
 import numpy as np
 
 from rlml_lab.support.parallel_jobs import add_workers, each, workers_of
+from rlml_slam import se2
 from rlml_slam.cli.simulate import write_bag
 from rlml_slam.evaluation.ate import trajectory_errors
-from rlml_slam.evaluation.metrics import metrics, reflector_figures
+from rlml_slam.evaluation.metrics import MATCH_RADIUS, metrics, reflector_figures
+from rlml_slam.evaluation.run_record import Run
 from rlml_slam.params import Parameters, SimulatorParameters, from_mapping
 from rlml_slam.recordings.bag_replay import replay
+from rlml_slam.se2 import Array
 from rlml_slam.simulation.simulation import Simulation
 from rlml_slam.simulation.world_file import load_world
 
@@ -31,6 +35,7 @@ WORLDS = ('hall', 'corridor', 'symmetric', 'yard', 'room')
 ERRORS = {
     'live_ate_rmse_m': 'live', 'ate_rmse_m': 'optimised', 'reflector_rmse_m': 'reflectors',
     'shape_m': 'optimised, fitted', 'reflector_shape_m': 'reflectors, fitted',
+    'both_m': 'reflectors of both', 'both_shape_m': 'reflectors of both, fitted',
 }  # fmt: skip
 LIMIT = 1.05  # of the errors with topics
 
@@ -78,7 +83,7 @@ def compare(world: str, seed: int, duration: float) -> dict[str, tuple[float, fl
     params = Parameters()
     without_imu = replace(params, node=replace(params.node, use_imu=False))
     with tempfile.TemporaryDirectory() as folder:
-        both = []
+        both, distances = [], []
         for name, given in (('topics', without_imu), ('tf', params)):
             bag = Path(folder) / name
             write_bag(Simulation(load_world(world), p), bag, tf_only=name == 'tf')
@@ -91,5 +96,19 @@ def compare(world: str, seed: int, duration: float) -> dict[str, tuple[float, fl
                 'reflector_shape_m': fitted['reflector_rmse_m'],
             }
             both.append(metrics(run) | shape)
+            frames = (np.zeros(3), fit.T_truth_map)
+            distances.append([distances_of(run, T) for T in frames])
+    is_of_both = np.isfinite(distances).all(axis=(0, 1))
+    for k, of_frames in enumerate(distances):
+        for error, d in zip(('both_m', 'both_shape_m'), of_frames, strict=True):
+            both[k][error] = float(np.sqrt(np.mean(d[is_of_both] ** 2)))
     names = (*ERRORS, 'reflectors_found', 'reflectors_spurious')
     return {name: (both[0][name], both[1][name]) for name in names}
+
+
+def distances_of(run: Run, T_truth_map: Array) -> Array:
+    """Distance [m] of each true reflector from the nearest of the map, NaN of one not found."""
+    assert run.truth is not None
+    points = se2.transform(T_truth_map, run.reflectors.points)
+    d = np.linalg.norm(points - run.truth.reflectors[:, None], axis=-1).min(axis=1)
+    return np.where(d <= MATCH_RADIUS, d, np.nan)

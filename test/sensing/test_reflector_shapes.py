@@ -104,6 +104,18 @@ def test_a_tilt_counts_once_from_each_view():
     assert odds[0] == pytest.approx(PRIOR + 2.0)
 
 
+def test_the_order_of_the_scans_of_a_view_does_not_matter():
+    """The first scan of a view is no better than the others: the mean of their tilts counts."""
+    tilts = np.random.default_rng(2).normal(0.0, 3.0, 8)
+    for order in (tilts, tilts[::-1], np.sort(tilts)):
+        shapes = ReflectorShapes()
+        for tilted in order:
+            odds = shapes.update(1, AWAY, HERE, rows(0.1, tilted))
+        assert odds[0] == pytest.approx(PRIOR + 0.8 + tilts.mean())
+    odds = shapes.update(2, AWAY, np.array([1.9, 1.0]), rows(0.0, 0.5))
+    assert odds[0] == pytest.approx(PRIOR + 0.8 + tilts.mean() + 0.5)
+
+
 def test_two_reflectors_side_by_side_are_two():
     shapes = ReflectorShapes()
     both = np.concatenate([AWAY, AWAY + np.array([0.0, 0.15])])

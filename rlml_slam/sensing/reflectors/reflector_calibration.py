@@ -28,11 +28,20 @@ from rlml_slam.sensing.reflectors.background_intensity import (
     opened,
     valid_beams,
 )
-from rlml_slam.sensing.reflectors.bright_spots import FATE, PEAK, RANGE, WIDTH, Fate, find
+from rlml_slam.sensing.reflectors.bright_spots import (
+    BEAM,
+    BEARING,
+    FATE,
+    PEAK,
+    RANGE,
+    WIDTH,
+    Fate,
+    find,
+)
+from rlml_slam.sensing.reflectors.reflector_size import DIVERGENCES, WIDEST, ReflectorSize
 from rlml_slam.sensing.reflectors.spot_settings import Beams, settings_of
 from rlml_slam.types import Scan
 
-WIDEST = 0.6  # [m] of a reflector; wider surfaces are walls
 FINE = 8  # bins of an octave of intensity
 BINS = 32 * FINE  # of intensity; from 2^-8 to 2^24 times the first one
 LOWEST = 2.0**-8
@@ -45,9 +54,6 @@ SCANS = 200  # newest ones whose range noise is remembered
 SPOTS = 2000  # newest bright spots that are remembered
 ENOUGH_SPOTS, ENOUGH_SCANS = 12, 8  # before anything is said
 PERIOD = 25  # scans between two estimates
-SIZES = np.geomspace(0.02, WIDEST, 40)  # [m]
-DIVERGENCES = np.array([0.001, 0.002, 0.003, 0.005, 0.008, 0.012, 0.016])  # [rad]
-AS_GOOD = 0.97  # share of the spots of the best size that another size has to explain
 NOISY = 0.05  # [m] of range noise at most
 TOLERANCE = 0.3  # of the size, by which it may be off
 
@@ -57,12 +63,13 @@ class Calibration:
     """The detector's parameters for a laser, and the diffuse intensity (OCTAVES,) by range.
 
     ``ratio`` is how many times as bright as that the dimmest tenth of the reflectors is, infinite
-    where all else has no intensity at all.
+    where all else has no intensity at all. ``sigma_size`` [m] is how well their size is known.
     """
 
     detector: Detector
     diffuse: Array
     ratio: float
+    sigma_size: float
 
     def floor(self, ranges: Array) -> Array:
         """Intensity (n,) below which nothing at these ranges is a reflector."""
@@ -87,14 +94,14 @@ class ReflectorCalibration:
             divergence=float(DIVERGENCES[-1]),
         )  # fmt: skip
         self._counts = np.zeros((OCTAVES, BINS + 1), np.int64)
-        # range, width, peak, and spacing of beams at that range; of the scans' number
-        self._spots: deque[tuple[float, float, float, float]] = deque(maxlen=SPOTS)
+        self._spots: deque[tuple[float, float]] = deque(maxlen=SPOTS)  # range and peak
+        self._size = ReflectorSize(max(params.diameter, params.flat_width), params.divergence)
         self._noise: deque[float] = deque(maxlen=SCANS)  # [m] of the newest scans
         self.num_scans = 0
         self.result: Calibration | None = None
 
-    def add(self, scan: Scan) -> None:
-        """One scan with intensities; now and then a new estimate."""
+    def add(self, scan: Scan, T_odom_laser: Array | None = None) -> None:
+        """One scan with intensities, from a pose (3,) in odom; now and then a new estimate."""
         self.num_scans += 1
         ranges, bright = valid_beams(scan)
         self._noise.append(range_noise(ranges))
@@ -114,9 +121,13 @@ class ReflectorCalibration:
         rows = find(beams, np.where(seen, bound, 0.0), settings)
         fates = rows[:, FATE].astype(np.int64)
         small = ~np.isin(fates, (Fate.DIM, Fate.FEW, Fate.RANGE, Fate.HIDDEN, Fate.FADING))
-        for row in rows[small & (rows[:, WIDTH] < WIDEST + rows[:, RANGE] * DIVERGENCES[-1])]:
-            r = float(row[RANGE])
-            self._spots.append((r, float(row[WIDTH]), float(row[PEAK]), r * step))
+        rows = rows[small & (rows[:, WIDTH] < WIDEST + rows[:, RANGE] * DIVERGENCES[-1])]
+        r, bearing = rows[:, RANGE], rows[:, BEARING]
+        self._spots.extend(zip(r, rows[:, PEAK], strict=True))
+        points = r[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], -1)
+        spots = np.stack([r, rows[:, WIDTH], r * step, rows[:, BEAM]], -1)
+        pose = np.zeros(3) if T_odom_laser is None else T_odom_laser
+        self._size.add(scan.stamp, points, pose, spots)
         if self.num_scans >= ENOUGH_SCANS and self.num_scans % PERIOD in (0, ENOUGH_SCANS):
             self.result = self.estimate()
 
@@ -138,14 +149,14 @@ class ReflectorCalibration:
 
     def estimate(self) -> Calibration | None:
         """What the spots have in common, None if they are too few."""
-        spots, diffuse = np.array(self._spots).reshape(-1, 4), self._diffuse()
+        spots, diffuse = np.array(self._spots).reshape(-1, 2), self._diffuse()
         level = diffuse_at(diffuse, spots[:, 0])
-        ratios = np.where(level > 0.0, spots[:, 2] / np.maximum(level, 1e-300), np.inf)
+        ratios = np.where(level > 0.0, spots[:, 1] / np.maximum(level, 1e-300), np.inf)
         out = ratios >= STANDS_OUT
         if out.sum() < max(ENOUGH_SPOTS, 0.02 * self.num_scans):
             return None
         ratio = float(np.quantile(ratios[out], 0.1, method='lower'))
-        size, divergence = self._size(spots[out])
+        size, divergence, sigma = self._size.estimate()
         # below the dimmest reflectors, and as far above everything white as they allow
         contrast = min(self._p.contrast, max(math.sqrt(ratio), BELOW * ratio))
         detector = replace(
@@ -158,29 +169,9 @@ class ReflectorCalibration:
         # each reflector shows by itself which of both shapes it has, unless all are flat
         diameter, flat_width = size if self._p.diameter > 0.0 else 0.0, size
         if self._p.diameter > 0.0 and self._p.flat_width > 0.0:
-            diameter, flat_width = self._p.diameter, self._p.flat_width
+            diameter, flat_width, sigma = self._p.diameter, self._p.flat_width, 0.0
         detector = replace(detector, diameter=diameter, flat_width=flat_width)
-        return Calibration(detector, diffuse, ratio)
-
-    def _size(self, spots: Array) -> tuple[float, float]:
-        """Size [m] and divergence [rad] that explain most spots: the given ones if they do.
-
-        A spot of n beams that lie ``spacing`` apart is between n - 1 and n + 1 of these wide.
-        """
-        r, width, spacing = spots[:, 0], spots[:, 1], spots[:, 3]
-
-        def explained(size: Array, divergence: Array) -> Array:
-            want = size[:, None, None] + divergence[:, None] * r
-            fits = (want >= width - spacing) & (want <= width + spacing)
-            return np.asarray(fits.mean(axis=-1))
-
-        found = explained(SIZES, DIVERGENCES)
-        given = max(self._p.diameter, self._p.flat_width)
-        if explained(np.array([given]), np.array([self._p.divergence])) >= AS_GOOD * found.max():
-            return given, self._p.divergence
-        good = np.argwhere(found >= 0.97 * found.max())
-        i, j = good[len(good) // 2]
-        return float(SIZES[i]), float(DIVERGENCES[j])
+        return Calibration(detector, diffuse, ratio, sigma)
 
 
 def calibrated(scans: Iterable[Scan], params: Detector) -> Calibration | None:

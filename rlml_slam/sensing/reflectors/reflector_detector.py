@@ -33,6 +33,8 @@ from rlml_slam.sensing.reflectors.spot_settings import Beams, settings_of
 from rlml_slam.sensing.reflectors.spot_shape import surface_depth
 from rlml_slam.types import ANONYMOUS, Detections, Scan
 
+# of a diameter: the mean of sqrt(R^2 - t^2) weighted by the power that comes back, 8 R / (3 pi)
+DEPTH = 4.0 / (3.0 * np.pi)
 SAME = 0.1  # [m] between two sightings of one reflector in one sweep
 
 
@@ -59,19 +61,22 @@ class Found:
     def __len__(self) -> int:
         return len(self.points)
 
-    def with_odds(self, odds: Array, diameter: float, shared: float = 1.0) -> Found:
+    def with_odds(
+        self, odds: Array, diameter: float, shared: float = 1.0, sigma_size: float = 0.0
+    ) -> Found:
         """The same where the odds of the shapes (n,) are better known.
 
         The range is the mean over the shapes, and its variance has what they differ by: with the
         share f of flat, f (1 - f) (r_flat - r_round)^2, times the scans that it is ``shared`` by.
+        So has what is open about the diameter, ``sigma_size`` [m], of which a cylinder's surface
+        is DEPTH on average before its centre.
         """
         rows, flat = self.rows, 1.0 / (1.0 + np.exp(-odds))
         r = rows[:, ROUND] + flat * (rows[:, FLAT] - rows[:, ROUND])
         u = np.stack([np.cos(rows[:, BEARING]), np.sin(rows[:, BEARING])], -1)
-        var = (
-            rows[:, VAR_RANGE]
-            + shared * flat * (1.0 - flat) * (rows[:, FLAT] - rows[:, ROUND]) ** 2
-        )
+        open_shape = flat * (1.0 - flat) * (rows[:, FLAT] - rows[:, ROUND]) ** 2
+        open_size = (1.0 - flat) * (DEPTH * sigma_size) ** 2
+        var = rows[:, VAR_RANGE] + shared * (open_shape + open_size)
         cov = polar_covariance(u, var, r**2 * rows[:, VAR_BEARING])
         diameters = np.where(odds > 0.0, np.nan, diameter)
         return replace(self, points=r[:, None] * u, cov=cov, diameters=diameters, odds=odds)

@@ -34,7 +34,8 @@ class ReflectorShapes:
 
     def __init__(self) -> None:
         self._points = np.zeros((0, 2))
-        self._odds = np.zeros(0)
+        self._odds = np.zeros(0)  # without the tilt in this view
+        self._tilts = np.zeros((0, 2))  # sum of TILTED and number of scans of this view
         self._views = np.zeros(0)
         self._stamps = np.zeros(0, np.int64)
         self._decided = np.array(EXPECTED)  # round and flat ones so far
@@ -42,53 +43,68 @@ class ReflectorShapes:
     @property
     def prior(self) -> float:
         """Log of the odds that a reflector of which nothing is known is flat."""
-        num_round = self._decided[0] + np.sum(self._odds < -DECIDED)
-        num_flat = self._decided[1] + np.sum(self._odds > DECIDED)
+        num_round = self._decided[0] + np.sum(self._known < -DECIDED)
+        num_flat = self._decided[1] + np.sum(self._known > DECIDED)
         return float(np.log(num_flat / num_round))
 
     def update(self, stamp: int, points: Array, origin: Array, rows: Array) -> Array:
         """Odds (n,) that reflectors are flat, by this scan and those before.
 
         ``points`` (n, 2) and the laser at ``origin`` (2,) are in odom, ``rows`` (n, COLUMNS) what
-        the scan shows. From one view a tilt is the same in all scans: it counts once.
+        the scan shows. From one view a tilt is the same in all scans: their mean counts, once.
         """
         self._forget(self._stamps < stamp - MEMORY)
         n = len(points)
-        before = self._nearest(points)
+        before = nearest_once(points, self._points)
         seen = before >= 0
         odds, view = rows[:, ODDS].copy(), np.arctan2(*(points - origin).T[::-1])
         odds[seen] += self._odds[before[seen]]
-        last = np.full(n, np.inf)
-        last[seen] = self._views[before[seen]]
+        last, tilts = np.full(n, np.inf), np.zeros((n, 2))
+        last[seen], tilts[seen] = self._views[before[seen]], self._tilts[before[seen]]
         with np.errstate(invalid='ignore'):
             is_new = ~(np.abs(se2.wrap(view - last)) < VIEW)
-        odds[is_new] += rows[is_new, TILTED]
+        odds[is_new] += _mean(tilts[is_new])
+        tilts[is_new] = 0.0
+        tilts += np.stack([rows[:, TILTED], np.ones(n)], -1)
         odds = np.clip(odds, -SURE, SURE)
         view[~is_new] = last[~is_new]
         kept = np.setdiff1d(np.arange(len(self._points)), before)
         self._points = np.concatenate([self._points[kept], points])
         self._odds = np.concatenate([self._odds[kept], odds])
+        self._tilts = np.concatenate([self._tilts[kept], tilts])
         self._views = np.concatenate([self._views[kept], view])
         self._stamps = np.concatenate([self._stamps[kept], np.full(n, stamp, np.int64)])
-        return np.asarray(odds + self.prior)
+        return np.asarray(np.clip(odds + _mean(tilts), -SURE, SURE) + self.prior)
 
-    def _nearest(self, points: Array) -> NDArray[np.int64]:
-        """Index (n,) of the known reflector at each point, each once; -1 for none."""
-        out = np.full(len(points), -1)
-        if not len(self._points):
-            return out
-        distance = np.linalg.norm(points[:, None] - self._points, axis=-1)
-        for i in np.argsort(distance.min(axis=1)):
-            j = int(distance[i].argmin())
-            if distance[i, j] < NEAR:
-                out[i] = j
-                distance[:, j] = np.inf
-        return out
+    @property
+    def _known(self) -> Array:
+        """Log of the odds (n,) of all reflectors seen lately."""
+        return np.asarray(self._odds + _mean(self._tilts))
 
     def _forget(self, old: NDArray[np.bool_]) -> None:
         """Drop reflectors that are out of view; what they were is what others are likely to be."""
         for is_flat in (0, 1):
             sign = 2 * is_flat - 1
-            self._decided[is_flat] += np.sum(sign * self._odds[old] > DECIDED)
+            self._decided[is_flat] += np.sum(sign * self._known[old] > DECIDED)
         self._points, self._odds = self._points[~old], self._odds[~old]
+        self._tilts = self._tilts[~old]
         self._views, self._stamps = self._views[~old], self._stamps[~old]
+
+
+def _mean(tilts: Array) -> Array:
+    """Mean TILTED (n,) of sums and numbers (n, 2), 0 of none."""
+    return np.asarray(tilts[:, 0] / np.maximum(tilts[:, 1], 1.0))
+
+
+def nearest_once(points: Array, known: Array) -> NDArray[np.int64]:
+    """Index (n,) of the known reflector at each point (n, 2), each once; -1 for none."""
+    out = np.full(len(points), -1)
+    if not len(known):
+        return out
+    distance = np.linalg.norm(points[:, None] - known, axis=-1)
+    for i in np.argsort(distance.min(axis=1)):
+        j = int(distance[i].argmin())
+        if distance[i, j] < NEAR:
+            out[i] = j
+            distance[:, j] = np.inf
+    return out

@@ -45,30 +45,32 @@ class ScanReflectors:
         """
         if self._mode == 'off' or len(scan.intensities) != len(scan.ranges):
             return None
-        detector, calibration = self._p, None
+        detector, calibration, sigma_size = self._p, None, 0.0
+        T_odom_laser = None if T_odom_base is None else se2.compose(T_odom_base, T_base_laser)
         if self._mode == 'auto':
-            calibration = self._calibrated(scan)
+            calibration = self._calibrated(scan, T_odom_laser)
             if calibration is None:
                 return None
-            detector = calibration.detector
+            detector, sigma_size = calibration.detector, calibration.sigma_size
         found = detect(scan, detector, None if calibration is None else calibration.floor)
-        if T_odom_base is not None:
+        odds, shared = found.odds, 1.0
+        if T_odom_laser is not None:
             points = found.at_stamp(scan, T_base_laser, sweep, once=False).points
-            T_odom_laser = se2.compose(T_odom_base, T_base_laser)
             points = se2.transform(T_odom_laser, points)
             odds = self._shapes.update(scan.stamp, points, T_odom_laser[:2], found.rows)
-            found = found.with_odds(odds, detector.diameter, SHARED)
+            shared = SHARED
+        found = found.with_odds(odds, detector.diameter, shared, sigma_size)
         self.num_scans += 1
         self.num_found += len(found)
         return found.at_stamp(scan, T_base_laser, sweep, sweep_cov)
 
-    def _calibrated(self, scan: Scan) -> Calibration | None:
+    def _calibrated(self, scan: Scan, T_odom_laser: Array | None) -> Calibration | None:
         laser = self._lasers.get(scan.frame_id)
         if laser is None:
             if len(self._lasers) >= MAX_LASERS or scan.angle_increment == 0.0:
                 return None
             laser = self._lasers[scan.frame_id] = ReflectorCalibration(self._p)
-        laser.add(scan)
+        laser.add(scan, T_odom_laser)
         return laser.result
 
     def __str__(self) -> str:
