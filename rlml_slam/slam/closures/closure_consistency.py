@@ -49,6 +49,8 @@ def is_consistent(
     i, j = nodes.T
     e = relative_pose(graph.poses[i], graph.poses[j], deltas)[0]
     alone = evidence(e, between.covs(i, j) + covs, 1.0, wrong)
+    # a weak match may not enter alone, wherever the graph expects it
+    alone = np.where(np.asarray(log_odds) < 0.0, np.minimum(alone, 0.0), alone)
     agree = _agreement(graph, between, nodes, deltas, covs, wrong)
     ranges, positions = np.broadcast_to(view_range, len(nodes)), graph.poses[:, :2]
     views = np.array([_num_viewpoints(positions, j[row], ranges[row]) for row in agree])

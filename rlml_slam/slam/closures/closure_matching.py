@@ -2,7 +2,8 @@
 """Scan match of a keyframe with a finished submap: branch and bound, refinement, verification.
 
 Verified by the score, by the ratio of the second-best score to the best one, and by the
-covariance: a scan has to constrain its pose in all directions.
+covariance: a scan has to constrain its pose in all directions. Where the drift is large, weak
+matches are searched for as well (weak_match.py).
 """
 
 from __future__ import annotations
@@ -15,13 +16,16 @@ from typing import NamedTuple
 import numpy as np
 
 from rlml_slam.matching.scans import scan_information
-from rlml_slam.matching.scans.branch_and_bound import Criteria, Window, wide
+from rlml_slam.matching.scans.branch_and_bound import Criteria, WideResult, Window, wide
 from rlml_slam.matching.scans.scan_match import linearize, match
 from rlml_slam.matching.scans.search_pyramid import Pyramid
+from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.closure_candidates import Candidate
+from rlml_slam.slam.closures.closure_consistency import REPEATED_WRONG
 from rlml_slam.slam.closures.keyframe_submap import WEAK_INFORMATION, KeyframeSubmap
+from rlml_slam.slam.closures.local_map import Surroundings, local_map
 from rlml_slam.slam.closures.loop_closure import Closure
 from rlml_slam.slam.keyframes import Keyframe
 
@@ -29,6 +33,8 @@ MAX_SIGMA = 1.0  # [m] largest standard deviation of the position of a match, in
 PYRAMIDS = (
     6  # search pyramids kept, more than are searched at a time: each is three times its submap
 )
+WEAK_SHARE = 0.85  # of the smallest score: below, wrong places of a local map score as well
+MAX_LOOKUPS = 5_000_000  # of a search for weak matches, which prunes less
 SEARCH_SIGMA = np.array([0.5, 0.5, 0.2])  # [m, m, rad] prior of the refinement at the best cell
 
 AMBIGUOUS, DEGENERATE = 'a second pose fits as well', 'the scan does not constrain one direction'
@@ -73,15 +79,32 @@ class SearchResult(NamedTuple):
     poses: Array
 
 
+class _Searched(NamedTuple):
+    """Grid that is searched, and its pyramid."""
+
+    submap: Submap
+    pyramid: Pyramid
+
+
 class ClosureMatcher:
     """Searches and verifies matches; caches the search pyramids of the latest submaps."""
 
     def __init__(self, params: Parameters) -> None:
         self._p = params
-        self._pyramids: OrderedDict[KeyframeSubmap, Pyramid] = OrderedDict()
+        self._searched: OrderedDict[tuple[KeyframeSubmap, bool], _Searched] = OrderedDict()
 
-    def match(self, candidate: Candidate, key: Keyframe, points: Array) -> SearchResult:
-        """Match ``points`` (n, 2) of a keyframe; a Closure as record of a rejected match."""
+    def match(
+        self,
+        candidate: Candidate,
+        key: Keyframe,
+        points: Array,
+        surroundings: Surroundings | None = None,
+    ) -> SearchResult:
+        """Match ``points`` (n, 2) of a keyframe; a Closure as record of a rejected match.
+
+        With ``surroundings``, a window that is wider than the smallest one is searched in the
+        local map, and for weak matches as well.
+        """
         p, m, guess = self._p.loop_closure, candidate.m, candidate.guess
         i, j = m.anchor.index, key.index
 
@@ -89,12 +112,10 @@ class ClosureMatcher:
             closure = Closure(i, j, guess, score, -1, why)
             return SearchResult(candidate, closure, np.array(poses).reshape(-1, 3))
 
-        result = wide(
-            self._pyramid(m),
-            points,
-            Window(guess, (candidate.window, candidate.window), candidate.angle),
-            Criteria(p.min_score, second_share=p.ambiguity_ratio),
-        )
+        if candidate.window <= p.search_window:
+            surroundings = None
+        submap, pyramid = self._grid(m, surroundings)
+        result = self._search(pyramid, candidate, points, surroundings is not None)
         if result.best is None:
             return rejected('no pose in the search window fits')
         if (
@@ -103,34 +124,56 @@ class ClosureMatcher:
         ):
             return rejected(AMBIGUOUS, result.best.score, result.best.pose, result.second.pose)
         prior = np.diag(1.0 / SEARCH_SIGMA**2)
-        found = match(
-            m.submap, points, result.best.pose, prior, self._p.scan_match, searched=False
-        )
-        if found.score < p.min_score:
+        found = match(submap, points, result.best.pose, prior, self._p.scan_match, searched=False)
+        if found.score < p.min_score and surroundings is None:
             return rejected('the score after refinement is too low', found.score)
-        information = scan_information.information(
-            m.submap, points, found.pose, self._p.scan_match
-        )
+        information = scan_information.information(submap, points, found.pose, self._p.scan_match)
         if _largest_variance(information) > MAX_SIGMA**2:
             return rejected(DEGENERATE, found.score, found.pose)
-        term = linearize(m.submap, points, found.pose)
+        term = linearize(submap, points, found.pose)
         second = math.nan if result.second is None else result.second.score / result.best.score
         overlap = term.inliers / max(term.count, 1)
         assert key.origin is not None
         view_range = float(np.median(np.hypot(*(points - key.origin).T)))
         fit = Match(
             m, key, found.pose, information, found.score, overlap, second, candidate.search_area,
-            view_range=view_range,
+            self._log_odds(min(result.best.score, found.score)), view_range=view_range,
         )  # fmt: skip
         return SearchResult(candidate, fit, found.pose[None])
 
-    def _pyramid(self, m: KeyframeSubmap) -> Pyramid:
-        if m not in self._pyramids:
-            self._pyramids[m] = Pyramid(m.submap)
-            if len(self._pyramids) > PYRAMIDS:
-                self._pyramids.popitem(last=False)
-        self._pyramids.move_to_end(m)
-        return self._pyramids[m]
+    def _search(
+        self, pyramid: Pyramid, candidate: Candidate, points: Array, weak_too: bool
+    ) -> WideResult:
+        """Best pose in the search window."""
+        p = self._p.loop_closure
+        half_width = candidate.window, candidate.window
+        window = Window(candidate.guess, half_width, candidate.angle)
+        usual = Criteria(p.min_score, second_share=p.ambiguity_ratio)
+        if not weak_too:
+            return wide(pyramid, points, window, usual)
+        # weak ones are not searched for a second pose: they need other viewpoints anyway
+        weak = Criteria(WEAK_SHARE * p.min_score, second_share=1.0, budget=MAX_LOOKUPS)
+        found = wide(pyramid, points, window, weak)
+        if found.complete and (found.best is None or found.best.score < p.min_score):
+            return found
+        strong = wide(pyramid, points, window, usual)
+        return found if strong.best is None else strong
+
+    def _log_odds(self, score: float) -> float:
+        """Prior log odds of a match by its score, eq. 58: 0, or negative for a weak one."""
+        least = self._p.loop_closure.min_score
+        return max(least - score, 0.0) / ((1.0 - WEAK_SHARE) * least) * math.log(REPEATED_WRONG)
+
+    def _grid(self, m: KeyframeSubmap, surroundings: Surroundings | None) -> _Searched:
+        """The submap, or its local map, with its search pyramid."""
+        name = m, surroundings is not None
+        if name not in self._searched:
+            submap = m.submap if surroundings is None else local_map(m, surroundings)
+            self._searched[name] = _Searched(submap, Pyramid(submap))
+            if len(self._searched) > PYRAMIDS:
+                self._searched.popitem(last=False)
+        self._searched.move_to_end(name)
+        return self._searched[name]
 
 
 def _largest_variance(information: Array) -> float:

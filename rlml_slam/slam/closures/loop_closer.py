@@ -3,7 +3,8 @@
 
 A closure that the scan match proposes passes four checks, each in a file of its own:
 
-1. verification of the match: score, ambiguity ratio, degeneracy (closure_matching.py);
+1. verification of the match: score, ambiguity ratio, degeneracy (closure_matching.py); after a
+   large drift weak ones remain, which need others (weak_match.py);
 2. no better placed match in another submap (closure_ambiguity.py);
 3. consistency with the graph, alone or with other closures (closure_consistency.py);
 4. monitoring after each solve: inconsistent ones are disabled (closure_monitor.py).
@@ -35,7 +36,9 @@ from rlml_slam.slam.closures.closure_monitor import ClosureMonitor
 from rlml_slam.slam.closures.closure_records import ClosureRecords
 from rlml_slam.slam.closures.constellation_closure import ConstellationMatch
 from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap, edge_of_match
+from rlml_slam.slam.closures.local_map import Surroundings
 from rlml_slam.slam.closures.loop_closure import Closure
+from rlml_slam.slam.closures.weak_match import keep_best
 from rlml_slam.slam.keyframes import Keyframe
 from rlml_slam.types import EdgeKind
 
@@ -74,21 +77,33 @@ class LoopCloser:
     def search(
         self, key: Keyframe, points: Array, submaps: Sequence[KeyframeSubmap]
     ) -> tuple[Closure, ...]:
-        """Closures of every n-th keyframe with ``points`` (n, 2), n the keyframe interval."""
+        """Closures of every n-th keyframe with ``points`` (n, 2), n the keyframe interval.
+
+        After a large drift, weak matches with the local map count as well.
+        """
         p = self._p.loop_closure
         self._num_scans += 1
         if not p.enabled or self._num_scans % p.keyframe_interval:
             return ()
-        return self.match(key, points, submaps)
+        return self._match(key, points, submaps, Surroundings(self._graph, submaps))
 
     def match(
         self, key: Keyframe, points: Array, submaps: Sequence[KeyframeSubmap]
     ) -> tuple[Closure, ...]:
         """Closures of a keyframe with ``points`` (n, 2) and the finished ``submaps`` near it."""
+        return self._match(key, points, submaps, None)
+
+    def _match(
+        self,
+        key: Keyframe,
+        points: Array,
+        submaps: Sequence[KeyframeSubmap],
+        around: Surroundings | None,
+    ) -> tuple[Closure, ...]:
         near = candidates(self._graph, key, submaps, self._p.loop_closure)
-        results = [self._matcher.match(candidate, key, points) for candidate in near]
+        results = [self._matcher.match(candidate, key, points, around) for candidate in near]
         ratio = self._p.loop_closure.ambiguity_ratio
-        return self._add(reject_ambiguous(self._graph, key, points, results, ratio))
+        return self._add(keep_best(reject_ambiguous(self._graph, key, points, results, ratio)))
 
     def confirm(
         self, proposed: ConstellationMatch, points: Array | None, submaps: Sequence[KeyframeSubmap]
