@@ -36,13 +36,14 @@ def is_consistent(
     wrong: Array,
     log_odds: Array | float = 0.0,
     view_range: Array | float = 0.0,
+    weak: NDArray[np.bool_] | bool = False,
 ) -> NDArray[np.bool_]:
     """Whether (k,) closures between poses (k, 2) that are not in the graph yet may be added.
 
     ``deltas`` (k, 3) with covariances ``covs`` (k, 3, 3) of their residuals; ``wrong`` (k,) is the
     log density of the errors of wrong matches, ``log_odds`` (k,) further evidence for each, and
-    ``view_range`` (k,) [m] the median range of each scan. Solves the graph for its covariances.
-    Raises SolverError like OnlineSolver.
+    ``view_range`` (k,) [m] the median range of each scan; ``weak`` (k,) are those of weak matches.
+    Solves the graph for its covariances. Raises SolverError like OnlineSolver.
     """
     graph, between = solver.graph, _RelativeCovariance(solver, np.unique(nodes))
     wrong = np.broadcast_to(wrong, len(nodes))
@@ -50,7 +51,7 @@ def is_consistent(
     e = relative_pose(graph.poses[i], graph.poses[j], deltas)[0]
     alone = evidence(e, between.covs(i, j) + covs, 1.0, wrong)
     # a weak match may not enter alone, wherever the graph expects it
-    alone = np.where(np.asarray(log_odds) < 0.0, np.minimum(alone, 0.0), alone)
+    alone = np.where(weak, np.minimum(alone, 0.0), alone)
     agree = _agreement(graph, between, nodes, deltas, covs, wrong)
     ranges, positions = np.broadcast_to(view_range, len(nodes)), graph.poses[:, :2]
     views = np.array([_num_viewpoints(positions, j[row], ranges[row]) for row in agree])

@@ -191,6 +191,7 @@ class LoopCloser:
             uniform(np.array([c.search_area for c in matches])),
             np.array([c.log_odds for c in matches]),
             np.array([c.view_range for c in matches]),
+            np.array([c.weak for c in matches]),
         )
         out = []
         for n, (c, is_added) in enumerate(zip(matches, consistent.tolist(), strict=True)):

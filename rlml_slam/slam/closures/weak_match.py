@@ -19,9 +19,9 @@ OUTSCORED = 'the keyframe has a better weak match'
 
 def keep_best(results: Sequence[Match | Closure]) -> list[Match | Closure]:
     """The results of one keyframe with at most one weak match: it has only one viewpoint."""
-    weak = [r for r in results if isinstance(r, Match) and r.log_odds < 0.0]
+    weak = [r for r in results if isinstance(r, Match) and r.weak]
     best = max(weak, key=lambda r: r.score, default=None)
     return [
-        r.closure(OUTSCORED) if isinstance(r, Match) and r.log_odds < 0.0 and r is not best else r
+        r.closure(OUTSCORED) if isinstance(r, Match) and r.weak and r is not best else r
         for r in results
     ]

@@ -122,7 +122,7 @@ def test_another_hall_does_not_match_the_local_map():
     for seed in range(4):
         model = mapped(hall(seed), (0.0, np.pi))
         found = searched(hall(seed + 100), across, model, True)
-        assert not isinstance(found, Match) or found.log_odds < 0.0
+        assert not isinstance(found, Match) or found.weak
 
 
 # --- weak matches in the graph ------------------------------------------------------------------
@@ -158,7 +158,8 @@ def entered(graph, nodes, shifts, rng, log_odds=WEAK):
     deltas = se2.between(true(nodes[:, 0]), off)
     deltas = se2.compose(deltas, SIGMA * rng.standard_normal(deltas.shape))
     covs = np.broadcast_to(COV, (len(nodes), 3, 3))
-    return is_consistent(OnlineSolver(graph), nodes, deltas, covs, WRONG, log_odds, 1.0)
+    weak = log_odds < 0.0
+    return is_consistent(OnlineSolver(graph), nodes, deltas, covs, WRONG, log_odds, 1.0, weak)
 
 
 @pytest.mark.parametrize('seed', range(8))
@@ -186,7 +187,18 @@ def test_of_the_weak_matches_of_a_keyframe_the_best_one_is_kept():
     place = KeyframeSubmap(key, Submap())
 
     def made(score, log_odds):
-        return Match(place, key, np.zeros(3), np.eye(3), score, 1.0, 0.5, 36.0, log_odds)
+        return Match(
+            place,
+            key,
+            np.zeros(3),
+            np.eye(3),
+            score,
+            1.0,
+            0.5,
+            36.0,
+            log_odds,
+            weak=log_odds < 0.0,
+        )
 
     weak, better, strong = made(0.48, -1.0), made(0.5, -0.5), made(LEAST, 0.0)
     out = keep_best([weak, strong, better])
