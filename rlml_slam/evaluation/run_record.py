@@ -25,7 +25,7 @@ from rlml_slam.slam.landmarks.reflector_states import ReflectorState
 from rlml_slam.types import Frame, Health, Level, Reflectors, Status
 from rlml_slam.version import __version__
 
-STANDS = 1e-6  # [m], [rad] below which the robot has not moved since the truth began
+MIN_MOTION = 1e-6  # [m], [rad] below which the robot has not moved since the truth began
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,12 @@ class Truth:
         """
         if not self.is_map or not log.poses or np.any(log.poses[0]) or np.any(log.covs[0]):
             return self  # of a map that was there before
-        at, known = interpolate(self.trajectory, np.array(log.stamps[:1]))
-        if not np.isfinite(at).all() or np.abs(at).max() < STANDS:
+        if log.stamps[0] <= self.trajectory.stamps[0]:
             return self
-        if not known[0]:
+        at, known = interpolate(self.trajectory, np.array(log.stamps[:1]))
+        if np.nanmax(np.abs(at)) < MIN_MOTION:
+            return self
+        if not known[0] or not np.isfinite(at).all():
             return replace(self, is_map=False)
         T = se2.inverse(at[0])
         path = Trajectory(self.trajectory.stamps, se2.compose(T, self.trajectory.poses))

@@ -18,7 +18,7 @@ def naming(url: str, what: str, kind: type[RlmlError] = MapError) -> Iterator[No
     """
     try:
         yield
-    except RlmlError:
-        raise
+    except (RlmlError, AssertionError, AttributeError, NameError, IndexError):
+        raise  # ours: said already, or a bug
     except Exception as e:
         raise kind(f'{url}: {what}: {e}') from e

@@ -59,3 +59,18 @@ def test_truth_that_is_unknown_at_the_first_pose_is_aligned():
     cut = Truth(path, True)
     first = truth.trajectory.stamps[8:]
     assert not cut.in_map_of(log_of(first, np.zeros((len(first), 3)))).is_map
+
+
+def test_truth_without_headings_is_aligned_where_the_map_begins_later():
+    truth = driven(np.random.default_rng(0))
+    path = Trajectory(truth.trajectory.stamps, truth.trajectory.poses * [1.0, 1.0, np.nan])
+    first = path.stamps[8:]
+    assert not Truth(path, True).in_map_of(log_of(first, np.zeros((len(first), 3)))).is_map
+
+
+def test_truth_that_begins_after_the_map_stays():
+    truth = driven(np.random.default_rng(0))
+    path = Trajectory(truth.trajectory.stamps + STEP // 2, truth.trajectory.poses + 0.1)
+    late = Truth(path, True)
+    first = truth.trajectory.stamps
+    assert late.in_map_of(log_of(first, np.zeros((len(first), 3)))) is late

@@ -8,7 +8,6 @@ import json
 import pytest
 from made_bags import simulated_bag
 
-from rlml_lab.fleet.stores import s3_server
 from rlml_slam.cli.main import main
 
 pytest.importorskip('distributed')
@@ -29,6 +28,8 @@ def test_bags_and_results_in_s3_give_the_same_table(tmp_path, capsys):
     (bags / 'r2').mkdir()
     (bags / 'r2/broken.mcap').write_text('nonsense')
     assert replay(capsys, bags, '--out', here)[0] == 1  # one is broken
+    from rlml_lab.fleet.stores import s3_server
+
     with s3_server():
         fs = fsspec.filesystem('s3')
         fs.mkdir('fleet')

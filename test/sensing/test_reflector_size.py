@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rlml_slam.sensing.reflectors.bright_spots import LIT
-from rlml_slam.sensing.reflectors.reflector_size import WIDTHS, ReflectorSize
+from rlml_slam.sensing.reflectors.reflector_size import MOST, WIDTHS, ReflectorSize
 
 DIVERGENCE = 0.003
 PERIOD = 10**8  # [ns]
@@ -84,3 +84,30 @@ def test_nothing_seen_leaves_the_parameters():
     found, divergence, sigma = size.estimate()
     assert (found, divergence) == (0.08, DIVERGENCE)
     assert sigma > 0.1
+
+
+def test_a_reflector_that_is_passed_again_and_again_is_not_many():
+    """Odometry has drifted meanwhile, and nobody knows that it is the same one."""
+    sigmas, size = [], ReflectorSize(0.3, DIVERGENCE)
+    step = 2.0 * np.pi / 1440
+    for k in range(400):
+        spot = np.array([[4.0, 5.0 * 4.0 * step, 4.0 * step, 10.5 + k % 2]])
+        size.add(k * 120 * PERIOD, np.array([[4.0, 0.0]]), np.array([50.0 * k, 0.0, 0.0]), spot)
+        if k in (100, 399):
+            sigmas.append(size.estimate())
+    assert sigmas[1] == pytest.approx(sigmas[0], rel=0.1)
+
+
+def test_no_more_reflectors_are_remembered_than_fit():
+    size, rng = ReflectorSize(0.08, DIVERGENCE), np.random.default_rng(0)
+    for k in range(30):
+        n = 150 if k % 2 else 30
+        spots = np.stack([np.full(n, 5.0), np.full(n, 0.09), np.full(n, 0.02), np.arange(n)], -1)
+        size.add(k * PERIOD, rng.uniform(-20.0, 20.0, (n, 2)), np.zeros(3), spots)
+        assert len(size._points) == size._seen.shape[1] <= MOST
+    assert np.isfinite(size.estimate()).all()
+
+
+@pytest.mark.parametrize('given', [0.01, 1.0])
+def test_given_size_that_the_table_lacks_holds_until_something_is_seen(given):
+    assert ReflectorSize(given, DIVERGENCE).estimate()[0] == given

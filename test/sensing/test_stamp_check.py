@@ -79,9 +79,23 @@ def test_clock_that_was_set_back_is_an_error():
         stamps.wrong_after('odom', newest - 10 * SECOND, newest)
 
 
-def test_random_stamps_far_ahead_confirm_nothing():
+def test_random_stamps_far_ahead_confirm_nothing_while_time_goes_on():
     stamps, newest = running()
     for k in range(4 * CONFIRM):
         assert stamps.holds('imu', Imu(newest + (100 + 37 * (k % 5)) * SECOND, 0.0))
         assert list(stamps.release_held(CONFIRM)) == []
+        assert stamps.accept('odom', newest + (k + 1) * STEP, stamps.newest_of('odom'))
     assert stamps._inputs.totals() == {'imu': {'future': 4 * CONFIRM - 1}}
+
+
+@pytest.mark.parametrize('gaps', [[1.2], [2.0], [2.0, 7.0, 1.5, 20.0]])
+def test_stream_that_is_slow_or_irregular_is_accepted(gaps):
+    stamps, stamp, accepted = StampCheck(InputCounts()), T0, []
+    for k in range(40):
+        message = Imu(stamp, 0.0)
+        found = [] if stamps.holds('scan', message) else [('scan', message)]
+        for stream, one in [*stamps.release_held(CONFIRM), *found]:
+            if stamps.accept(stream, one.stamp, stamps.newest_of(stream)):
+                accepted.append(one)
+        stamp += round(gaps[k % len(gaps)] * SECOND)
+    assert len(accepted) >= 40 - CONFIRM

@@ -25,13 +25,17 @@ ODD = 0.25  # share of reflectors of another size, or of none: a flat one looks 
 MOVED = 1.0  # beams by which a reflector has moved when its edges lie elsewhere between beams
 ROUNDING = 1e-9  # of a probability
 GIVEN = 0.5  # probability that parameters are right, before anything is seen
+MOST = 100  # reflectors that are remembered, the newest
+# reflectors out of view whose evidence counts: one that is passed again and again is a new one
+# each time, and what was taken for reflectors at the start has to fade
+LASTING = 30.0
 
 
 class ReflectorSize:
     """Probability of each width and divergence of the beam (eq. 57), from the spots of scans.
 
     A cylinder has one width from everywhere; one that has another in each view is odd, and says
-    nothing. So each reflector counts once, however many scans show it.
+    nothing. So each reflector counts once, however many scans show it until it is out of view.
     """
 
     def __init__(self, size: float, divergence: float) -> None:
@@ -40,11 +44,13 @@ class ReflectorSize:
         # a cylinder of the given diameter shines over LIT to all of it, to half a step of WIDTHS
         half = math.sqrt(RATIO)
         is_given = (LIT * size / half <= WIDTHS) & (size * half >= WIDTHS)
+        is_given[np.argmin(np.abs(WIDTHS - size))] = True  # it may be none of the table's
         self._by_given = GIVEN * is_given / max(is_given.sum(), 1)
         width = self._by_given + (1.0 - GIVEN) / len(WIDTHS)
         angle = np.append(np.full(len(DIVERGENCES), (1.0 - GIVEN) / len(DIVERGENCES)), GIVEN)
         self._given_share = self._by_given / width
-        self._total = np.log(width[:, None] * angle)  # with all reflectors that are out of view
+        self._prior = np.log(width[:, None] * angle)
+        self._total = self._prior  # with the reflectors that are out of view
         self._points, self._stamps = np.zeros((0, 2)), np.zeros(0, np.int64)
         self._beams, self._angles = np.zeros(0), np.zeros(0)
         # log likelihoods (n, widths, divergences): this view, those before, those before if odd
@@ -55,7 +61,7 @@ class ReflectorSize:
 
         ``spots`` (n, 4): range [m], width [m], spacing of beams [m] and the middle as a beam.
         """
-        points = se2.transform(T_odom_laser, points)
+        points, spots = se2.transform(T_odom_laser, points[:MOST]), spots[:MOST]
         before = nearest_once(points, self._points)
         known, was = np.flatnonzero(before >= 0), before[before >= 0]
         angles, beams = np.arctan2(*(points - T_odom_laser[:2]).T[::-1]), spots[:, 3].copy()
@@ -69,15 +75,20 @@ class ReflectorSize:
         beams[known[same]] = self._beams[was[same]]
         counts = np.setdiff1d(np.arange(len(points)), known[same])
         seen[0, counts] += self._likelihood(spots[counts])
-        unseen = np.setdiff1d(np.arange(len(self._points)), was)
-        is_old = self._stamps[unseen] < stamp - MEMORY
-        self._total += _of_reflectors(self._seen[:, unseen[is_old]])
-        kept = unseen[~is_old]
+        hidden = np.setdiff1d(np.arange(len(self._points)), was)
+        kept = hidden[np.argsort(-self._stamps[hidden], kind='stable')][: MOST - len(points)]
+        kept = np.sort(kept[self._stamps[kept] >= stamp - MEMORY])
+        self._leave(self._seen[:, np.setdiff1d(hidden, kept)])
         self._points = np.concatenate([self._points[kept], points])
         self._stamps = np.concatenate([self._stamps[kept], np.full(len(points), stamp, np.int64)])
         self._beams = np.concatenate([self._beams[kept], beams])
         self._angles = np.concatenate([self._angles[kept], angles])
         self._seen = np.concatenate([self._seen[:, kept], seen], axis=1)
+
+    def _leave(self, seen: Array) -> None:
+        """Count reflectors (3, n, widths, divergences) that are out of view."""
+        lasting = (1.0 - 1.0 / LASTING) ** seen.shape[1]
+        self._total = self._prior + lasting * (self._total - self._prior) + _of_reflectors(seen)
 
     def _likelihood(self, spots: Array) -> Array:
         """Log of the likelihood (n, widths, divergences) of spots.

@@ -40,6 +40,7 @@ class StampCheck:
         self._step: dict[str, int] = {}  # by stream: between its last two stamps
         self._num_behind = 0  # messages in a row that are far behind
         self._held: list[tuple[str, Message]] = []  # messages that are far ahead
+        self._held_after = self.newest  # when the last one was held
         self._num_passed = 0  # messages since the newest of these that were not
 
     def newest_of(self, stream: str) -> int | None:
@@ -61,11 +62,13 @@ class StampCheck:
         stamp = message.stamp
         ahead, limit = stamp - self.newest, MAX_AHEAD + 3 * self._step.get(stream, 0)
         if self.first is not None and ahead > limit:
-            # messages of one clock are near each other; random stamps confirm nothing
-            for other, held in self._held:
-                if abs(held.stamp - stamp) > limit:
-                    self._count_future(other, held.stamp)
-            self._held = [h for h in self._held if abs(h[1].stamp - stamp) <= limit]
+            if self.newest != self._held_after:
+                # time went on as before: random stamps far ahead confirm nothing
+                for other, held in self._held:
+                    if abs(held.stamp - stamp) > limit:
+                        self._count_future(other, held.stamp)
+                self._held = [h for h in self._held if abs(h[1].stamp - stamp) <= limit]
+            self._held_after = self.newest
             self._held.append((stream, message))
             self._num_passed = 0
             return True

@@ -127,7 +127,7 @@ class ClosureMatcher:
             return rejected(AMBIGUOUS, result.best.score, result.best.pose, result.second.pose)
         prior = np.diag(1.0 / SEARCH_SIGMA**2)
         found = match(submap, points, result.best.pose, prior, self._p.scan_match, searched=False)
-        if found.score < p.min_score and surroundings is None:
+        if found.score < p.min_score * (1.0 if surroundings is None else WEAK_SHARE):
             return rejected('the score after refinement is too low', found.score)
         information = scan_information.information(submap, points, found.pose, self._p.scan_match)
         if _largest_variance(information) > MAX_SIGMA**2:

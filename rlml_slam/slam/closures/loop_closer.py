@@ -85,7 +85,10 @@ class LoopCloser:
         self._num_scans += 1
         if not p.enabled or self._num_scans % p.keyframe_interval:
             return ()
-        return self._match(key, points, submaps, Surroundings(self._graph, submaps))
+        # the newest submaps surround the robot wherever it is
+        newest = 2 * self._p.back_end.submap_size
+        old = [m for m in submaps if m.anchor.index + newest <= key.index]
+        return self._match(key, points, submaps, Surroundings(self._graph, old))
 
     def match(
         self, key: Keyframe, points: Array, submaps: Sequence[KeyframeSubmap]
@@ -207,6 +210,7 @@ class LoopCloser:
             self.tried[False] -= self.records.remove_rejected(accepted)
             self._rejected -= accepted
         left = [c for c, added in zip(matches, consistent.tolist(), strict=True) if not added]
+        left.sort(key=lambda c: not c.weak)  # stable: of too many, weak ones go first
         self._pending = left[-MAX_PENDING:]
         return out
 
