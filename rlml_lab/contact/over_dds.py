@@ -7,6 +7,7 @@ import copy
 import math
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,15 +32,17 @@ START = 400.0  # [s] for processes to start, and their kernels to be compiled
 QOS = QoSProfile(depth=1000)
 BYTES = 0.05  # share of random bytes
 TOPICS = ('scan', 'odom', 'imu', 'reflectors')
+GOOD = 'good'  # namespace of what the simulator publishes
+BESIDE = -5_000_000, 5_000_000  # [ns] of a mutated message from the good one
 
 
 class Intruder(Node):
-    """Sends mutated messages of the present moment on the sensors' topics."""
+    """Passes the simulator's messages on to the sensors' topics, with mutated ones in between."""
 
     def __init__(self, seed: int) -> None:
         super().__init__('intruder')
         self._rng = np.random.default_rng(seed)
-        self._good = dict(stream_of_room(3.0))
+        self._good = dict(stream_of_room(3.0))  # the newest, by topic
         self.true: dict[int, Array] = {}
         self.poses: dict[int, Array] = {}
         self.refused: dict[str, str] = {}
@@ -47,9 +50,17 @@ class Intruder(Node):
         self._out = {
             topic: self.create_publisher(type(self._good[topic]), topic, QOS) for topic in TOPICS
         }
+        for topic in TOPICS:
+            use = partial(self.pass_on, topic)
+            self.create_subscription(type(self._good[topic]), f'{GOOD}/{topic}', use, QOS)
         self.create_subscription(PoseWithCovarianceStamped, 'pose', self.on_pose, QOS)
         self.create_subscription(Odometry, 'ground_truth', self.on_truth, QOS)
         self.create_subscription(DiagnosticArray, '/diagnostics', self.on_diagnostics, QOS)
+
+    def pass_on(self, topic: str, msg: Any) -> None:
+        """A good message, which the next mutated ones are made of."""
+        self._good[topic] = msg
+        self._out[topic].publish(msg)
 
     def on_pose(self, msg: Any) -> None:
         """A pose of the front end."""
@@ -74,8 +85,9 @@ class Intruder(Node):
             self._out[topic].publish(random_bytes(self._rng))
         else:
             msg = copy.deepcopy(self._good[topic])
-            sec, nanosec = divmod(max(self.true, default=0), 1_000_000_000)
-            msg.header.stamp.sec, msg.header.stamp.nanosec = sec, nanosec
+            # a stamp of its own, or it would be refused as a duplicate
+            stamp = decode.stamp(msg, topic) + int(self._rng.integers(*BESIDE))
+            msg.header.stamp.sec, msg.header.stamp.nanosec = divmod(stamp, 1_000_000_000)
             self._out[topic].publish(mutated(msg, self._rng))
         self.sent += 1
 
@@ -91,9 +103,9 @@ def drive(messages: int, rate: float, seed: int, log: Path, seconds: float) -> I
     ):
         values = {'map_directory': maps, 'laser_pose': list(Simulator().laser_pose)}
         children.start('slam', node('slam', values))
-        children.start(
-            'simulator', node('simulator', {'repeat': 'true', 'wait_for_subscribers': 1})
-        )
+        remap = [word for t in TOPICS for word in ('-r', f'{t}:={GOOD}/{t}')]
+        words = node('simulator', {'repeat': 'true', 'wait_for_subscribers': 1})
+        children.start('simulator', words + remap)
         intruder = Intruder(seed)
         executor = SingleThreadedExecutor()
         executor.add_node(intruder)

@@ -18,6 +18,7 @@ from rlml_slam.slam.closures.closure_consistency import is_consistent
 from rlml_slam.slam.closures.closure_matching import ClosureMatcher, Match
 from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap
 from rlml_slam.slam.closures.local_map import MAX_DRIFT, Surroundings, local_map
+from rlml_slam.slam.closures.loop_closer import MAX_PENDING, PENDING, LoopCloser
 from rlml_slam.slam.closures.weak_match import OUTSCORED, keep_best
 from rlml_slam.slam.keyframes import Keyframe
 from rlml_slam.types import EdgeKind
@@ -205,3 +206,41 @@ def test_of_the_weak_matches_of_a_keyframe_the_best_one_is_kept():
     assert out[1] is strong
     assert out[2] is better
     assert out[0].why == OUTSCORED
+
+
+def matched(graph, i, j, rng, shift=(0.0, 0.0, 0.0), weak=True):
+    """A match of keyframe j with the submap of keyframe i, off by ``shift`` and its noise."""
+    anchor, key = (Keyframe(k, k, graph.poses[k], np.eye(3), None, np.zeros(2), k) for k in (i, j))
+    delta = se2.between(true(i), se2.compose(np.array(shift), true(j)))
+    delta = se2.compose(delta, SIGMA * rng.standard_normal(3))
+    place = KeyframeSubmap(anchor, Submap(), size=1, T_anchor_grid=np.zeros(3))
+    return Match(
+        place, key, delta, np.diag(SIGMA**-2), 0.5, 0.9, 0.5, 36.0, WEAK if weak else 0.0,
+        view_range=1.0, weak=weak,
+    )  # fmt: skip
+
+
+def test_weak_matches_wait_until_others_agree():
+    rng = np.random.default_rng(0)
+    graph = two_laps(rng)
+    closer = LoopCloser(P, OnlineSolver(graph))
+    first = closer._add([matched(graph, 5, 5 + LAP, rng)])
+    assert [(c.accepted, c.why) for c in first] == [(False, PENDING)]
+    accepted = {c.j for k in range(10, 70, 5)
+                for c in closer._add([matched(graph, k, k + LAP, rng)]) if c.accepted}  # fmt: skip
+    assert 5 + LAP in accepted
+    assert len(accepted) > 8
+    assert all(c.j != 5 + LAP or c.accepted for c in closer.records)  # its rejection is gone
+
+
+def test_weak_matches_push_no_strong_one_out():
+    rng = np.random.default_rng(1)
+    graph = two_laps(rng)
+    closer = LoopCloser(P, OnlineSolver(graph))
+    far = (40.0, -30.0, 2.0)  # nothing agrees with it
+    closer._add([matched(graph, 5, 5 + LAP, rng, far, weak=False)])
+    for k in range(MAX_PENDING + 10):
+        shift = rng.uniform((-30.0, -30.0, -3.0), (30.0, 30.0, 3.0))
+        closer._add([matched(graph, k, k + LAP, rng, shift)])
+    assert len(closer._pending) == MAX_PENDING
+    assert [c.key.index for c in closer._pending if not c.weak] == [5 + LAP]
