@@ -17,7 +17,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from rlml_lab.contact.good_messages import stream_of_room
 from rlml_lab.contact.mutation import mutated, random_bytes
@@ -30,6 +30,7 @@ from rlml_slam.se2 import Array
 
 START = 400.0  # [s] for processes to start, and their kernels to be compiled
 QOS = QoSProfile(depth=1000)
+SENSOR = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 BYTES = 0.05  # share of random bytes
 TOPICS = ('scan', 'odom', 'imu', 'reflectors')
 GOOD = 'good'  # namespace of what the simulator publishes
@@ -52,7 +53,7 @@ class Intruder(Node):
         }
         for topic in TOPICS:
             use = partial(self.pass_on, topic)
-            self.create_subscription(type(self._good[topic]), f'{GOOD}/{topic}', use, QOS)
+            self.create_subscription(type(self._good[topic]), f'{GOOD}/{topic}', use, SENSOR)
         self.create_subscription(PoseWithCovarianceStamped, 'pose', self.on_pose, QOS)
         self.create_subscription(Odometry, 'ground_truth', self.on_truth, QOS)
         self.create_subscription(DiagnosticArray, '/diagnostics', self.on_diagnostics, QOS)
