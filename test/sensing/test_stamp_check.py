@@ -99,3 +99,14 @@ def test_stream_that_is_slow_or_irregular_is_accepted(gaps):
                 accepted.append(one)
         stamp += round(gaps[k % len(gaps)] * SECOND)
     assert len(accepted) >= 40 - CONFIRM
+
+
+def test_stream_that_is_late_as_a_whole_is_no_clock_that_was_set_back():
+    """All of a second and a half at once, after a pause of the network or of its driver."""
+    stamps, newest = running()
+    assert stamps.accept('imu', newest, None)
+    late = newest + STEP
+    assert stamps.accept('scan', newest + 3 * SECOND, None)
+    for k in range(4 * PERSISTENT):
+        assert stamps.wrong_after('imu', late + k * STEP, newest + 3 * SECOND) is None
+        assert stamps.accept('imu', late + k * STEP, stamps.newest_of('imu'))

@@ -128,7 +128,8 @@ class StampCheck:
     def wrong_after(self, stream: str, stamp: int, last_used: int | None) -> int | None:
         """Time [ns] after which stamps were wrong, if too many messages are far behind; or None.
 
-        InputError if such stamps were used already (``last_used``): the clock was set back.
+        InputError if such stamps were used already (``last_used``) and this stream went back: the
+        clock was set back. A stream that goes on, but behind the others, is merely late.
         """
         behind = self.newest - stamp
         if self.first is None or behind <= MAX_AHEAD:
@@ -139,6 +140,8 @@ class StampCheck:
             return None
         self._num_behind = 0
         if last_used is not None and last_used - stamp > MAX_AHEAD:
+            if self._newest_of.get(stream, stamp) < stamp:
+                return None
             raise InputError(f'the clock of {stream} jumped back by {behind / SECOND:.1f} s')
         return stamp + MAX_AHEAD
 
