@@ -26,7 +26,7 @@ from rlml_slam.cli.support.processes import Processes, free_domain
 from rlml_slam.errors import RlmlError
 from rlml_slam.params import Simulator
 from rlml_slam.ros.codecs import decode
-from rlml_slam.se2 import Array
+from rlml_slam.se2 import Array, compose, inverse
 
 START = 400.0  # [s] for processes to start, and their kernels to be compiled
 QOS = QoSProfile(depth=1000)
@@ -138,9 +138,13 @@ def _run(
 
 
 def figures(of: Intruder) -> tuple[float, float]:
-    """Poses per second of the simulator, and their root mean square error [m]."""
+    """Poses per second of the simulator, and their root mean square error [m].
+
+    The map begins where the first scan came, which may be later than the truth.
+    """
     stamps = sorted(of.poses.keys() & of.true.keys())
-    steps = [math.hypot(*(of.poses[t] - of.true[t])[:2]) for t in stamps]
+    start = compose(of.true[stamps[0]], inverse(of.poses[stamps[0]])) if stamps else np.zeros(3)
+    steps = [math.hypot(*(compose(start, of.poses[t]) - of.true[t])[:2]) for t in stamps]
     known = sorted(of.poses)
     if len(known) < 2:
         return 0.0, math.nan
