@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from made_laps import COV, LAP, true, two_laps
 from numpy.testing import assert_allclose
 
 from rlml_slam import se2
@@ -15,29 +16,12 @@ from rlml_slam.graph.robust.spanning_forest import SpanningForest
 from rlml_slam.slam.closures.closure_consistency import _RelativeCovariance, is_consistent
 from rlml_slam.types import EdgeKind
 
-SIGMA = np.array([0.02, 0.02, 0.005])
-STEP = 0.25  # [m] between two poses
-LAP = 80  # poses of a circle
 WRONG = uniform(6.0)
-COV = np.diag(np.array([0.02, 0.02, 0.005]) ** 2)
-
-
-def true(k):
-    phi = 2.0 * np.pi * np.asarray(k) / LAP
-    radius = STEP * LAP / (2.0 * np.pi)
-    return np.stack([radius * np.cos(phi), radius * np.sin(phi), se2.wrap(phi + np.pi / 2.0)], -1)
 
 
 @pytest.fixture(scope='module')
 def graph():
-    """Two laps by odometry alone."""
-    out, rng = Graph(), np.random.default_rng(3)
-    out.add_pose(true(0), fixed=True)
-    for k in range(1, 2 * LAP):
-        delta = se2.compose(se2.between(true(k - 1), true(k)), SIGMA * rng.standard_normal(3))
-        out.add_pose(se2.compose(out.poses[-1], delta))
-        out.add_edge(EdgeKind.ODOMETRY, k - 1, k, delta, np.diag(SIGMA**-2))
-    return out
+    return two_laps(np.random.default_rng(3))
 
 
 def tried(graph, ends, shift=(0.0, 0.0, 0.0), view_range=0.0):

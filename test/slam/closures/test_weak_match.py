@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from made_laps import COV, LAP, SIGMA, true, two_laps
 from made_worlds import TinyWorld, cast, polygon
 
 from rlml_slam import se2
@@ -128,28 +129,8 @@ def test_another_hall_does_not_match_the_local_map():
 
 # --- weak matches in the graph ------------------------------------------------------------------
 
-LAP, STEP = 80, 0.25  # poses of a circle, [m] between two
-SIGMA = np.array([0.02, 0.02, 0.005])
-COV = np.diag(SIGMA**2)
 WRONG = uniform(36.0)
 WEAK = np.log(0.1)  # prior log odds of the weakest matches
-
-
-def true(k):
-    phi = 2.0 * np.pi * np.asarray(k) / LAP
-    radius = STEP * LAP / (2.0 * np.pi)
-    return np.stack([radius * np.cos(phi), radius * np.sin(phi), se2.wrap(phi + np.pi / 2.0)], -1)
-
-
-def two_laps(rng):
-    """Two laps by odometry alone."""
-    out = Graph()
-    out.add_pose(true(0), fixed=True)
-    for k in range(1, 2 * LAP):
-        delta = se2.compose(se2.between(true(k - 1), true(k)), SIGMA * rng.standard_normal(3))
-        out.add_pose(se2.compose(out.poses[-1], delta))
-        out.add_edge(EdgeKind.ODOMETRY, k - 1, k, delta, np.diag(SIGMA**-2))
-    return out
 
 
 def entered(graph, nodes, shifts, rng, log_odds=WEAK):
