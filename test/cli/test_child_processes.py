@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import os
 import socket
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -100,7 +102,17 @@ def test_load_is_the_slope_of_what_was_sampled():
     assert usage(-1, 0.0) is None
 
 
-def test_taken_domain_is_not_free(monkeypatch):
+@pytest.fixture
+def reserved(monkeypatch):
+    """Domains that are free again after the test."""
+    held = []
+    monkeypatch.setattr(module, '_RESERVED', held)
+    yield held
+    for domain in held:
+        domain.close()
+
+
+def test_taken_domain_is_not_free(reserved):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         # the first domain whose port can be had here
         domain = next(d for d in range(1, 102) if module._is_free(7400 + 250 * d))
@@ -108,3 +120,25 @@ def test_taken_domain_is_not_free(monkeypatch):
         assert not module._is_free(7400 + 250 * domain)
         for _ in range(30):
             assert free_domain() != domain
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='domains are reserved on Linux only')
+def test_two_processes_never_have_one_domain(reserved):
+    held = {free_domain() for _ in range(40)}
+    assert len(held) == 40
+    ask = (
+        'from rlml_slam.cli.support.processes import free_domain\n'
+        'print(*(free_domain() for _ in range(20)), flush=True)\n'
+        'input()'
+    )
+    others = [
+        subprocess.Popen(
+            [sys.executable, '-c', ask], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        for _ in range(2)
+    ]
+    theirs = [int(d) for other in others for d in other.stdout.readline().split()]
+    for other in others:
+        other.communicate('end\n', timeout=60)
+    assert len(set(theirs)) == 40
+    assert not held & set(theirs)

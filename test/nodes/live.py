@@ -127,7 +127,7 @@ class Process:
         return self._process.returncode, out
 
     def close(self):
-        """End it, whatever happened before."""
+        """End it, whatever happened before; what it printed is shown where a test fails."""
         self._process.kill()
         if not self._process.stdout.closed:
-            self._process.communicate()
+            print(f'process {self._process.args[2]}:', self._process.communicate()[0])

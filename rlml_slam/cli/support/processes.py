@@ -19,6 +19,7 @@ from rlml_slam.errors import RlmlError
 
 GRACE = 5.0  # [s] in which a child has to end after SIGINT
 LAST_LINES = 15  # of a dead child's output are shown
+_RESERVED: list[socket.socket] = []  # by this process, one for each of its domains
 
 
 class Processes:
@@ -100,14 +101,32 @@ class Processes:
 
 
 def free_domain() -> int:
-    """A ROS domain whose discovery ports nobody on this machine has bound."""
+    """A ROS domain that nobody on this machine uses; this process has it until it ends."""
     domains = list(range(1, 102))  # beyond these the ports are those of outgoing connections
     random.SystemRandom().shuffle(domains)
     for domain in domains:
         # RTPS: 7400 + 250 domain for multicast, + 10 + 2 k for the unicast of participant k
-        if all(_is_free(7400 + 250 * domain + offset) for offset in (0, 10, 12, 14, 16)):
+        ports = [7400 + 250 * domain + offset for offset in (0, 10, 12, 14, 16)]
+        if all(map(_is_free, ports)) and _is_reserved(domain):
             return domain
     raise RlmlError('no free ROS domain on this machine')
+
+
+def _is_reserved(domain: int) -> bool:
+    """Keep other processes that ask for a domain from this one, before its nodes are there.
+
+    A name of Linux's abstract sockets is free again when its process ends, whatever ends it.
+    """
+    if not sys.platform.startswith('linux'):
+        return True
+    reserved = socket.socket(socket.AF_UNIX)
+    try:
+        reserved.bind(f'\0rlml_slam domain {domain}')
+    except OSError:
+        reserved.close()
+        return False
+    _RESERVED.append(reserved)
+    return True
 
 
 def _is_free(port: int) -> bool:
