@@ -57,8 +57,8 @@ class MessageGuard:
         self.refused[topic] += 1
         self.last = reason[:500]
         kind = (topic, NUMBERS.sub('#', self.last))
-        if kind in self._logged or len(self._logged) >= MAX_LOGGED:
-            return
+        if kind in self._logged or len(self._logged) >= MAX_LOGGED * (2 if trace else 1):
+            return  # what is to be reported has room of its own
         self._logged.add(kind)
         if trace:
             self._logger.error(f'not used: {self.last}; please report this:\n{trace}')

@@ -51,6 +51,23 @@ def test_message_is_given_to_its_use(node):
     assert guard_of(node).figures() == {}
 
 
+def test_error_that_nobody_expected_is_in_the_log_however_many_refusals_are(node):
+    def fail(_):
+        raise ZeroDivisionError
+
+    guard = guard_of(node)
+    for k in range(3 * MAX_LOGGED):
+        guard.refuse(f'topic {chr(65 + k)}', 'nonsense')
+    said = node.get_logger()
+    assert (len(said.warnings), said.errors) == (MAX_LOGGED, [])
+    listener(node, fail).accept(LaserScan())
+    assert len(said.errors) == 1
+    assert 'ZeroDivisionError' in said.errors[0]
+    for k in range(3 * MAX_LOGGED):
+        guard.report(f'topic {chr(65 + k)}', ZeroDivisionError())
+    assert len(said.errors) == MAX_LOGGED
+
+
 def test_large_message_is_refused_before_anything_is_made_of_it(node):
     used = []
     data = serialize_message(PoseArray(poses=[Pose()] * 20_000))
