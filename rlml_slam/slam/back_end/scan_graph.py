@@ -20,6 +20,7 @@ from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.back_end.keyframe_selection import leaves_submap
 from rlml_slam.slam.closures.keyframe_submap import TURN, KeyframeSubmap, edge_of_match
+from rlml_slam.slam.front_end.submaps import FAR
 from rlml_slam.slam.keyframes import Keyframe
 from rlml_slam.types import EdgeKind, Frame
 
@@ -101,11 +102,17 @@ class ScanGraph:
             self._finish(self._active.pop(0))
         if not self._active or (len(self._active) == 1 and self._active[0].size >= size // 2):
             self._active.append(KeyframeSubmap(key, Submap(self._p.submap)))
-        for m in self._active:
+        for m in tuple(self._active):
             # within one submap the front end's trajectory is smoother than the graph's
             T = se2.between(se2.compose(m.anchor.T_local, TURN), key.T_local)
             assert key.origin is not None
-            m.submap.insert(se2.transform(T, points), se2.transform(T, key.origin[None])[0])
+            placed = se2.transform(T, points), se2.transform(T, key.origin[None])[0]
+            if not all((np.abs(part) < FAR).all() for part in placed):
+                self._active.remove(m)  # the pose or the scan is wrong, and no grid spans that
+                if m.size:
+                    self._finish(m)
+                continue
+            m.submap.insert(*placed)
             m.size += 1
             m.centre = m.centre + (T[:2] - m.centre) / m.size
 

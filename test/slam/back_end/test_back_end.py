@@ -484,6 +484,26 @@ def test_submaps_end_where_the_motion_after_them_is_not_known():
     assert apart > known
 
 
+@pytest.mark.parametrize('spoiled', ['pose', 'point'])
+def test_no_submap_spans_a_pose_or_a_point_that_is_wrong(spoiled):
+    """A pose 1e6 m away that calls itself sure would make a grid of gigabytes."""
+    frames = frames_along(drive((0.6, 0.0, 12.0)))
+    half, away = len(frames) // 2, np.array([1e6, -1e6, 0.0])
+    for k, frame in enumerate(frames[half:], half):
+        if spoiled == 'pose':
+            frames[k] = replace(frame, T_local_base=frame.T_local_base + away)
+        elif k < half + 20:
+            points = np.vstack([frame.observation.points, [9e3, 0.0]])
+            frames[k] = replace(frame, observation=replace(frame.observation, points=points))
+    back_end, _ = run(frames)
+    before = len(back_end.scan_graph.finished)
+    back_end.scan_graph.finish_active()
+    sizes = [m.submap.values.size for m in back_end.scan_graph.finished]
+    assert len(sizes) > before > 0  # others begin behind it
+    assert 0 < min(sizes) <= max(sizes) < 1_000_000
+    assert back_end.keyframes[-1].stamp > frames[half + 20].stamp
+
+
 def test_edge_of_a_scan_that_leaves_a_direction_open_enters_the_graph():
     graph, floor = Graph(), np.array(Parameters().back_end.scan_edge_variance_floor)
     for pose in (np.zeros(3), np.array([1.0, 0.0, 0.2])):
