@@ -17,7 +17,7 @@ from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, Reliabilit
 
 from rlml_slam.errors import InputError
 from rlml_slam.params import Node, Parameters
-from rlml_slam.ros.codecs.decode import frame
+from rlml_slam.ros.codecs.decode import frame, known_stamp
 from rlml_slam.ros.codecs.device_reflectors import as_poses, is_device
 from rlml_slam.ros.codecs.message_types import rclpy_class
 from rlml_slam.ros.message_guard import SMALL, Listener, guard_of
@@ -235,7 +235,7 @@ class Sensors:
         if stream not in self._came:
             self._came.add(stream)
             self._logger.info(f'first {stream}{_place(msg)}')
-        if stream not in PLACED:
+        if stream not in PLACED or not _stamp(msg):  # which is refused, and waited for by none
             self._use(stream, msg)
             return
         if not self._waits:
@@ -350,9 +350,7 @@ def input_figures(synchronizer: Synchronizer) -> dict[str, object]:
 
 
 def _stamp(msg: Any, path: tuple[str, ...] = ()) -> int:
-    """The stamp of a message; of one of /tf that of its odometry, 0 without any."""
+    """The stamp of a message, of one of /tf that of its odometry; 0 without one to believe."""
     if hasattr(msg, 'transforms'):
         msg = next((t for t in msg.transforms if frame(t.child_frame_id) in path), None)
-        if msg is None:
-            return 0
-    return int(msg.header.stamp.sec) * 1_000_000_000 + int(msg.header.stamp.nanosec)
+    return 0 if msg is None else known_stamp(msg)

@@ -21,7 +21,7 @@ from rlml_slam.cli.support.recorder import Recorder  # noqa: E402
 from rlml_slam.maps.occupancy import OccupancyGrid  # noqa: E402
 from rlml_slam.motion import STILL  # noqa: E402
 from rlml_slam.ros.codecs import encode  # noqa: E402
-from rlml_slam.ros.codecs.frame_messages import build_record  # noqa: E402
+from rlml_slam.ros.codecs.frame_messages import build_points, build_record  # noqa: E402
 from rlml_slam.ros.codecs.message_types import make_rclpy as make  # noqa: E402
 from rlml_slam.ros.codecs.reflector_clouds import (  # noqa: E402
     build_associated,
@@ -99,6 +99,14 @@ def test_scan_is_paired_with_its_pose_by_stamp(recorder):
     answer.header.stamp.nanosec = 7
     recorder.on_pose(answer)
     assert len(recorder.latency_ms) == 1
+
+
+def test_points_whose_stamp_no_clock_has_are_of_no_pose(recorder):
+    for stamp in (SECOND, 2 * SECOND):
+        msg = build_points(make, stamp, 'base_link', np.ones((3, 2)))
+        msg.header.stamp.nanosec += SECOND * (stamp == SECOND)
+        recorder.on_points(serialize_message(msg))
+    assert list(recorder.frames.scans.stamps) == [2 * SECOND]
 
 
 def test_scans_outside_the_last_trajectory_have_their_live_poses(recorder):

@@ -16,12 +16,14 @@ from live import LATCHED, room
 
 from rlml_slam import se2
 from rlml_slam.errors import InputError, ParameterError
+from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.nodes.front_end import FrontEndNode
 from rlml_slam.ros.codecs import decode, encode
 from rlml_slam.ros.codecs.correction_message import build_correction
 from rlml_slam.ros.codecs.message_types import make_rclpy as make
 from rlml_slam.ros.codecs.message_types import rclpy_class
 from rlml_slam.ros.codecs.reflector_clouds import read_associated
+from rlml_slam.ros.message_guard import guard_of
 from rlml_slam.sensing.synchronization.synchronizer import CONFIRM
 from rlml_slam.slam.conversation import Correct
 from rlml_slam.types import Health, Level, Status
@@ -367,6 +369,21 @@ def test_clock_that_jumps_back_begins_anew(live, node):
     assert decode.stamp(live_frames(live)[-1], '') < 5 * SECOND
 
 
+@pytest.mark.parametrize('number', [0, 2**32, 2_147_483_647 * SECOND + 9])
+def test_map_with_a_number_that_no_request_has_spoils_no_pose(live, node, number):
+    feed(node, 2.0)
+    before = node.last.stamp
+    grid = OccupancyGrid(0.05, (0.0, 0.0), np.zeros((9, 9), dtype=np.int8))
+    with pytest.raises(InputError, match='rlml/localization_grid: '):
+        node.control.on_grid(encode.occupancy_grid(make, number, 'map', grid))
+    none = make('sensor_msgs/msg/PointCloud2', header=encode.header(make, number, 'map'))
+    with pytest.raises(InputError, match='rlml/localization_map: '):
+        node.control.on_map(none)
+    feed(node, 4.0)
+    assert node.last.stamp > before
+    assert not guard_of(node).refused
+
+
 # --- the place of the laser -----------------------------------------------------------------
 
 
@@ -384,6 +401,19 @@ def test_scans_wait_for_the_place_of_the_laser(live):
     n = len([1 for s, _ in scans if s == 'scan'])
     assert used(node, 'scan') >= n - 1
     np.testing.assert_allclose(node.last.observation.origin, [0.3, 0.1], atol=1e-6)
+
+
+@pytest.mark.parametrize('nanosec', [0, SECOND])
+def test_stamp_that_no_clock_has_ends_no_wait_for_the_place_of_the_laser(live, nanosec):
+    node = live.start(FrontEndNode, use_reflectors=False)
+    node.sensors._has_tf = node.sensors._waits = True
+    scans = [m for _, m in room(['/scan'], seconds=1.0)]
+    bad = copy.deepcopy(scans[0])
+    bad.header.stamp.sec, bad.header.stamp.nanosec = 0, nanosec
+    for msg in (bad, scans[0], bad, scans[1]):
+        node.sensors.add('scan', msg)
+    assert node.sensors._waits
+    assert node.sensors.synchronizer.inputs.totals()['scan'] == {'invalid': 2}
 
 
 @pytest.mark.skipif(

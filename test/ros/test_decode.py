@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import struct
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,6 +13,7 @@ from hypothesis import strategies as st
 from rlml_slam import se2
 from rlml_slam.errors import InputError
 from rlml_slam.maps.occupancy import OccupancyGrid
+from rlml_slam.motion import SECOND
 from rlml_slam.params import Reflector
 from rlml_slam.ros.codecs import decode, encode
 from rlml_slam.ros.codecs.message_types import Make, make_bag, make_rclpy, rclpy_class
@@ -100,6 +103,27 @@ def test_nanoseconds_of_a_second_or_more_are_refused(make, nanosec):
     msg.header.stamp.nanosec = nanosec
     with pytest.raises(InputError, match=f'scan: header.stamp.nanosec is {nanosec}, a second'):
         decode.scan(msg)
+
+
+@pytest.mark.parametrize(
+    ('sec', 'nanosec'), [(0, 0), (-5, 0), ((1 << 31) - 1, 0), (7, SECOND), (7, 2**32 - 1)]
+)
+def test_stamp_that_no_clock_has_orders_and_dates_nothing(make, sec, nanosec):
+    msg = encode.laser_scan(make, a_scan())
+    assert decode.known_stamp(msg) == decode.stamp_or_now(msg, 'scan') == STAMP
+    msg.header.stamp.sec, msg.header.stamp.nanosec = sec, nanosec
+    assert decode.known_stamp(msg) == 0
+    for head, order in ((b'\0\1\0\0', '<'), (b'\0\0\0\0', '>')):
+        data = head + struct.pack(f'{order}iI', sec, nanosec)
+        assert decode.serialized_stamp(data) == 0
+        assert decode.serialized_stamp(data[:-1]) == decode.serialized_stamp(b'') == 0
+        good = head + struct.pack(f'{order}IiI', 1, *divmod(STAMP, SECOND))
+        assert decode.serialized_stamp(good, 4) == STAMP
+    if not sec and not nanosec:
+        assert decode.stamp_or_now(msg, 'scan') == 0
+        return
+    with pytest.raises(InputError, match=r'scan: header\.stamp'):
+        decode.stamp_or_now(msg, 'scan')
 
 
 def test_leading_slash_of_a_frame_is_dropped(make):

@@ -236,6 +236,16 @@ def test_request_travels_exactly(kind):
     assert_equal(read_request(build_request(make_bag, want, 'map')), want, exact=True)
 
 
+def test_session_starts_at_no_stamp_that_no_clock_has():
+    start = StartSession(2, 1, 0, np.zeros(3), np.eye(3), 3)
+    msg = build_request(make_bag, start, 'map')
+    assert read_request(msg).stamp == 0  # now
+    for sec, nanosec in ((0, SECOND), (-1, 0)):
+        msg.header.stamp = make_bag('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec)
+        with pytest.raises(InputError, match=r'rlml/session_start: header\.stamp'):
+            read_request(msg)
+
+
 def test_request_that_is_not_finite_is_refused():
     msg = build_request(make_bag, Relocate(2, 1, 1, np.full(3, np.nan), np.eye(3)), 'map')
     with pytest.raises(InputError, match='not finite'):

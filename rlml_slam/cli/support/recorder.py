@@ -163,7 +163,7 @@ class Recorder(Node):
     def on_points(self, data: bytes) -> None:
         """The end points of one scan, serialized: few of them are looked into."""
         stamp = decode.serialized_stamp(data)
-        if self.frames.scans.is_due():
+        if stamp and self.frames.scans.is_due():
             points = read_points(deserialize_message(data, PointCloud2))
             self.frames.scans.add(stamp, points)
         else:
@@ -198,7 +198,7 @@ class Recorder(Node):
 
     def on_diagnostics(self, msg: DiagnosticArray) -> None:
         """Health of the front end, and the figures of both nodes."""
-        stamp = msg.header.stamp.sec * 1_000_000_000 + msg.header.stamp.nanosec
+        stamp = decode.known_stamp(msg)
         for status in msg.status:
             name = status.name.rsplit('/')[-1]
             self.figures[name] = {v.key: v.value for v in status.values}

@@ -84,9 +84,9 @@ class RobotSetup:
         heard = self.heard[stream]
         heard.arrivals.append(arrived)
         for part in getattr(msg, 'transforms', [msg]):
-            stamp = int(part.header.stamp.sec) * 10**9 + int(part.header.stamp.nanosec)
+            stamp = decode.known_stamp(part)  # a finding of its own where there is none
             heard.frames[decode.frame(part.header.frame_id)] += 1
-            if stream != 'tf_static':
+            if stream != 'tf_static' and stamp:
                 heard.ages.append(1e-9 * (now - stamp))
             if stream in (TF, 'tf_static'):
                 child = decode.frame(part.child_frame_id)

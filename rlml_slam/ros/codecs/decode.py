@@ -83,10 +83,26 @@ def frame(frame_id: str) -> str:
 
 def stamp(msg: Any, topic: str) -> int:
     """The header's stamp [ns]; InputError if no clock can have it."""
-    t = msg.header.stamp
-    if int(t.nanosec) >= SECOND:  # a stamp up to 3.3 s ahead, which would be believed
-        raise InputError(f'{topic}: header.stamp.nanosec is {int(t.nanosec)}, a second or more')
-    ns = int(t.sec) * SECOND + int(t.nanosec)
+    return _stamp(int(msg.header.stamp.sec), int(msg.header.stamp.nanosec), topic)
+
+
+def stamp_or_now(msg: Any, topic: str) -> int:
+    """The same; 0 of a message that is about now, whose stamp is not set."""
+    return stamp(msg, topic) if msg.header.stamp.sec or msg.header.stamp.nanosec else 0
+
+
+def known_stamp(msg: Any) -> int:
+    """The same; 0 where no clock can have it."""
+    try:
+        return stamp(msg, '')
+    except InputError:
+        return 0
+
+
+def _stamp(sec: int, nanosec: int, topic: str) -> int:
+    if nanosec >= SECOND:  # a stamp up to 3.3 s ahead, which would be believed
+        raise InputError(f'{topic}: header.stamp.nanosec is {nanosec}, a second or more')
+    ns = sec * SECOND + nanosec
     if not 0 < ns < LAST_STAMP:
         raise InputError(f'{topic}: header.stamp is {ns} ns')
     return ns
@@ -112,16 +128,10 @@ def scan(msg: Any, topic: str = 'scan') -> Scan:
     if intensities.size and intensities.shape != ranges.shape:
         raise InputError(f'{topic}: {len(intensities)} intensities for {len(ranges)} ranges')
     return Scan(
-        stamp(msg, topic),
-        frame(msg.header.frame_id),
-        float(msg.angle_min),
-        float(msg.angle_increment),
-        float(msg.time_increment),
-        max(float(msg.range_min), 0.0),
-        min(float(msg.range_max), FARTHEST),
-        ranges,
-        intensities,
-    )
+        stamp(msg, topic), frame(msg.header.frame_id), float(msg.angle_min),
+        float(msg.angle_increment), float(msg.time_increment), max(float(msg.range_min), 0.0),
+        min(float(msg.range_max), FARTHEST), ranges, intensities,
+    )  # fmt: skip
 
 
 def odometry(msg: Any, topic: str = 'odom') -> Odometry:
@@ -232,10 +242,8 @@ def start_pose(msg: Any, map_frame: str, topic: str = 'initialpose') -> PoseEsti
     least = float(np.linalg.eigvalsh(cov)[0])
     if least < -_ROUNDING * most:
         raise InputError(f'{where} has the eigenvalue {least:.3g}, below 0')
-    t = msg.header.stamp
-    time = 0 if int(t.sec) == int(t.nanosec) == 0 else stamp(msg, topic)
     pose = planar_pose(msg.pose.pose, f'{topic}: pose')
-    return PoseEstimate(time, map_frame, pose, cov)
+    return PoseEstimate(stamp_or_now(msg, topic), map_frame, pose, cov)
 
 
 def _planar_covariance(msg: Any, topic: str) -> Array:
@@ -314,8 +322,14 @@ def occupancy_grid(msg: Any, topic: str) -> OccupancyGrid | None:
 
 
 def serialized_stamp(data: bytes, skipped: int = 0) -> int:
-    """Stamp [ns] of a serialized message that begins with a header, after ``skipped`` bytes."""
-    # CDR: four bytes of encapsulation, then the header's stamp (int32 sec, uint32 nanosec)
-    order = '<' if data[1] & 1 else '>'
-    sec, nanosec = struct.unpack_from(f'{order}iI', data, 4 + skipped)
-    return int(sec) * SECOND + int(nanosec)
+    """Stamp [ns] of a serialized message that begins with a header, after ``skipped`` bytes.
+
+    0 where there is none, or none that a clock can have.
+    """
+    try:
+        # CDR: four bytes of encapsulation, then the header's stamp (int32 sec, uint32 nanosec)
+        order = '<' if data[1] & 1 else '>'
+        sec, nanosec = struct.unpack_from(f'{order}iI', data, 4 + skipped)
+        return _stamp(sec, nanosec, '')
+    except (struct.error, IndexError, InputError):
+        return 0

@@ -93,13 +93,9 @@ def read_record(msg: Any, topic: str = 'rlml/frames') -> Record:
         return value.reshape(3, 3) if value.size == 9 else value
 
     motion = Motion(
-        array('delta'),
-        array('cov'),
-        bool(r['known']),
-        array('bias_gain'),
-        float(r['bias']),
+        array('delta'), array('cov'), bool(r['known']), array('bias_gain'), float(r['bias']),
         float(r['bias_var']),
-    )
+    )  # fmt: skip
     odom_pose = None if np.isnan(r['odom_pose']).any() else array('odom_pose')
     origin = None if np.isnan(r['origin']).any() else array('origin')
     none = np.zeros(0, dtype=np.int64)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rlml_slam.ros.codecs import encode
-from rlml_slam.ros.codecs.decode import covariances, stamp
+from rlml_slam.ros.codecs.decode import covariances, stamp, stamp_or_now
 from rlml_slam.ros.codecs.message_types import Make
 from rlml_slam.ros.codecs.point_cloud import bounded, build_cloud, read_table
 from rlml_slam.slam.conversation import Relocate, StartSession
@@ -44,9 +44,8 @@ def read_request(msg: Any, topic: str = 'rlml/session_start') -> StartSession | 
     cov = np.array(r['cov'], dtype=np.float64).reshape(3, 3)
     bounded(pose, f'{topic}: the pose')
     covariances(cov, f'{topic}: the covariance')
-    # a request about the pose of now has no stamp
-    time = msg.header.stamp.sec * 1_000_000_000 + msg.header.stamp.nanosec
     number, session = int(r['number']), int(r['session'])
     if r['kind'] == START:
+        time = stamp_or_now(msg, topic)  # none where it is about the pose of now
         return StartSession(number, session, time, pose, cov, int(r['first_key']))
     return Relocate(number, session, stamp(msg, topic), pose, cov)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import heapq
-import struct
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
@@ -114,7 +113,8 @@ class BlackBox:
         newest = [self._received.pop() for _ in range(count)][::-1]
         queues: defaultdict[str, list[tuple[int, Received]]] = defaultdict(list)
         for r in newest:
-            queues[r.topic].append((_stamp(r), r))
+            is_tf = r.kind.endswith('TFMessage')  # its first transform has a header
+            queues[r.topic].append((serialized_stamp(r.data, 4 if is_tf else 0), r))
         known = {topic: k for k, topic in enumerate(topics)}
         ordered = sorted(queues, key=lambda topic: known.get(topic, len(known)))
         merged = heapq.merge(*(queues[topic] for topic in ordered), key=lambda item: item[0])
@@ -195,11 +195,3 @@ class BlackBox:
             self.write_if_due()
         self._worker.submit(lambda: None).result()
         self._worker.close()
-
-
-def _stamp(r: Received) -> int:
-    """Stamp [ns] of a message with a header, of /tf that of its first transform; else 0."""
-    try:
-        return serialized_stamp(r.data, 4 if r.kind.endswith('TFMessage') else 0)
-    except (struct.error, IndexError):
-        return 0

@@ -106,18 +106,15 @@ class FrontEndControl:
 
     def on_grid(self, msg: Any) -> None:
         """The grid of a map; one without cells is none."""
-        self._grids = {number_of(msg, 'rlml/localization_grid'): decode.occupancy_grid(
-            msg, 'rlml/localization_grid'
-        )}  # fmt: skip
+        topic = 'rlml/localization_grid'
+        self._grids = {number_of(msg, topic): decode.occupancy_grid(msg, topic)}
         self._use_map()
 
     def on_map(self, msg: Any) -> None:
         """The reflectors of a map; without fields, there is none to localize in."""
-        self._reflectors = {
-            number_of(msg, 'rlml/localization_map'): (
-                read_reflector_map(msg, 'rlml/localization_map') if msg.fields else None
-            )
-        }
+        topic = 'rlml/localization_map'
+        known = read_reflector_map(msg, topic) if msg.fields else None
+        self._reflectors = {number_of(msg, topic): known}
         self._use_map()
 
     def _use_map(self) -> None:
@@ -153,9 +150,9 @@ class FrontEndControl:
 
 def number_of(msg: Any, topic: str) -> int:
     """Number of a request, which is in the place of the stamp; InputError if there is none."""
-    number = int(msg.header.stamp.sec) * 1_000_000_000 + int(msg.header.stamp.nanosec)
-    if number <= 0:
-        raise InputError(f'{topic}: no number of a request in the place of the stamp')
+    number = decode.stamp(msg, topic)
+    if number >= 2**32:  # records have as many bits for it
+        raise InputError(f'{topic}: {number} in the place of the stamp is no number of a request')
     return number
 
 
