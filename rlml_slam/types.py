@@ -106,8 +106,8 @@ class Observation:
     the deskewed end points of the valid beams, ``origin`` (2,) the position of the laser; both
     None without a scan. ``scan`` is the raw sweep. ``odom_pose`` (3,) is the raw odometry at the
     stamp, None without odometry. ``points`` were computed with ``T_base_laser`` (3,) and
-    ``sweep`` (3,), the motion of base during the sweep. ``stamp_sigma`` [s] is the error of the
-    stamp, if the stamps have jitter.
+    ``sweep`` (3,), the motion of base during the sweep, with covariance ``sweep_cov`` (3, 3).
+    ``stamp_sigma`` [s] is the error of the stamp, if the stamps have jitter.
     """
 
     stamp: int
@@ -120,6 +120,7 @@ class Observation:
     T_base_laser: Array | None = None
     sweep: Array | None = None
     stamp_sigma: float = 0.0
+    sweep_cov: Array | None = None
 
 
 class Status(IntEnum):

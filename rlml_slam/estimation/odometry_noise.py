@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlml_slam import se2
 from rlml_slam.params import MotionNoise
@@ -40,7 +41,7 @@ class OdometryNoise:
         self._floors = np.array([noise.speed_noise_floor, noise.turn_noise_floor])
         self._slopes = np.array([noise.speed_noise, noise.turn_noise])
         self._sums = np.zeros((2, 2, 2))  # of a Q / S^2 and of Q^2 / S^2
-        self._applied: tuple[Array, Array, Array] | None = None
+        self._applied: tuple[Array, NDArray[np.int64], Array] | None = None
 
     @property
     def shares(self) -> Array:
@@ -54,16 +55,32 @@ class OdometryNoise:
         One that stands, but for what its wheels jitter, says nothing of how it drives.
         """
         motion, self._applied = observation.motion, None
-        moved = np.abs(motion.delta[AXES])
-        if not motion.known or not 0.0 < dt <= LONGEST or (moved < self._floors * dt).all():
+        fast = self._fast(motion.delta, dt)
+        if not motion.known or fast is None:
             return observation
-        fast = (self._slopes * moved > self._floors * dt).astype(int)
-        share = self.shares[[0, 1], fast]
         self._applied = motion.delta, fast, motion.cov[AXES, AXES]
+        return replace(observation, motion=replace(motion, cov=self._scaled(motion.cov, fast)))
+
+    def sweep_cov(self, observation: Observation, lasts: float) -> Array:
+        """Covariance (3, 3) of the motion in the sweep of ``lasts`` [s], with this noise."""
+        if observation.sweep is None or observation.sweep_cov is None:
+            return np.zeros((3, 3))
+        fast = self._fast(observation.sweep, lasts)
+        cov = observation.sweep_cov
+        return cov if fast is None else self._scaled(cov, fast)
+
+    def _fast(self, delta: Array, dt: float) -> NDArray[np.int64] | None:
+        """Whether each of AXES is fast, None for a robot that stands or a time that is odd."""
+        moved = np.abs(delta[AXES])
+        if not 0.0 < dt <= LONGEST or (moved < self._floors * dt).all():
+            return None
+        fast: NDArray[np.int64] = (self._slopes * moved > self._floors * dt).astype(np.int64)
+        return fast
+
+    def _scaled(self, cov: Array, fast: NDArray[np.int64]) -> Array:
         scale = np.ones(3)
-        scale[AXES] = np.sqrt(share)
-        cov = motion.cov * np.outer(scale, scale)
-        return replace(observation, motion=replace(motion, cov=cov))
+        scale[AXES] = np.sqrt(self.shares[[0, 1], fast])
+        return cov * np.outer(scale, scale)
 
     def learn(
         self, motion: Motion, before: tuple[Array, Array], after: tuple[Array, Array]

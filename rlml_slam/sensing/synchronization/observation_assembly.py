@@ -74,7 +74,7 @@ class ObservationAssembly:
         odom_pose = self._odom_pose(stamp)
         stale = self._stale_frames(group, odom_pose)
         scan: Scan | None = None
-        points = origin = detections = T = sweep = None
+        points = origin = detections = T = sweep = sweep_cov = None
         for w in group:
             if w.item.frame_id in stale:
                 self._inputs.count(w.stream, 'repeated')
@@ -99,7 +99,7 @@ class ObservationAssembly:
         sigma, white = errors
         motion = self._motion_to(stamp, white)
         return Observation(
-            stamp, motion, points, origin, detections, scan, odom_pose, T, sweep, sigma
+            stamp, motion, points, origin, detections, scan, odom_pose, T, sweep, sigma, sweep_cov
         )
 
     def _odom_pose(self, stamp: int) -> Array | None:

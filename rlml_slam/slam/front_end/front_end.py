@@ -102,7 +102,7 @@ class FrontEnd:
     ) -> ScanEvidence:
         """Update with the match in the submap, then in the grid of the saved map, if any."""
         scan = self._scans.update(observation, sweep, matches.agree_with_map)
-        self._map.update(self.state, observation)
+        self._map.update(self.state, observation, sweep)
         return scan
 
     def _contradicts_map(

@@ -20,7 +20,8 @@ from rlml_slam.matching.scans.scan_match import match
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
-from rlml_slam.slam.front_end.joint_state import JointState
+from rlml_slam.sensing.velocity_deskew import Sweep
+from rlml_slam.slam.front_end.joint_state import VELOCITY, JointState
 from rlml_slam.slam.relocalization.grid_submap import possible, submap_of
 
 GATE_PROBABILITY = 0.9999  # of the gate of a match against the prior
@@ -28,7 +29,7 @@ BEAM_STEP = 4  # of a scan that does not match, every n-th beam is traced throug
 MARGIN = 1e-4  # of a covariance that is never taken as shared
 LEAST = 1e-9  # information relative to that of the prior, below which there is none
 KNOWN = 1e-12  # [m², rad²] smallest eigenvalue of the covariance of a pose that is given
-POSE = np.arange(3)
+POSE_AND_SWEEP = np.r_[0:3, VELOCITY : VELOCITY + 3]
 
 
 @dataclass(frozen=True)
@@ -119,12 +120,18 @@ class GridLocalizer:
         far = math.hypot(step[0], step[1]) >= p.minimum_travel_distance
         return far or abs(float(step[2])) >= p.minimum_travel_heading
 
-    def update(self, state: JointState, points: Array) -> GridMatch:
-        """Match end points (n, 2), base frame, and update the state if the match is accepted."""
+    def update(self, state: JointState, points: Array, sweep: Sweep) -> GridMatch:
+        """Match end points (n, 2), base frame, and update the state if the match is accepted.
+
+        They constrain the pose at the middle of the ``sweep``, as in the scan term.
+        """
         p = self._p.scan_match
         points = voxel_filter.thin(points, p.voxel_size, p.max_points)
         submap, yaw = self._saved.submap, self._saved.yaw
-        prior, cov = self._saved.from_map(state.pose), state.pose_cov
+        J = np.hstack([np.eye(3), se2.rotation3(float(state.x[2])) * sweep.half])
+        middle = state.pose + J[:, 3:] @ (state.velocity - sweep.velocity)
+        prior = self._saved.from_map(middle)
+        cov = J @ state.P[np.ix_(POSE_AND_SWEEP, POSE_AND_SWEEP)] @ J.T
         strength = np.asarray(np.linalg.inv(cov + self._floor), dtype=np.float64)
         strength = se2.rotate_cov(strength, -yaw)
         found = match(submap, points, prior, strength, p, searched=False)
@@ -151,7 +158,7 @@ class GridLocalizer:
         shared = at_most(self._saved.cov_cell, cov)
         if shared.any():
             root, v = relative_update(cov, shared, root, v)
-        state.apply(POSE, root, np.eye(len(v)), v)
+        state.apply(POSE_AND_SWEEP, root @ J, np.eye(len(v)), v)
         self._last = state.pose
         weakest = self._p.health.degeneracy_sigma**-2
         return GridMatch(found.score, True, len(v) == 3 and float(values[0]) >= weakest)

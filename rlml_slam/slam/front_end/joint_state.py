@@ -31,6 +31,7 @@ SYSTEMATIC = slice(BIAS, DRIFT + 1)
 STANDING = np.zeros(2)
 GATE = 16.0  # squared sigmas of a bias beyond which the wheels slip
 MOVING = slice(VELOCITY, VELOCITY + 3)
+REGULAR = 1e-12  # [m², rad²] smallest eigenvalue of the covariance of a pose that is not given
 
 
 class JointState:
@@ -38,10 +39,10 @@ class JointState:
 
     In this order: the pose, the gyro's bias, the shares by which the robot's speed and turn
     exceed those that its wheels measure, the turn per distance [rad/m] that they do not measure,
-    the velocity (forward, left, turn) of the base, which a robot with odometry does not need
-    (:mod:`coasting`), two anchors, the reflectors; and ``extra`` rows, zero but while reflectors
-    are left out (:mod:`distant`): of what they depend on, the rows ``tied``, those that are
-    nothing else any more.
+    the velocity (forward, left, turn) of the base, or where there is odometry the error of what it
+    measured during the newest sweep (:meth:`begin_sweep`), two anchors, the reflectors; and
+    ``extra`` rows, zero but while reflectors are left out (:mod:`distant`): of what they depend
+    on, the rows ``tied``, those that are nothing else any more.
     """
 
     def __init__(
@@ -130,6 +131,30 @@ class JointState:
             motion.drift_gain, went, walk, kept, self._wheels2,
         )  # fmt: skip
 
+    def begin_sweep(self, cov: Array) -> None:
+        """A sweep begins here, in which odometry errs by the covariance (3, 3) (eq. 59).
+
+        The end points were de-skewed with that odometry, so they constrain the pose plus half of
+        its error; and the next motion has all of it.
+        """
+        self.x[MOVING] = 0.0
+        self.P[MOVING, :] = self.P[:, MOVING] = 0.0
+        self.P[MOVING, MOVING] = cov
+
+    def end_sweep(self, heading: float, share: float, cov: Array) -> None:
+        """Move the pose by a ``share`` of the sweep that began at a ``heading``, as odometry errs.
+
+        The sweep's error had the covariance (3, 3). It is white: parts of it are independent, so
+        the noise of the motion that is to be added is less by ``share^2`` times that.
+        """
+        follow_sweep(self.x, self.P, heading, share)
+        if share < 1.0:
+            between = share * (1.0 - share) * cov
+            moved = se2.rotation3(heading) @ between
+            self.P[MOVING, MOVING] += between
+            self.P[:3, MOVING] -= moved
+            self.P[MOVING, :3] -= moved.T
+
     def corrected(self, motion: Motion) -> Motion:
         """A motion as it is by what is known now of how wheels and gyro err."""
         bias, speed, turn, drift = self.x[SYSTEMATIC].tolist()
@@ -196,6 +221,11 @@ class JointState:
         P[BIAS, BIAS] = self.P[BIAS, BIAS]
         P[WHEELS, WHEELS] = self.P[WHEELS, WHEELS]
         P[MOVING, MOVING] = self.P[MOVING, MOVING]
+        if np.linalg.eigvalsh(self.P[:3, :3])[0] > REGULAR:  # what it shares with the pose's error
+            part = np.linalg.solve(self.P[:3, :3], self.P[:3, MOVING]).T
+            P[MOVING, rows] = part @ cov[:3]
+            P[rows, MOVING] = P[MOVING, rows].T
+            P[MOVING, MOVING] += part @ (cov[:3, :3] - self.P[:3, :3]) @ part.T
         for a in ANCHORS:
             J, _ = se2.compose_jacobians(x[:3], se2.between(x[:3], x[a : a + 3]))
             P[a : a + 3, :] = J @ P[:3, :]
@@ -337,6 +367,28 @@ def predict(
             P[e] *= kept
             P[:, e] *= kept
             P[e, e] += (1.0 - kept * kept) * wheels2[k]
+
+
+@brief
+def follow_sweep(x: Array, P: Array, heading: float, share: float) -> None:
+    """Kernel of :meth:`JointState.end_sweep`, in place; what is left of the error stays."""
+    c, s = share * math.cos(heading), share * math.sin(heading)
+    v = VELOCITY
+    x[0] += c * x[v] - s * x[v + 1]
+    x[1] += s * x[v] + c * x[v + 1]
+    x[2] = wrapped(x[2] + share * x[v + 2])
+    for k in range(len(x)):
+        P[0, k] += c * P[v, k] - s * P[v + 1, k]
+        P[1, k] += s * P[v, k] + c * P[v + 1, k]
+        P[2, k] += share * P[v + 2, k]
+    for k in range(len(x)):
+        P[k, 0] += c * P[k, v] - s * P[k, v + 1]
+        P[k, 1] += s * P[k, v] + c * P[k, v + 1]
+        P[k, 2] += share * P[k, v + 2]
+    for k in range(v, v + 3):
+        x[k] *= 1.0 - share
+        P[k] *= 1.0 - share
+        P[:, k] *= 1.0 - share
 
 
 @brief

@@ -13,6 +13,7 @@ from dataclasses import replace
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Parameters
+from rlml_slam.sensing.velocity_deskew import Sweep
 from rlml_slam.slam.front_end.grid_localization import GridLocalizer, GridMatch
 from rlml_slam.slam.front_end.joint_state import JointState
 from rlml_slam.slam.relocalization.grid_submap import is_mapped
@@ -49,13 +50,13 @@ class MapLocalization:
             return None
         return len(detections)
 
-    def update(self, state: JointState, observation: Observation) -> None:
+    def update(self, state: JointState, observation: Observation, sweep: Sweep) -> None:
         """Match the scan with the grid and update the state, once per keyframe distance."""
         points = observation.points
         if self._grid is None or points is None or len(points) < self._p.scan_match.min_points:
             return
         if self._grid.is_due(state.pose):
-            self.grid_match = self._grid.update(state, points)
+            self.grid_match = self._grid.update(state, points, sweep)
 
 
 class MapConfirmation:

@@ -17,14 +17,17 @@ from dataclasses import replace
 import numpy as np
 
 from rlml_slam import se2
+from rlml_slam.estimation.correction import positive
 from rlml_slam.estimation.odometry_noise import OdometryNoise
 from rlml_slam.params import MotionNoise, Parameters
 from rlml_slam.se2 import Array
+from rlml_slam.sensing.deskew import sweep_time
+from rlml_slam.sensing.velocity_deskew import Sweep
 from rlml_slam.slam.front_end.constant_velocity import ConstantVelocity
 from rlml_slam.slam.front_end.joint_state import STANDING, JointState
 from rlml_slam.slam.front_end.motion_hypotheses import FRESH, Hypothesis, MotionHypotheses
 from rlml_slam.slam.front_end.scan_update import relative
-from rlml_slam.types import Observation
+from rlml_slam.types import Motion, Observation
 
 # [ns] shortest time over which a velocity is computed. Scans that arrive in a burst are too close:
 # a pose error of 2 mm would be 0.4 m/s over 5 ms, and is .04 m/s over this time.
@@ -45,6 +48,7 @@ class MotionTerm:
         self._hypotheses = MotionHypotheses(params)
         self._odometry_noise = OdometryNoise(params.motion)
         self._predicted: tuple[Array, Array] | None = None  # pose in the submap, covariance
+        self._odometry = STANDING  # the newest motion that it measured
         self.stamp: int | None = None
         self.has_odometry = self.is_constant_velocity = False
         self.forget_velocity()
@@ -55,6 +59,8 @@ class MotionTerm:
         self._is_velocity_known = False
         self._hypotheses.forget()
         self._since: tuple[int, Array] | None = None  # stamp and pose of the last velocity
+        # time that is left of the newest sweep [s], covariance of what odometry errs by in it
+        self._sweep: tuple[float, Array] | None = None
 
     def hypotheses(self, observation: Observation) -> list[Hypothesis]:
         """What may have happened since the last observation, the odometry's motion first."""
@@ -62,6 +68,7 @@ class MotionTerm:
         if self.stamp is not None:
             dt = (observation.stamp - self.stamp) * 1e-9
             observation = self._odometry_noise.scaled(observation, dt)
+        self._odometry = observation.motion.delta
         return self._hypotheses.of(observation, velocity)
 
     def predict(self, state: JointState, observation: Observation) -> None:
@@ -76,8 +83,39 @@ class MotionTerm:
             return
         expected = expected_motion(self.velocity, dt, p) if motion.known else STANDING
         kept = math.exp(-dt / p.scale_error_time)
+        heading, share = float(state.x[2]), self._share_of_sweep(state, motion, dt)
+        if self._sweep is not None:
+            motion = replace(motion, cov=positive(motion.cov - share**2 * self._sweep[1]))
         state.predict(motion, p.imu_bias_walk**2 * dt, kept, expected)
+        if self._sweep is not None:
+            state.end_sweep(heading, share, self._sweep[1])
+        self._begin_sweep(state, observation, share, dt)
         self._predicted = relative(state.x, state.P)
+
+    def _share_of_sweep(self, state: JointState, motion: Motion, dt: float) -> float:
+        """Share of what is left of the newest sweep that this motion is; without odometry 0."""
+        if self._sweep is not None and (motion.delta is not self._odometry or not motion.known):
+            state.begin_sweep(np.zeros((3, 3)))
+            self._sweep = None
+        return 0.0 if self._sweep is None else min(dt / self._sweep[0], 1.0)
+
+    def _begin_sweep(
+        self, state: JointState, observation: Observation, share: float, dt: float
+    ) -> None:
+        """The sweep of the observation's scan, if it has one, takes the place of the last one."""
+        lasts = 0.0 if observation.scan is None else sweep_time(observation.scan)
+        if self.has_odometry and observation.scan is not None and lasts > 0.0:
+            cov = self._odometry_noise.sweep_cov(observation, lasts)
+            state.begin_sweep(cov)
+            self._sweep = lasts, cov
+        elif self._sweep is not None:
+            left, cov = self._sweep
+            self._sweep = (left - dt, (1.0 - share) * cov) if left > dt else None
+
+    @property
+    def sweep(self) -> Sweep:
+        """How an error of odometry in the newest sweep moves the match of its scan."""
+        return Sweep() if self._sweep is None else Sweep(half=np.full(3, 0.5))
 
     def corrected(self, state: JointState, observation: Observation) -> Observation:
         """The observation with its motion as estimated now; measures the velocity."""
@@ -90,7 +128,17 @@ class MotionTerm:
             now = relative(state.x, state.P)
             self._odometry_noise.learn(observation.motion, self._predicted, now)
             motion = state.corrected(observation.motion)
+            observation = self._placed(state, observation)
         return replace(observation, motion=motion)
+
+    def _placed(self, state: JointState, observation: Observation) -> Observation:
+        """The observation with its end points where its sweep is by the state as it is now."""
+        half = self.sweep.half * state.velocity
+        if observation.points is None or observation.origin is None or not half.any():
+            return observation
+        moved = se2.exp(half)
+        points, origin = se2.transform(moved, observation.points), observation.origin[None]
+        return replace(observation, points=points, origin=se2.transform(moved, origin)[0])
 
     def _measure_velocity(self, stamp: int, pose: Array) -> None:
         if self._since is None:

@@ -63,7 +63,7 @@ class ScanTerm:
         Twice: by the predicted velocity, then by that after a match of the first result.
         """
         if not self._motion.is_constant_velocity:
-            return observation, Sweep()
+            return observation, self._motion.sweep
         p, max_range = self._p.scan_match, self._p.submap.max_laser_range
         first, sweep = deskewed(observation, self._state.velocity, max_range)
         submap = self.submaps.target
