@@ -23,6 +23,10 @@ COMMANDS: Table = {
             'worlds': Command(
                 'rlml_lab.studies.study_worlds', 'accuracy and consistency over seeds and worlds'
             ),
+            'drift': Command(
+                'rlml_lab.faults.study_drift',
+                'growth of the heading error by distance, against its sigma',
+            ),
             'faults': Command(
                 'rlml_lab.faults.study_faults',
                 'faults put into a recording: error, health and cost of each',

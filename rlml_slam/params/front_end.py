@@ -181,7 +181,7 @@ class Submap(Group):
     p_hit: float = param(0.7, 'occupancy probability of a cell after one hit', '', 0.5, 0.99)
     p_miss: float = param(0.46, 'occupancy probability of a cell after one miss', '', 0.01, 0.5)
     bias_variance: tuple[float, ...] = param(
-        (1e-4, 1e-4, 2.25e-6),
+        (1e-4, 1e-4, 1.6e-5),
         'variance of the error of a submap, common to all scans matched against it',
         'm², m², rad²',
         0.0,

@@ -39,10 +39,9 @@ class JointState:
 
     In this order: the pose, the gyro's bias, the shares by which the robot's speed and turn
     exceed those that its wheels measure, the turn per distance [rad/m] that they do not measure,
-    the velocity (forward, left, turn) of the base, or where there is odometry the error of what it
-    measured during the newest sweep (:meth:`begin_sweep`), two anchors, the reflectors; and
-    ``extra`` rows, zero but while reflectors are left out (:mod:`distant`): of what they depend
-    on, the rows ``tied``, those that are nothing else any more.
+    the velocity (forward, left, turn) of the base, or with odometry its error in the newest sweep
+    (:func:`begin_sweep`), two anchors, the reflectors. Of the rows ``tied``, on which reflectors
+    depend that are left out, ``extra`` are nothing else.
     """
 
     def __init__(
@@ -131,30 +130,6 @@ class JointState:
             motion.drift_gain, went, walk, kept, self._wheels2,
         )  # fmt: skip
 
-    def begin_sweep(self, cov: Array) -> None:
-        """A sweep begins here, in which odometry errs by the covariance (3, 3) (eq. 59).
-
-        The end points were de-skewed with that odometry, so they constrain the pose plus half of
-        its error; and the next motion has all of it.
-        """
-        self.x[MOVING] = 0.0
-        self.P[MOVING, :] = self.P[:, MOVING] = 0.0
-        self.P[MOVING, MOVING] = cov
-
-    def end_sweep(self, heading: float, share: float, cov: Array) -> None:
-        """Move the pose by a ``share`` of the sweep that began at a ``heading``, as odometry errs.
-
-        The sweep's error had the covariance (3, 3). It is white: parts of it are independent, so
-        the noise of the motion that is to be added is less by ``share^2`` times that.
-        """
-        follow_sweep(self.x, self.P, heading, share)
-        if share < 1.0:
-            between = share * (1.0 - share) * cov
-            moved = se2.rotation3(heading) @ between
-            self.P[MOVING, MOVING] += between
-            self.P[:3, MOVING] -= moved
-            self.P[MOVING, :3] -= moved.T
-
     def corrected(self, motion: Motion) -> Motion:
         """A motion as it is by what is known now of how wheels and gyro err."""
         bias, speed, turn, drift = self.x[SYSTEMATIC].tolist()
@@ -218,9 +193,8 @@ class JointState:
         x[LANDMARKS:] = points.ravel()
         rows = np.r_[0:3, LANDMARKS:n]
         P[np.ix_(rows, rows)] = cov
-        P[BIAS, BIAS] = self.P[BIAS, BIAS]
-        P[WHEELS, WHEELS] = self.P[WHEELS, WHEELS]
-        P[MOVING, MOVING] = self.P[MOVING, MOVING]
+        for same in (slice(BIAS, BIAS + 1), WHEELS, MOVING):
+            P[same, same] = self.P[same, same]
         if np.linalg.eigvalsh(self.P[:3, :3])[0] > REGULAR:  # what it shares with the pose's error
             part = np.linalg.solve(self.P[:3, :3], self.P[:3, MOVING]).T
             P[MOVING, rows] = part @ cov[:3]
@@ -369,9 +343,35 @@ def predict(
             P[e, e] += (1.0 - kept * kept) * wheels2[k]
 
 
+def begin_sweep(state: JointState, cov: Array) -> None:
+    """A sweep begins at the pose of the state; odometry errs by (3, 3) in it (eq. 59).
+
+    The end points were de-skewed with that odometry, so they constrain the pose plus half of its
+    error; and the next motion has all of it.
+    """
+    state.x[MOVING] = 0.0
+    state.P[MOVING, :] = state.P[:, MOVING] = 0.0
+    state.P[MOVING, MOVING] = cov
+
+
+def end_sweep(state: JointState, heading: float, share: float, cov: Array) -> None:
+    """Move the pose by a ``share`` of the sweep that began at a ``heading``, as odometry errs.
+
+    The sweep's error had the covariance (3, 3). It is white: parts of it are independent, so the
+    noise of the motion that is to be added is less by ``share^2`` times that.
+    """
+    follow_sweep(state.x, state.P, heading, share)
+    if share < 1.0:
+        between = share * (1.0 - share) * cov
+        moved = se2.rotation3(heading) @ between
+        state.P[MOVING, MOVING] += between
+        state.P[:3, MOVING] -= moved
+        state.P[MOVING, :3] -= moved.T
+
+
 @brief
 def follow_sweep(x: Array, P: Array, heading: float, share: float) -> None:
-    """Kernel of :meth:`JointState.end_sweep`, in place; what is left of the error stays."""
+    """Kernel of end_sweep(), in place; what is left of the error stays."""
     c, s = share * math.cos(heading), share * math.sin(heading)
     v = VELOCITY
     x[0] += c * x[v] - s * x[v + 1]
@@ -458,3 +458,4 @@ def warm_up() -> None:
     measure_bias(state.x, state.P, 0.0, 1.0, 0.0, 0.0)
     state.apply(np.arange(3), np.eye(3), np.eye(3), np.zeros(3))
     state.turn_with_anchor(state.x)
+    follow_sweep(state.x, state.P, 0.0, 1.0)

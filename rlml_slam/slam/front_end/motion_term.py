@@ -24,7 +24,7 @@ from rlml_slam.se2 import Array
 from rlml_slam.sensing.deskew import sweep_time
 from rlml_slam.sensing.velocity_deskew import Sweep
 from rlml_slam.slam.front_end.constant_velocity import ConstantVelocity
-from rlml_slam.slam.front_end.joint_state import STANDING, JointState
+from rlml_slam.slam.front_end.joint_state import STANDING, JointState, begin_sweep, end_sweep
 from rlml_slam.slam.front_end.motion_hypotheses import FRESH, Hypothesis, MotionHypotheses
 from rlml_slam.slam.front_end.scan_update import relative
 from rlml_slam.types import Motion, Observation
@@ -88,14 +88,14 @@ class MotionTerm:
             motion = replace(motion, cov=positive(motion.cov - share**2 * self._sweep[1]))
         state.predict(motion, p.imu_bias_walk**2 * dt, kept, expected)
         if self._sweep is not None:
-            state.end_sweep(heading, share, self._sweep[1])
+            end_sweep(state, heading, share, self._sweep[1])
         self._begin_sweep(state, observation, share, dt)
         self._predicted = relative(state.x, state.P)
 
     def _share_of_sweep(self, state: JointState, motion: Motion, dt: float) -> float:
         """Share of what is left of the newest sweep that this motion is; without odometry 0."""
         if self._sweep is not None and (motion.delta is not self._odometry or not motion.known):
-            state.begin_sweep(np.zeros((3, 3)))
+            begin_sweep(state, np.zeros((3, 3)))
             self._sweep = None
         return 0.0 if self._sweep is None else min(dt / self._sweep[0], 1.0)
 
@@ -106,7 +106,7 @@ class MotionTerm:
         lasts = 0.0 if observation.scan is None else sweep_time(observation.scan)
         if self.has_odometry and observation.scan is not None and lasts > 0.0:
             cov = self._odometry_noise.sweep_cov(observation, lasts)
-            state.begin_sweep(cov)
+            begin_sweep(state, cov)
             self._sweep = lasts, cov
         elif self._sweep is not None:
             left, cov = self._sweep
@@ -134,11 +134,9 @@ class MotionTerm:
     def _placed(self, state: JointState, observation: Observation) -> Observation:
         """The observation with its end points where its sweep is by the state as it is now."""
         half = self.sweep.half * state.velocity
-        if observation.points is None or observation.origin is None or not half.any():
+        if observation.points is None or not half.any():
             return observation
-        moved = se2.exp(half)
-        points, origin = se2.transform(moved, observation.points), observation.origin[None]
-        return replace(observation, points=points, origin=se2.transform(moved, origin)[0])
+        return replace(observation, points=se2.transform(se2.exp(half), observation.points))
 
     def _measure_velocity(self, stamp: int, pose: Array) -> None:
         if self._since is None:

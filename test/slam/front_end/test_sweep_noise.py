@@ -4,15 +4,18 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from made_states import made
 
-from rlml_lab.studies.study_worlds import Case, drive
 from rlml_slam import se2
-from rlml_slam.evaluation.metrics import run_errors
 from rlml_slam.params import MotionNoise, Parameters
 from rlml_slam.sensing.velocity_deskew import Sweep
-from rlml_slam.slam.front_end.joint_state import LANDMARKS, MOVING, VELOCITY, JointState
+from rlml_slam.slam.front_end.joint_state import (
+    LANDMARKS,
+    MOVING,
+    VELOCITY,
+    JointState,
+    end_sweep,
+)
 from rlml_slam.slam.front_end.motion_term import MotionTerm
 from rlml_slam.slam.front_end.scan_update import fuse
 from rlml_slam.types import Motion, Observation, Scan
@@ -90,7 +93,7 @@ def test_error_of_a_sweep_moves_the_pose_as_a_linear_map():
     x = F @ state.x
     P = F @ state.P @ F.T + share * (1.0 - share) * (B @ SWEEP_COV @ B.T)
     P[:3, :3] -= share * (1.0 - share) * turned  # comes with the rest of the motion
-    state.end_sweep(heading, share, SWEEP_COV)
+    end_sweep(state, heading, share, SWEEP_COV)
     np.testing.assert_allclose(state.x, x, atol=1e-12)
     np.testing.assert_allclose(state.P, P, atol=1e-12)
 
@@ -134,12 +137,3 @@ def test_new_reflectors_keep_what_the_pose_has_of_the_sweep():
     after = state.P[MOVING, MOVING] - part @ state.P[:3, MOVING]
     np.testing.assert_allclose(after, rest, atol=1e-12)
     assert np.linalg.eigvalsh(state.P)[0] > -1e-12
-
-
-@pytest.mark.parametrize('world', ['room', 'hall'])
-def test_drive_without_imu_is_as_sure_as_it_may_be(world):
-    params = Parameters()
-    params = replace(params, node=replace(params.node, use_imu=False))
-    # 5.8 in the room and 3.7 in the hall, where matches do not have the noise of their sweeps
-    errors = run_errors(drive(Case(world, 0), params))
-    assert np.nanmean(errors.nees) < 3.5
