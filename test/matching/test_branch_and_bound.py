@@ -10,6 +10,7 @@ from made_rooms import ROOM, built, path, scan, walls
 from rlml_slam import se2
 from rlml_slam.errors import InputError
 from rlml_slam.matching.scans import branch_and_bound, search_pyramid
+from rlml_slam.matching.scans.block_search import Goal, search
 from rlml_slam.matching.scans.branch_and_bound import Criteria, Window, wide
 from rlml_slam.matching.scans.search_pyramid import Pyramid
 from rlml_slam.matching.scans.submap import P_MAX, P_MIN, Submap
@@ -171,6 +172,35 @@ def brute_force_far(pyramid, points, pose, n, thetas):
                 inside = (q >= 0) & (q < columns) & (r >= 0) & (r < rows)
                 sums[a, i + n, j + n] = grid[r[inside], q[inside]].sum()
     return sums
+
+
+@pytest.mark.parametrize('far', [np.nan, np.inf, 1e9, 1e300])
+def test_points_that_no_beam_reaches_cost_bounded_work(pyramid, points, far):
+    moved = points + np.array([far, 0.0])
+    thetas = branch_and_bound.angles(moved, pyramid.resolution, np.pi)
+    assert len(thetas) < 100_000
+    assert len(branch_and_bound.angles(points, pyramid.resolution, np.pi)) < 1000
+
+
+@pytest.mark.parametrize('far', [np.nan, np.inf, 1e9, -1e9, 2.0**32 * 0.05, 1e300])
+def test_point_that_is_in_no_grid_meets_no_cell(pyramid, points, far):
+    """2^32 cells further on is no cell of the grid, though 32 bits are the same."""
+    mixed, away = (
+        np.vstack([points, points[::8] + np.array([x, 0.0])]) for x in (far, 500.0)
+    )  # fmt: skip
+    window = Window(TRUE, (0.5, 0.5), 0.1)
+    thetas = branch_and_bound.angles(points, pyramid.resolution, 0.1)
+    sums = []
+    for of in (mixed, away):
+        lattice = branch_and_bound.lattice_of(pyramid, of, window, thetas)
+        found = np.full((2, 4), -1, dtype=np.int64)
+        goal = Goal(-1, 0.0, 0.7, 10.0, 10.0, False, branch_and_bound.ENDLESS)
+        search(pyramid.levels, lattice, goal, found)
+        sums.append(found[0])
+    np.testing.assert_array_equal(*sums)
+    # nor does a pose
+    found = searched(pyramid, points, np.array([far, 0.0, 0.0]), 0.5, 0.1)
+    assert found.best is None or found.best.score == pytest.approx(P_MIN)
 
 
 def test_sums_of_many_points_do_not_overflow(pyramid, points):

@@ -246,6 +246,14 @@ def test_session_starts_at_no_stamp_that_no_clock_has():
             read_request(msg)
 
 
+@pytest.mark.parametrize('far', [np.nan, np.inf, 600.0, -1e9])
+def test_end_point_that_no_beam_reaches_is_refused(far):
+    near = np.array([[300.0, -1.0], [2.0, 3.0]])
+    np.testing.assert_array_equal(read_points(build_points(make_bag, 1, 'base', near)), near)
+    with pytest.raises(InputError, match='deskewed_points: a point is not finite, or beyond 500'):
+        read_points(build_points(make_bag, 1, 'base', np.vstack([near, [0.0, far]])))
+
+
 def test_request_that_is_not_finite_is_refused():
     msg = build_request(make_bag, Relocate(2, 1, 1, np.full(3, np.nan), np.eye(3)), 'map')
     with pytest.raises(InputError, match='not finite'):

@@ -22,6 +22,8 @@ from rlml_slam.matching.scans.submap import P_MAX, P_MIN, Submap
 from rlml_slam.se2 import Array, wrap
 
 ENDLESS = 1 << 62  # look-ups of a search without a budget
+LONGEST = 500.0  # [m] of a beam; angles of longer ones would fill the memory
+OUTSIDE = 1 << 29  # [cells] beyond all grids; shifts are added to it in 32 bits
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,7 @@ def wide(
 
 def angles(points: Array, resolution: float, half_angle: float) -> Array:
     """Angles searched (m,), relative: a step moves the 90th percentile of ranges by a cell."""
-    reach = max(_quantile(np.sort(np.hypot(points[:, 0], points[:, 1])), 0.9), 1.0)
+    reach = max(1.0, min(LONGEST, _quantile(np.sort(np.hypot(*points.T)), 0.9)))  # of NaN too
     step = resolution / reach
     if half_angle >= math.pi:
         m = math.ceil(2.0 * math.pi / step)
@@ -180,8 +182,12 @@ def cells_of(
         c, s = np.cos(pose[2] + thetas[a]), np.sin(pose[2] + thetas[a])
         for k in range(len(points)):
             px, py = points[k, 0], points[k, 1]
-            cells[a, k, 0] = int(np.floor((pose[0] + c * px - s * py) * scale)) - first[0]
-            cells[a, k, 1] = int(np.floor((pose[1] + s * px + c * py) * scale)) - first[1]
+            u = np.floor((pose[0] + c * px - s * py) * scale) - first[0]
+            v = np.floor((pose[1] + s * px + c * py) * scale) - first[1]
+            # numbers that no integer holds, and NaN, are in no grid
+            is_cell = abs(u) < OUTSIDE and abs(v) < OUTSIDE
+            cells[a, k, 0] = int(u) if is_cell else OUTSIDE
+            cells[a, k, 1] = int(v) if is_cell else OUTSIDE
     return cells
 
 

@@ -16,12 +16,13 @@ import numpy as np
 
 from rlml_slam.errors import InputError
 from rlml_slam.ros.codecs import encode
-from rlml_slam.ros.codecs.decode import FARTHEST, covariances, stamp
+from rlml_slam.ros.codecs.decode import covariances, stamp
 from rlml_slam.ros.codecs.message_types import Make
 from rlml_slam.ros.codecs.point_cloud import bounded, build_cloud, read_table
 from rlml_slam.ros.codecs.reflector_clouds import Associated
 from rlml_slam.se2 import Array
 from rlml_slam.slam.conversation import SessionFrame
+from rlml_slam.slam.front_end.submaps import FAR
 from rlml_slam.types import Frame, Health, Level, Motion, Observation
 
 MAX_BEHIND = 20  # frames that may overtake one whose points or detections are still on their way
@@ -100,14 +101,9 @@ def read_record(msg: Any, topic: str = 'rlml/frames') -> Record:
     origin = None if np.isnan(r['origin']).any() else array('origin')
     none = np.zeros(0, dtype=np.int64)
     frame = Frame(
-        time,
-        Observation(time, motion, origin=origin, odom_pose=odom_pose),
-        array('T_local_base'),
-        array('cov_local'),
-        array('T_map_base'),
-        array('cov_map'),
-        none,
-        none,
+        time, Observation(time, motion, origin=origin, odom_pose=odom_pose),
+        array('T_local_base'), array('cov_local'), array('T_map_base'), array('cov_map'),
+        none, none,
         health=Health(Level(int(r['level']))),
         scan_score=float(r['scan_score']),
         scan_used=bool(r['scan_used']),
@@ -116,7 +112,7 @@ def read_record(msg: Any, topic: str = 'rlml/frames') -> Record:
         chi2=float(r['chi2']),
         iterations=int(r['iterations']),
         wall_ms=float(r['wall_ms']),
-    )
+    )  # fmt: skip
     of = SessionFrame(int(r['session']), frame, int(r['request']), int(r['mode']))
     return Record(of, bool(r['has_points']), bool(r['has_detections']))
 
@@ -131,7 +127,7 @@ def build_points(make: Make, time: int, base_frame: str, points: Array) -> Any:
 def read_points(msg: Any, topic: str = 'deskewed_points') -> Array:
     """Points (n, 2)."""
     points: Array = read_table(msg, POINT, topic)['exact'].astype(np.float64)
-    bounded(points, f'{topic}: a point', FARTHEST)
+    bounded(points, f'{topic}: a point', FAR)
     return points
 
 
