@@ -61,12 +61,9 @@ class OdometryNoise:
         self._applied = motion.delta, fast, motion.cov[AXES, AXES]
         return replace(observation, motion=replace(motion, cov=self._scaled(motion.cov, fast)))
 
-    def sweep_cov(self, observation: Observation, lasts: float) -> Array:
-        """Covariance (3, 3) of the motion in the sweep of ``lasts`` [s], with this noise."""
-        if observation.sweep is None or observation.sweep_cov is None:
-            return np.zeros((3, 3))
-        fast = self._fast(observation.sweep, lasts)
-        cov = observation.sweep_cov
+    def cov_of(self, delta: Array, dt: float, cov: Array) -> Array:
+        """The covariance (3, 3) of a motion (3,) of ``dt`` [s], with this noise."""
+        fast = self._fast(delta, dt)
         return cov if fast is None else self._scaled(cov, fast)
 
     def _fast(self, delta: Array, dt: float) -> NDArray[np.int64] | None:

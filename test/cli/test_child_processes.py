@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import random
 import socket
 import subprocess
 import sys
@@ -120,15 +121,20 @@ def test_taken_domain_is_not_free(reserved):
         assert not module._is_free(7400 + 250 * domain)
         for _ in range(30):
             assert free_domain() != domain
+            reserved.pop().close()
 
 
 @pytest.mark.skipif(sys.platform != 'linux', reason='domains are reserved on Linux only')
-def test_two_processes_never_have_one_domain(reserved):
-    held = {free_domain() for _ in range(40)}
-    assert len(held) == 40
+def test_two_processes_never_have_one_domain(reserved, monkeypatch):
+    # two of the same list: by chance alone, they would have one in common
+    monkeypatch.setattr(module.random, 'SystemRandom', lambda: random.Random(0))
+    held = {free_domain() for _ in range(5)}
+    assert len(held) == 5
     ask = (
+        'import random\n'
+        'random.SystemRandom = lambda: random.Random(0)\n'
         'from rlml_slam.cli.support.processes import free_domain\n'
-        'print(*(free_domain() for _ in range(20)), flush=True)\n'
+        'print(*(free_domain() for _ in range(5)), flush=True)\n'
         'input()'
     )
     others = [
@@ -140,5 +146,5 @@ def test_two_processes_never_have_one_domain(reserved):
     theirs = [int(d) for other in others for d in other.stdout.readline().split()]
     for other in others:
         other.communicate('end\n', timeout=60)
-    assert len(set(theirs)) == 40
+    assert len(set(theirs)) == 10
     assert not held & set(theirs)

@@ -15,6 +15,6 @@ from rlml_slam.params import Parameters
 def test_drive_without_imu_is_as_sure_as_it_may_be(world):
     params = Parameters()
     params = replace(params, node=replace(params.node, use_imu=False))
-    # 5.8 in the room and 3.7 in the hall, where matches do not have the noise of their sweeps
+    # without the noise of sweeps in their matches, two seeds have 5.6 in the room, 4.3 in the hall
     errors = run_errors(drive(Case(world, 0), params))
-    assert np.nanmean(errors.nees) < 3.5
+    assert 0.7 < np.nanmean(errors.nees) < 3.5

@@ -107,26 +107,28 @@ def free_domain() -> int:
     for domain in domains:
         # RTPS: 7400 + 250 domain for multicast, + 10 + 2 k for the unicast of participant k
         ports = [7400 + 250 * domain + offset for offset in (0, 10, 12, 14, 16)]
-        if all(map(_is_free, ports)) and _is_reserved(domain):
+        if (own := _reserve(domain)) is None:
+            continue
+        if all(map(_is_free, ports)):
+            _RESERVED.append(own)
             return domain
+        own.close()
     raise RlmlError('no free ROS domain on this machine')
 
 
-def _is_reserved(domain: int) -> bool:
-    """Keep other processes that ask for a domain from this one, before its nodes are there.
+def _reserve(domain: int) -> socket.socket | None:
+    """What keeps other processes that ask for a domain from this one; None where another has it.
 
     A name of Linux's abstract sockets is free again when its process ends, whatever ends it.
     """
-    if not sys.platform.startswith('linux'):
-        return True
-    reserved = socket.socket(socket.AF_UNIX)
+    own = socket.socket(socket.AF_UNIX)
     try:
-        reserved.bind(f'\0rlml_slam domain {domain}')
+        if sys.platform.startswith('linux'):
+            own.bind(f'\0rlml_slam domain {domain}')
     except OSError:
-        reserved.close()
-        return False
-    _RESERVED.append(reserved)
-    return True
+        own.close()
+        return None
+    return own
 
 
 def _is_free(port: int) -> bool:

@@ -87,9 +87,10 @@ class ObservationAssembly:
                 detections = self._in_base(w.item, T_base_sensor)
             elif self._node.use_scan:
                 scan, T = w.item, T_base_sensor
-                sweep, sweep_cov = self._sweep(w.item, w.delay, moved)
+                sweep, noise, known = self._sweep(w.item, w.delay, moved)
+                sweep_cov = noise if known else None
                 if self._detects and not any(w.stream == 'reflectors' for w in group):
-                    seen = self.reflectors.detections(scan, T, sweep, sweep_cov, odom_pose)
+                    seen = self.reflectors.detections(scan, T, sweep, noise, odom_pose)
                     detections = None if seen is None else self._in_base(seen, T)
         if scan is not None and T is not None and sweep is not None:
             points = project(scan, T, sweep, self._p.submap.max_laser_range)
@@ -148,8 +149,10 @@ class ObservationAssembly:
             return self.buffer.motion(start, end).delta
         return se2.inverse(self.buffer.motion(end, start).delta)
 
-    def _sweep(self, scan: Scan, delay: int, moved: Array) -> tuple[Array, Array]:
-        """Motion (3,) of base during a sweep and its covariance, in the base frame at the stamp.
+    def _sweep(self, scan: Scan, delay: int, moved: Array) -> tuple[Array, Array, bool]:
+        """Motion (3,) of base during a sweep, its covariance, and whether odometry covers it.
+
+        In the base frame at the stamp.
 
         The covariance is that about the first ray, which is at most a scan away from the stamp;
         without odometry that of a robot of which only is known how fast it may be.
@@ -159,7 +162,7 @@ class ObservationAssembly:
         cov = swept.cov
         if not swept.known:
             cov = np.diag(np.minimum(np.diag(cov), (MAY_MOVE * lasts) ** 2))
-        return se2.compose(se2.compose(moved, swept.delta), se2.inverse(moved)), cov
+        return se2.compose(se2.compose(moved, swept.delta), se2.inverse(moved)), cov, swept.known
 
     def _sensor_pose(self, frame_id: str) -> Array:
         return self._sensor_poses.get(frame_id, np.array(self._node.laser_pose))

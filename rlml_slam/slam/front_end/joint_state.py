@@ -40,8 +40,8 @@ class JointState:
     In this order: the pose, the gyro's bias, the shares by which the robot's speed and turn
     exceed those that its wheels measure, the turn per distance [rad/m] that they do not measure,
     the velocity (forward, left, turn) of the base, or with odometry its error in the newest sweep
-    (:func:`begin_sweep`), two anchors, the reflectors. Of the rows ``tied``, on which reflectors
-    depend that are left out, ``extra`` are nothing else.
+    (:func:`begin_sweep`), two anchors, the reflectors; and ``extra`` rows, zero but while
+    reflectors are left out (:mod:`inactive_landmarks`). Those depend on the rows ``tied``.
     """
 
     def __init__(
@@ -354,41 +354,22 @@ def begin_sweep(state: JointState, cov: Array) -> None:
     state.P[MOVING, MOVING] = cov
 
 
-def end_sweep(state: JointState, heading: float, share: float, cov: Array) -> None:
-    """Move the pose by a ``share`` of the sweep that began at a ``heading``, as odometry errs.
-
-    The sweep's error had the covariance (3, 3). It is white: parts of it are independent, so the
-    noise of the motion that is to be added is less by ``share^2`` times that.
-    """
-    follow_sweep(state.x, state.P, heading, share)
-    if share < 1.0:
-        between = share * (1.0 - share) * cov
-        moved = se2.rotation3(heading) @ between
-        state.P[MOVING, MOVING] += between
-        state.P[:3, MOVING] -= moved
-        state.P[MOVING, :3] -= moved.T
-
-
 @brief
-def follow_sweep(x: Array, P: Array, heading: float, share: float) -> None:
-    """Kernel of end_sweep(), in place; what is left of the error stays."""
-    c, s = share * math.cos(heading), share * math.sin(heading)
+def end_sweep(x: Array, P: Array, heading: float) -> None:
+    """Move the pose by the error of the sweep that began at a ``heading``, in place (eq. 59)."""
+    c, s = math.cos(heading), math.sin(heading)
     v = VELOCITY
     x[0] += c * x[v] - s * x[v + 1]
     x[1] += s * x[v] + c * x[v + 1]
-    x[2] = wrapped(x[2] + share * x[v + 2])
+    x[2] = wrapped(x[2] + x[v + 2])
     for k in range(len(x)):
         P[0, k] += c * P[v, k] - s * P[v + 1, k]
         P[1, k] += s * P[v, k] + c * P[v + 1, k]
-        P[2, k] += share * P[v + 2, k]
+        P[2, k] += P[v + 2, k]
     for k in range(len(x)):
         P[k, 0] += c * P[k, v] - s * P[k, v + 1]
         P[k, 1] += s * P[k, v] + c * P[k, v + 1]
-        P[k, 2] += share * P[k, v + 2]
-    for k in range(v, v + 3):
-        x[k] *= 1.0 - share
-        P[k] *= 1.0 - share
-        P[:, k] *= 1.0 - share
+        P[k, 2] += P[k, v + 2]
 
 
 @brief
@@ -458,4 +439,4 @@ def warm_up() -> None:
     measure_bias(state.x, state.P, 0.0, 1.0, 0.0, 0.0)
     state.apply(np.arange(3), np.eye(3), np.eye(3), np.zeros(3))
     state.turn_with_anchor(state.x)
-    follow_sweep(state.x, state.P, 0.0, 1.0)
+    end_sweep(state.x, state.P, 0.0)

@@ -32,6 +32,7 @@ from rlml_slam.types import Motion, Observation
 # [ns] shortest time over which a velocity is computed. Scans that arrive in a burst are too close:
 # a pose error of 2 mm would be 0.4 m/s over 5 ms, and is .04 m/s over this time.
 MIN_INTERVAL = 50_000_000
+WHOLE = 0.9  # share of a sweep from which on the next stamp counts as its end, for its jitter
 
 
 class MotionTerm:
@@ -59,7 +60,7 @@ class MotionTerm:
         self._is_velocity_known = False
         self._hypotheses.forget()
         self._since: tuple[int, Array] | None = None  # stamp and pose of the last velocity
-        # time that is left of the newest sweep [s], covariance of what odometry errs by in it
+        # of the newest observation's sweep: its time [s], and the covariance of its motion
         self._sweep: tuple[float, Array] | None = None
 
     def hypotheses(self, observation: Observation) -> list[Hypothesis]:
@@ -83,34 +84,40 @@ class MotionTerm:
             return
         expected = expected_motion(self.velocity, dt, p) if motion.known else STANDING
         kept = math.exp(-dt / p.scale_error_time)
-        heading, share = float(state.x[2]), self._share_of_sweep(state, motion, dt)
-        if self._sweep is not None:
-            motion = replace(motion, cov=positive(motion.cov - share**2 * self._sweep[1]))
+        heading, cov = float(state.x[2]), self._sweep_within(motion, dt)
+        if cov is not None:
+            motion = replace(motion, cov=positive(motion.cov - cov))
         state.predict(motion, p.imu_bias_walk**2 * dt, kept, expected)
-        if self._sweep is not None:
-            end_sweep(state, heading, share, self._sweep[1])
-        self._begin_sweep(state, observation, share, dt)
+        if cov is not None:
+            end_sweep(state.x, state.P, heading)
+        self._begin_sweep(state, observation)
         self._predicted = relative(state.x, state.P)
 
-    def _share_of_sweep(self, state: JointState, motion: Motion, dt: float) -> float:
-        """Share of what is left of the newest sweep that this motion is; without odometry 0."""
-        if self._sweep is not None and (motion.delta is not self._odometry or not motion.known):
-            begin_sweep(state, np.zeros((3, 3)))
-            self._sweep = None
-        return 0.0 if self._sweep is None else min(dt / self._sweep[0], 1.0)
+    def _sweep_within(self, motion: Motion, dt: float) -> Array | None:
+        """Covariance (3, 3) of the newest sweep where all of it is within this motion.
 
-    def _begin_sweep(
-        self, state: JointState, observation: Observation, share: float, dt: float
-    ) -> None:
-        """The sweep of the observation's scan, if it has one, takes the place of the last one."""
+        Else its error is left out: what other sources say does not have it, and of a part of a
+        sweep only a part, which is not known.
+        """
+        if self._sweep is None or not self._is_odometry(motion):
+            return None
+        lasts, cov = self._sweep
+        return cov if dt > WHOLE * lasts else None
+
+    def _begin_sweep(self, state: JointState, observation: Observation) -> None:
+        """The sweep of this scan, if it was de-skewed by odometry that covers it."""
         lasts = 0.0 if observation.scan is None else sweep_time(observation.scan)
-        if self.has_odometry and observation.scan is not None and lasts > 0.0:
-            cov = self._odometry_noise.sweep_cov(observation, lasts)
-            begin_sweep(state, cov)
+        self._sweep, cov = None, np.zeros((3, 3))
+        known = observation.sweep_cov if self._is_odometry(observation.motion) else None
+        if lasts > 0.0 and observation.sweep is not None and known is not None:
+            cov = self._odometry_noise.cov_of(observation.sweep, lasts, known)
             self._sweep = lasts, cov
-        elif self._sweep is not None:
-            left, cov = self._sweep
-            self._sweep = (left - dt, (1.0 - share) * cov) if left > dt else None
+        if self.has_odometry:
+            begin_sweep(state, cov)
+
+    def _is_odometry(self, motion: Motion) -> bool:
+        """Whether a motion is the one that odometry measured, known to its end."""
+        return motion.known and motion.delta is self._odometry
 
     @property
     def sweep(self) -> Sweep:

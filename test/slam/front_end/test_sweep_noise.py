@@ -4,21 +4,24 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from made_states import made
 
 from rlml_slam import se2
 from rlml_slam.params import MotionNoise, Parameters
+from rlml_slam.sensing.synchronization.input_counts import InputCounts
+from rlml_slam.sensing.synchronization.observation_assembly import ObservationAssembly
+from rlml_slam.sensing.synchronization.waiting_queue import Waiting
 from rlml_slam.sensing.velocity_deskew import Sweep
 from rlml_slam.slam.front_end.joint_state import (
     LANDMARKS,
     MOVING,
-    VELOCITY,
     JointState,
     end_sweep,
 )
 from rlml_slam.slam.front_end.motion_term import MotionTerm
 from rlml_slam.slam.front_end.scan_update import fuse
-from rlml_slam.types import Motion, Observation, Scan
+from rlml_slam.types import Motion, Observation, Odometry, Scan
 
 NOTHING = np.zeros(3)
 STEP = 100_000_000  # [ns] between two sweeps, each of which lasts as long
@@ -82,47 +85,91 @@ def test_pose_from_deskewed_scans_is_honest_and_better():
 
 
 def test_error_of_a_sweep_moves_the_pose_as_a_linear_map():
-    state = made(spread=0.3)
-    n, heading, share = len(state.x), 0.7, 0.4
-    turned = se2.rotate_cov(SWEEP_COV, heading)
-    F, B = np.eye(n), np.zeros((n, 3))
-    F[:3, MOVING] = share * se2.rotation3(heading)
-    F[MOVING, MOVING] *= 1.0 - share
-    # given the whole, what the two parts of white noise err by is opposite
-    B[:3], B[MOVING] = se2.rotation3(heading), -np.eye(3)
-    x = F @ state.x
-    P = F @ state.P @ F.T + share * (1.0 - share) * (B @ SWEEP_COV @ B.T)
-    P[:3, :3] -= share * (1.0 - share) * turned  # comes with the rest of the motion
-    end_sweep(state, heading, share, SWEEP_COV)
+    state, heading = made(spread=0.3), 0.7
+    F = np.eye(len(state.x))
+    F[:3, MOVING] = se2.rotation3(heading)
+    x, P = F @ state.x, F @ state.P @ F.T
+    end_sweep(state.x, state.P, heading)
     np.testing.assert_allclose(state.x, x, atol=1e-12)
     np.testing.assert_allclose(state.P, P, atol=1e-12)
 
 
-def test_sweep_that_lasts_over_several_observations_adds_up_to_its_noise():
-    params = Parameters(motion=SYSTEMATIC_OFF)
-    state, motion = JointState(np.zeros(3), np.zeros((3, 3)), 0.0), MotionTerm(params)
-    went, part = np.zeros(3), 0.25
-    (first,) = motion.hypotheses(observation(1, went, SWEEP_COV))
-    motion.predict(state, first.observation)
-    motion.corrected(state, first.observation)
-    for k in range(4):  # reflectors, seen during the sweep
-        stamp = STEP + int((k + 1) * part * STEP)
-        seen = Observation(stamp, Motion(went, part * SWEEP_COV), odom_pose=np.zeros(3))
-        (seen,) = motion.hypotheses(seen)
-        motion.predict(state, seen.observation)
-    np.testing.assert_allclose(np.diag(state.pose_cov), 2.0 * np.diag(SWEEP_COV), rtol=0.02)
-    assert not state.P[:3, MOVING].any() or np.abs(state.P[:3, MOVING]).max() < 1e-9
+def follow(*observations, is_asked=True):
+    """State and motion after matches of the first scan, and the other observations."""
+    state, motion = JointState(np.zeros(3), 1e-6 * np.eye(3), 0.0), MotionTerm(Parameters())
+    for k, one in enumerate(observations):
+        if is_asked or not k:
+            (hypothesis,) = motion.hypotheses(one)
+            one = hypothesis.observation
+        motion.predict(state, one)
+        if not k:
+            sweep, W = motion.sweep, np.linalg.inv(MATCH_COV)
+            found = np.array([0.002, 0.0, 0.004])
+            fuse(state.x, state.P, found, W, 30.0, NOTHING, W, sweep.half, sweep.velocity)
+    return state, motion
 
 
-def test_motion_of_another_source_does_not_have_the_error_of_the_sweep():
-    state, motion = JointState(np.zeros(3), np.zeros((3, 3)), 0.0), MotionTerm(Parameters())
-    (first,) = motion.hypotheses(observation(1, np.zeros(3), SWEEP_COV))
-    motion.predict(state, first.observation)
-    state.P[:3, VELOCITY] = state.P[VELOCITY, :3] = 1e-6
-    other = observation(2, np.full(3, 0.01), SWEEP_COV)  # it was not asked for hypotheses
-    motion.predict(state, replace(other, scan=None))
-    assert not state.P[MOVING].any()
+def test_next_motion_has_what_the_match_has_shown_of_the_sweep():
+    first, second = (observation(k, np.zeros(3), SWEEP_COV) for k in (1, 2))
+    before, _ = follow(first)
+    assert (before.velocity[[0, 2]] > 1e-4).all()
+    state, motion = follow(first, second)
+    np.testing.assert_allclose(state.pose, before.pose + before.velocity, atol=1e-5)
+    assert motion.sweep.half.all()
+    np.testing.assert_allclose(state.P[MOVING, MOVING], SWEEP_COV)
+
+
+@pytest.mark.parametrize('case', ['other source', 'unknown', 'within the sweep'])
+def test_sweep_that_is_not_all_in_the_next_motion_is_left_out(case):
+    first, second = (observation(k, np.zeros(3), SWEEP_COV) for k in (1, 2))
+    second = replace(second, scan=None)
+    if case == 'unknown':
+        second = replace(second, motion=replace(second.motion, known=False))
+    elif case == 'within the sweep':  # reflectors, or another laser
+        second = replace(second, stamp=STEP + STEP // 2)
+    before, _ = follow(first)
+    state, motion = follow(first, second, is_asked=case != 'other source')
+    np.testing.assert_allclose(state.pose, before.pose)
     assert not motion.sweep.half.any()
+    assert not state.P[MOVING].any()
+    assert np.linalg.eigvalsh(state.P[:3, :3])[0] > 0.0
+    # nor is a part of its noise left out
+    grown = np.diag(state.pose_cov) - np.diag(before.pose_cov)
+    assert (grown > 0.99 * np.diag(SWEEP_COV)).all()
+
+
+def test_noise_that_is_not_even_over_the_sweep_keeps_the_covariance_positive():
+    # the robot starts to drive: of the motion to the next scan, less is known to be uncertain
+    first = observation(1, np.zeros(3), SWEEP_COV)
+    state, _ = follow(first, observation(2, np.zeros(3), 0.01 * SWEEP_COV))
+    assert np.linalg.eigvalsh(state.P)[0] > -1e-15
+
+
+@pytest.mark.parametrize('what', ['odometry ends in the sweep', 'no ray times', 'no odometry'])
+def test_scan_without_a_known_sweep_is_matched_where_its_stamp_is(what):
+    one = observation(1, np.zeros(3), SWEEP_COV)
+    if what == 'odometry ends in the sweep':
+        one = replace(one, sweep_cov=None)
+    elif what == 'no ray times':
+        one = replace(one, scan=replace(one.scan, time_increment=0.0))
+    else:
+        one = replace(one, motion=replace(one.motion, known=False))
+    state, motion = follow(one)
+    assert not motion.sweep.half.any()
+    assert not state.velocity.any()
+
+
+def test_sweep_that_odometry_does_not_cover_has_no_covariance():
+    assembly, second = ObservationAssembly(Parameters(), InputCounts()), 10**9
+    for k in range(40):
+        assembly.buffer.add_odometry(
+            Odometry(second + k * second // 50, np.array([0.01 * k, 0, 0]))
+        )
+    covered, late = second + second // 2, second + 39 * second // 50 - STEP // 2
+    for stamp, is_covered in ((covered, True), (late, False)):
+        group = [Waiting(stamp, 'scan', scan(stamp), 0)]
+        found = assembly.assemble(stamp, group, (0.0, 0.0))
+        assert (found.sweep_cov is not None) == is_covered
 
 
 def test_new_reflectors_keep_what_the_pose_has_of_the_sweep():
