@@ -8,6 +8,8 @@ In each step, the correction of the pose has the variance P- - P+. So the innova
 variance S = R + P- follow, and S is the variance without the newest motion, plus a Q, where Q is
 that of the parameters and a the share that is estimated: a = (v^2 - (S - a Q)) / Q, as a weighted
 mean over the steps (eq. 56; innovation-based adaptive estimation, Mehra 1972). It is at most 1.
+Where scans are de-skewed by odometry, S has parts of two sweeps; the share that explains v^2 is
+the same.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ class MessageGuard:
         self.last = reason[:500]
         kind = (topic, NUMBERS.sub('#', self.last))
         if kind in self._logged or len(self._logged) >= MAX_LOGGED * (2 if trace else 1):
-            return  # what is to be reported has room of its own
+            return  # errors have as much room again
         self._logged.add(kind)
         if trace:
             self._logger.error(f'not used: {self.last}; please report this:\n{trace}')

@@ -235,7 +235,7 @@ class Sensors:
         if stream not in self._came:
             self._came.add(stream)
             self._logger.info(f'first {stream}{_place(msg)}')
-        if stream not in PLACED or not _stamp(msg):  # which is refused, and waited for by none
+        if stream not in PLACED or not _stamp(msg):  # a stamp that is refused
             self._use(stream, msg)
             return
         if not self._waits:
