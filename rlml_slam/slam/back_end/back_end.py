@@ -138,7 +138,8 @@ class BackEnd:
         closures = self._close_loops(key)
         self._join_reflectors()
         self._keyframes_since_solve += 1
-        if self._keyframes_since_solve >= self._p.back_end.optimize_every and self._has_changed:
+        is_due = self._keyframes_since_solve >= self._p.back_end.optimize_every
+        if frame.jumped or (is_due and self._has_changed):
             self.optimize()
             self.maintenance.after_solve(self.keyframes)
         elif not closures:
@@ -274,9 +275,8 @@ class BackEnd:
         self.reflector_graph.mark_solved()
         last = self.keyframes[-1]
         self.T_map_local = T = se2.compose(self.graph.poses[last.index], se2.inverse(last.T_local))
-        survey = self.survey_frame
+        survey, records = self.survey_frame, self.loop_closer.records
         bound = None if survey is not None and survey.found else self.path_covariance
-        records = self.loop_closer.records
         self.known = newest_covariance(self.solver, bound, records, self.keyframes, T)
 
     def finish(self) -> None:

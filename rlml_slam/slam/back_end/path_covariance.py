@@ -131,16 +131,24 @@ def newest_covariance(
     """Covariance of the newest keyframe in the map, after a solve.
 
     Its sightings are not in the graph yet: it is that of the keyframe before, grown by the front
-    end's since. The path covariance is a lower ``bound`` where no reflectors constrain the pose;
+    end's since. Where it was found again, that is the nearest one: it has the error of what is
+    mapped there. The path covariance is a lower ``bound`` where no reflectors constrain the pose;
     None in a map with the frame of a survey.
     """
     before, last = keys[-2:]
+    if last.jumped:
+        way = solver.graph.poses[: last.index, :2] - solver.graph.poses[last.index, :2]
+        before = keys[int(np.argmin(np.hypot(*way.T)))]
     cov = solver.joint([before.index])
     if bound is not None:
         bound.add_closures(closures, keys, solver.graph.edges)
         if not _is_constrained(solver.graph, bound, closures, keys, before):
-            heading = float(T_map_local[2] + before.T_local[2])
+            heading = float(solver.graph.poses[before.index, 2])
             cov = either(cov, se2.rotate_cov(bound.cov(before), heading))
+    if last.jumped:
+        way = solver.graph.poses[last.index, :2] - solver.graph.poses[before.index, :2]
+        cov = carried(cov, way) + se2.rotate_cov(last.cov_local, float(T_map_local[2]))
+        return ReferencePose(last.T_local, last.cov_local, cov)
     since = Correction(T_map_local, ReferencePose(before.T_local, before.cov_local, cov))
     _, cov_map = since.apply(last.T_local, last.cov_local)
     return ReferencePose(last.T_local, last.cov_local, cov_map)

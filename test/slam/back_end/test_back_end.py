@@ -516,3 +516,17 @@ def test_edge_of_a_scan_that_leaves_a_direction_open_enters_the_graph():
         T_grid_key = rng.uniform(-3.0, 3.0, 3)
         delta, weak = edge_of_match(TURN, T_grid_key, information, floor)
         assert graph.add_edge(EdgeKind.SCAN, 0, 1, delta, weak) == k
+
+
+def test_robot_that_is_found_again_has_the_error_of_what_is_mapped_there():
+    """It is lost at the end of a long way, and found at its middle, by 1 cm and .6 degrees."""
+    path = drive((0.5, 0.0, 30.0))
+    frames = frames_along(path, scan=False, reflectors=False)
+    middle = len(path) // 2
+    found = replace(frames[-1], T_local_base=path[middle], jumped=True)
+    back_end, updates = run([*frames[:-1], found])
+    there = int(np.argmin(np.abs(back_end.graph.poses[:-1, 0] - path[middle, 0])))
+    error = back_end.solver.joint([there])
+    assert error[1, 1] > 0.01**2
+    assert updates[-1].optimized
+    np.testing.assert_allclose(updates[-1].known.cov_map, error + 1e-4 * EYE, rtol=0.2)
