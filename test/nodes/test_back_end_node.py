@@ -122,7 +122,7 @@ def test_everything_of_the_map_is_published(live):
 
 def test_map_to_odom_joins_the_two_estimates(live):
     front, back = start(live, transform_tolerance=0.0)
-    drive(live, front, back, end=4.0)
+    drive(live, front, back, end=6.0)
     newest = front.last
 
     def is_sent():

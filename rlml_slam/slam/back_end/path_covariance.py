@@ -143,7 +143,9 @@ def newest_covariance(
     if bound is not None:
         bound.add_closures(closures, keys, solver.graph.edges)
         if not _is_constrained(solver.graph, bound, closures, keys, before):
-            heading = float(solver.graph.poses[before.index, 2])
+            heading = float(T_map_local[2] + before.T_local[2])
+            if last.jumped:  # its frame is not that of the robot now
+                heading = float(solver.graph.poses[before.index, 2])
             cov = either(cov, se2.rotate_cov(bound.cov(before), heading))
     if last.jumped:
         way = solver.graph.poses[last.index, :2] - solver.graph.poses[before.index, :2]
