@@ -15,13 +15,13 @@ from rlml_lab.faults.fault_catalog import FAULTS, chosen
 from rlml_lab.faults.fault_run import FaultFigures
 from rlml_lab.faults.fault_run import run as run_fault
 from rlml_slam.cli.support.progress import Progress
-from rlml_slam.cli.support.text_table import aligned
 from rlml_slam.params import Parameters, from_mapping, read_yaml
 
 HEADINGS = (
     'fault', 'seed', 'error [m]', '× clean', 'heading [°]', 'LOST', 'DEGRADED', 'OK and wrong',
     'longest [s]', 'CPU [ms/scan]', '× real time',
 )  # fmt: skip
+WIDTHS = (max(map(len, FAULTS)), 4, 17, *map(len, HEADINGS[3:]))
 
 
 def add_parser(subparsers: Any) -> None:
@@ -56,30 +56,33 @@ def run(args: argparse.Namespace) -> int:
     faults = list(chosen(args.fault))
     rows: list[tuple[str, int, FaultFigures]] = []
     reference = None
+    if not args.json:
+        print(line(HEADINGS), flush=True)
     with Progress('study', 1 + (len(faults) - 1) * args.seeds, args.json) as progress:
         for name, fault in faults:
             for seed in range(1 if name == 'none' else args.seeds):
                 figures, path, _ = run_fault(given, fault, seed, params, reference)
                 reference = reference or path
                 rows.append((name, seed, figures))
+                if not args.json:
+                    print(line(cells(name, seed, figures, rows[0][2].mean_m)), flush=True)
                 progress.update(len(rows), f'{name}: {figures.mean_m:.3f} m')
     if args.json:
         listed = [{'fault': name, 'seed': seed, **asdict(f)} for name, seed, f in rows]
         print(json.dumps({'recording': given.name, 'runs': listed}))
-    else:
-        print(table(rows))
     return 0
 
 
-def table(rows: Sequence[tuple[str, int, FaultFigures]]) -> str:
-    """One line per run; the first one has no fault."""
-    clean = rows[0][2].mean_m
-    lines = [list(HEADINGS)]
-    for name, seed, f in rows:
-        lines.append([
-            name, str(seed), f'{f.mean_m:.4f} ± {f.std_m:.4f}',
-            f'{f.mean_m / clean:.2f}' if clean > 0.0 else '', f'{f.rot_deg:.2f}',
-            f'{f.lost:.2%}', f'{f.degraded:.2%}', f'{f.ok_and_wrong:.2%}', f'{f.longest_s:.1f}',
-            f'{f.cpu_ms:.2f}', f'{f.real_time_factor:.0f}',
-        ])  # fmt: skip
-    return aligned(lines)
+def line(row: Sequence[str]) -> str:
+    """One line of the table: a study may be stopped, so each is printed when its run ends."""
+    return '  '.join(c.ljust(w) for c, w in zip(row, WIDTHS, strict=True)).rstrip()
+
+
+def cells(name: str, seed: int, f: FaultFigures, clean: float) -> list[str]:
+    """Of one run; ``clean`` is the error [m] without a fault."""
+    return [
+        name, str(seed), f'{f.mean_m:.4f} ± {f.std_m:.4f}',
+        f'{f.mean_m / clean:.2f}' if clean > 0.0 else '', f'{f.rot_deg:.2f}',
+        f'{f.lost:.2%}', f'{f.degraded:.2%}', f'{f.ok_and_wrong:.2%}', f'{f.longest_s:.1f}',
+        f'{f.cpu_ms:.2f}', f'{f.real_time_factor:.0f}',
+    ]  # fmt: skip

@@ -14,7 +14,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 rclpy = pytest.importorskip('rclpy', reason='needs ROS 2 or its wheels')
 
-from nav_msgs.msg import Path  # noqa: E402
+from geometry_msgs.msg import PoseStamped  # noqa: E402
+from nav_msgs.msg import Odometry, Path  # noqa: E402
 from rclpy.serialization import deserialize_message, serialize_message  # noqa: E402
 
 from rlml_slam.cli.support.recorder import Recorder  # noqa: E402
@@ -29,6 +30,7 @@ from rlml_slam.ros.codecs.reflector_clouds import (  # noqa: E402
 )
 from rlml_slam.ros.codecs.serialized_path import serialized_path  # noqa: E402
 from rlml_slam.ros.codecs.update_message import build_update  # noqa: E402
+from rlml_slam.ros.sensors import LATCHED  # noqa: E402
 from rlml_slam.slam.back_end.back_end import Update  # noqa: E402
 from rlml_slam.slam.closures.loop_closure import Closure  # noqa: E402
 from rlml_slam.slam.conversation import SessionFrame  # noqa: E402
@@ -216,3 +218,27 @@ def test_frames_and_their_detections_in_either_order_are_there_to_be_audited(rec
     assert_allclose(seen.poses[:, 0], [0.5, 1.0, 1.5, 2.0, 2.5])
     assert_array_equal(seen.scan, np.repeat(np.arange(5), 2))
     assert_allclose(seen.points[::2, 0], [3.0, 4.0, 5.0, 6.0, 7.0])
+
+
+def test_message_that_cannot_be_used_ends_no_run(recorder):
+    bad = truth(1, 0.0)
+    bad.pose.pose.position.x = float('nan')
+    published = recorder.create_publisher(Odometry, 'ground_truth', 10)
+    mapped = recorder.create_publisher(Path, 'trajectory', LATCHED)
+    deadline = time.monotonic() + 20.0
+    while not (published.get_subscription_count() and mapped.get_subscription_count()):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    stampless = Path(poses=[PoseStamped()])
+    stampless.poses[0].header.stamp.sec = -1
+    mapped.publish(stampless)
+    published.publish(bad)
+    published.publish(truth(2, 1.0))
+    while not (recorder.true and recorder.map.newest):
+        assert time.monotonic() < deadline
+        rclpy.spin_once(recorder, timeout_sec=0.1)
+    assert list(recorder.true) == [2 * SECOND]
+    recorder.on_pose(pose(2, 1.0))
+    run = recorder.run('drive')
+    assert list(run.frames.stamps) == [2 * SECOND]
+    assert recorder.message_guard.refused == {'ground_truth': 1, 'trajectory': 1}

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
+import argparse
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from rlml_lab.faults import fault_catalog as faults
-from rlml_lab.faults import study_stalls
-from rlml_lab.faults.fault_run import is_wrong, longest
+from rlml_lab.faults import study_faults, study_stalls
+from rlml_lab.faults.fault_run import FaultFigures, is_wrong, longest
 from rlml_slam import se2
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.evaluation.run_record import FrameLog
@@ -122,3 +123,24 @@ def test_stalls_in_a_fast_turn_among_furniture_cost_nothing():
     assert max(figures['headings']) < 2.0
     assert figures['ok_and_wrong'] == 0.0
     assert figures['mean_m'] < 1.5 * figures['clean_m']
+
+
+def test_each_row_is_printed_when_its_run_ends(monkeypatch, capsys):
+    printed_before = []
+
+    def one_run(given, fault, seed, params, reference):
+        printed_before.append(capsys.readouterr().out.splitlines())
+        return FaultFigures(0.02 * (1 + seed), 0.01, 0.5, 0.0, 0.1, 0.0, 0.0, 3.0, 60.0), 'path', 0
+
+    monkeypatch.setattr(study_faults, 'run_fault', one_run)
+    monkeypatch.setattr(study_faults.recording, 'load', lambda *given: None)
+    args = argparse.Namespace(
+        recording='', reference=None, fault=['cut 3 s'], seeds=2, config=None, json=False
+    )
+    assert study_faults.run(args) == 0
+    first, second, third = printed_before
+    assert first[0].split()[0] == 'fault'
+    assert second[0].split()[:2] == ['none', '0']
+    assert third[0].split()[:4] == ['cut', '3', 's', '0']
+    last = capsys.readouterr().out.splitlines()[0]
+    assert last.split()[:9] == ['cut', '3', 's', '1', '0.0400', '±', '0.0100', '2.00', '0.50']

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from visualization_msgs.msg import MarkerArray
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.ros.codecs import decode
+from rlml_slam.ros.message_guard import MessageGuard
 
 KINDS: Mapping[str, Any] = {'map': OccupancyGridMsg, 'trajectory': Path, 'graph': MarkerArray}
 
@@ -32,13 +34,17 @@ class HeardMap:
         """A serialized message."""
         self.newest[topic] = data
 
-    def read(self) -> None:
-        """Look into the newest messages."""
+    def read(self, guard: MessageGuard) -> None:
+        """Look into the newest messages; one that cannot be read leaves its part as it was."""
         use: dict[str, Callable[[Any], None]] = {
             'map': self.use_grid, 'trajectory': self.use_path, 'graph': self.use_graph,
         }  # fmt: skip
-        for topic, data in self.newest.items():
-            use[topic](deserialize_message(data, KINDS[topic]))
+
+        def read_one(topic: str) -> None:
+            use[topic](deserialize_message(self.newest[topic], KINDS[topic]))
+
+        for topic in self.newest:
+            guard.pass_on(topic, partial(read_one, topic))
 
     def use_grid(self, msg: Any) -> None:
         """The map."""

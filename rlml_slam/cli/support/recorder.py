@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -28,6 +29,7 @@ from rlml_slam.ros.codecs.frame_messages import read_points, read_record
 from rlml_slam.ros.codecs.message_types import rclpy_class
 from rlml_slam.ros.codecs.reflector_clouds import read_associated, read_reflector_map
 from rlml_slam.ros.codecs.update_message import UpdateSummary, read_update
+from rlml_slam.ros.message_guard import LARGE, Listener, guard_of
 from rlml_slam.ros.sensors import LATCHED
 from rlml_slam.ros.systems.simulator_messages import TRUE_REFLECTORS
 from rlml_slam.se2 import Array
@@ -100,27 +102,40 @@ class Recorder(Node):
         self._reflectors = NO_REFLECTORS
         self._true_reflectors: Detections | None = None
         self._last_true: Array | None = None
-        self._listener: Any = None
+        self._hears_sensor = False
         self._settled = time.monotonic() + SETTLE
-        listen = self.create_subscription
-        listen(PoseWithCovarianceStamped, 'pose', self.on_pose, DEEP)
-        listen(PointCloud2, 'rlml/frames', self.on_frame, DEEP)
-        listen(PointCloud2, 'reflectors/associated', self.on_associated, DEEP)
-        listen(PointCloud2, 'deskewed_points', self.on_points, DEEP, raw=True)
-        listen(PointCloud2, 'updates', self.on_update, DEEP)
-        listen(Odometry, 'ground_truth', self.on_truth, DEEP)
-        listen(PointCloud2, TRUE_REFLECTORS, self.on_true_reflectors, LATCHED)
-        listen(PointCloud2, 'reflector_map_points', self.on_reflectors, LATCHED)
-        listen(DiagnosticArray, '/diagnostics', self.on_diagnostics, DEEP)
+        listened: tuple[tuple[Any, str, Callable[[Any], None], QoSProfile], ...] = (
+            (PoseWithCovarianceStamped, 'pose', self.on_pose, DEEP),
+            (PointCloud2, 'rlml/frames', self.on_frame, DEEP),
+            (PointCloud2, 'reflectors/associated', self.on_associated, DEEP),
+            (PointCloud2, 'updates', self.on_update, DEEP),
+            (Odometry, 'ground_truth', self.on_truth, DEEP),
+            (PointCloud2, TRUE_REFLECTORS, self.on_true_reflectors, LATCHED),
+            (PointCloud2, 'reflector_map_points', self.on_reflectors, LATCHED),
+            (DiagnosticArray, '/diagnostics', self.on_diagnostics, DEEP),
+        )
+        self._listeners = [Listener(self, *given, LARGE) for given in listened]
+        self._guard = guard_of(self)
+        self._listen_raw(PointCloud2, 'deskewed_points', self.on_points, DEEP)
         for topic, kind in KINDS.items():
-            listen(kind, topic, partial(self.map.take, topic), LATCHED, raw=True)
+            self._listen_raw(kind, topic, partial(self.map.take, topic), LATCHED)
+
+    def _listen_raw(
+        self, kind: Any, topic: str, use: Callable[[bytes], None], qos: QoSProfile
+    ) -> None:
+        """Give ``use`` the bytes of every message; one that cannot be used costs only itself."""
+
+        def take(data: bytes) -> None:
+            self._guard.pass_on(topic, lambda: use(data))
+
+        self.create_subscription(kind, topic, take, qos, raw=True)
 
     def is_ready(self) -> bool:
         """Whether front end and back end are there; from then on the sensor is listened to.
 
         Its source waits for this listener, so that nobody misses the beginning.
         """
-        if self._listener is not None:
+        if self._hears_sensor:
             return True
         now = time.monotonic()
         if not (self.count_publishers('pose') and self.count_publishers('graph')):
@@ -131,9 +146,8 @@ class Recorder(Node):
             self.bag.listen(self)
         # bytes: the stamp is all that is wanted of a scan
         topic, kind = self._sensor
-        self._listener = self.create_subscription(
-            rclpy_class(kind), topic, self.on_sensor, SENSOR, raw=True
-        )
+        self._listen_raw(rclpy_class(kind), topic, self.on_sensor, SENSOR)
+        self._hears_sensor = True
         return True
 
     def on_sensor(self, data: bytes) -> None:
@@ -210,7 +224,7 @@ class Recorder(Node):
     def sent(self) -> int:
         """Messages of the sensor that its source says it sent; else those that came here."""
         key = f'{self._sensor[0]} published'
-        counted = [int(f[key]) for f in self.figures.values() if key in f]
+        counted = [int(f[key]) for f in self.figures.values() if f.get(key, '').isdecimal()]
         return counted[0] if counted else self.sensed
 
     def error(self) -> float | None:
@@ -258,7 +272,7 @@ class Recorder(Node):
 
     def run(self, name: str) -> Run:
         """Everything that was heard."""
-        self.map.read()
+        self.map.read(self._guard)
         stamps, log = np.array(sorted(self.true), dtype=np.int64), self._log()
         truth = None
         if len(stamps):
