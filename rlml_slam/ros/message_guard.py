@@ -81,6 +81,18 @@ def guard_of(node: Any) -> MessageGuard:
     return found
 
 
+def listen_to_bytes(
+    node: Any, kind: Any, topic: str, use: Callable[[bytes], None], qos: QoSProfile
+) -> None:
+    """Give ``use`` each message as it is on the wire; what it cannot use is counted."""
+    guard = guard_of(node)
+
+    def take(data: bytes) -> None:
+        guard.pass_on(topic, partial(use, data))
+
+    node.create_subscription(kind, topic, take, qos, raw=True)
+
+
 class Listener:
     """A subscription; ``use`` gets each message of at most ``largest`` bytes that can be read.
 

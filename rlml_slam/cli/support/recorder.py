@@ -29,7 +29,7 @@ from rlml_slam.ros.codecs.frame_messages import read_points, read_record
 from rlml_slam.ros.codecs.message_types import rclpy_class
 from rlml_slam.ros.codecs.reflector_clouds import read_associated, read_reflector_map
 from rlml_slam.ros.codecs.update_message import UpdateSummary, read_update
-from rlml_slam.ros.message_guard import LARGE, Listener, guard_of
+from rlml_slam.ros.message_guard import LARGE, Listener, guard_of, listen_to_bytes
 from rlml_slam.ros.sensors import LATCHED
 from rlml_slam.ros.systems.simulator_messages import TRUE_REFLECTORS
 from rlml_slam.se2 import Array
@@ -116,19 +116,9 @@ class Recorder(Node):
         )
         self._listeners = [Listener(self, *given, LARGE) for given in listened]
         self._guard = guard_of(self)
-        self._listen_raw(PointCloud2, 'deskewed_points', self.on_points, DEEP)
+        listen_to_bytes(self, PointCloud2, 'deskewed_points', self.on_points, DEEP)
         for topic, kind in KINDS.items():
-            self._listen_raw(kind, topic, partial(self.map.take, topic), LATCHED)
-
-    def _listen_raw(
-        self, kind: Any, topic: str, use: Callable[[bytes], None], qos: QoSProfile
-    ) -> None:
-        """Give ``use`` the bytes of every message; one that cannot be used costs only itself."""
-
-        def take(data: bytes) -> None:
-            self._guard.pass_on(topic, lambda: use(data))
-
-        self.create_subscription(kind, topic, take, qos, raw=True)
+            listen_to_bytes(self, kind, topic, partial(self.map.take, topic), LATCHED)
 
     def is_ready(self) -> bool:
         """Whether front end and back end are there; from then on the sensor is listened to.
@@ -146,7 +136,7 @@ class Recorder(Node):
             self.bag.listen(self)
         # bytes: the stamp is all that is wanted of a scan
         topic, kind = self._sensor
-        self._listen_raw(rclpy_class(kind), topic, self.on_sensor, SENSOR)
+        listen_to_bytes(self, rclpy_class(kind), topic, self.on_sensor, SENSOR)
         self._hears_sensor = True
         return True
 
