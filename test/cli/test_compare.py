@@ -127,7 +127,7 @@ def recording(name, folder):
     if not log.exists():
         pytest.skip('the recordings of ../shared are not here')
     assert main(['convert', 'carmen', str(log), str(folder / 'bag')]) == 0
-    return folder / 'bag', 400.0
+    return folder / 'bag', 250.0 if name == 'intel' else 200.0
 
 
 @pytest.fixture(scope='module', params=['hall', 'fr079', 'intel'])
