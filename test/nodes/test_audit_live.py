@@ -21,16 +21,17 @@ HIDDEN, WAS_HIDDEN = 2, np.array([3.1, 0.15])  # in a box
 START = np.array([1.3, 1.2])
 
 
-@pytest.fixture
-def faulty(tmp_path):
+@pytest.fixture(scope='module')
+def faulty(tmp_path_factory):
     """A recorded drive through the room, in which one reflector moved and one is hidden."""
+    folder = tmp_path_factory.mktemp('faulty')
     world = (Path(world_file.__file__).parent / 'worlds' / 'room.yaml').read_text('utf-8')
     assert world.count(f'at: {STOOD.tolist()}') == 1
     world = world.replace(f'at: {STOOD.tolist()}', f'at: {STANDS.tolist()}')
     world = world.replace('boxes:\n', 'boxes:\n  - {at: [3.1, 0.2], size: [0.4, 0.4]}\n')
-    (tmp_path / 'faulty.yaml').write_text(world, encoding='utf-8')
-    assert main(['simulate', str(tmp_path / 'faulty.yaml'), str(tmp_path / 'bag')]) == 0
-    return tmp_path / 'bag'
+    (folder / 'faulty.yaml').write_text(world, encoding='utf-8')
+    assert main(['simulate', str(folder / 'faulty.yaml'), str(folder / 'bag')]) == 0
+    return folder / 'bag'
 
 
 def findings(capsys, *arguments):
@@ -47,7 +48,7 @@ def place(finding):
 def test_live_drive_names_what_is_not_as_planned(faulty, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv('ROS_DOMAIN_ID', str(DOMAIN))
     run, plan = tmp_path / 'run', tmp_path / 'plan'
-    assert main(['live', str(faulty), '--out', str(run)]) == 0
+    assert main(['live', str(faulty), '--out', str(run), '--rate', '3']) == 0
     main(['plan', 'room', '--out', str(plan), '--spacing', '0.5'])
     found = findings(capsys, run, '--plan', plan)
     assert [f['kind'] for f in found] == ['moved', 'hidden']
