@@ -33,6 +33,13 @@ def bags(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope='module')
+def workers():
+    """Options for a worker that has been started already."""
+    with open_client(None, 1) as client:
+        yield '--cluster', client.scheduler.address
+
+
 def fleet(*words) -> int:
     return main(['fleet', *map(str, words)])
 
@@ -44,7 +51,7 @@ def jobs_of(place, out, **options) -> list[Job]:
     ]
 
 
-def test_fleet_replays_as_replay_does_and_finds_it_again(bags, tmp_path, capsys):
+def test_fleet_replays_as_replay_does_and_finds_it_again(bags, workers, tmp_path, capsys):
     first, second = tmp_path / 'first', tmp_path / 'second'
     assert fleet('replay', bags, '--out', first, '--jobs', 1, '--mcap') == 1  # one is broken
     assert 'r2/broken.mcap: not a readable bag' in capsys.readouterr().out
@@ -60,7 +67,7 @@ def test_fleet_replays_as_replay_does_and_finds_it_again(bags, tmp_path, capsys)
     # as a kill leaves it: files without a record
     (first / 'r2/room/run.json').unlink()
     (first / 'r2/room/trajectory.tum').write_text('half')
-    assert fleet('replay', bags, '--out', first, '--jobs', 1, '--mcap', '--json') == 1
+    assert fleet('replay', bags, '--out', first, *workers, '--mcap', '--json') == 1
     figures = json.loads(capsys.readouterr().out)
     assert figures['found_again'] == 1
     assert (first / 'fleet.parquet').read_bytes() == table
@@ -73,22 +80,22 @@ def test_fleet_replays_as_replay_does_and_finds_it_again(bags, tmp_path, capsys)
     assert (second / 'fleet.parquet').read_bytes() == table
 
 
-def test_worse_parameters_are_flagged(bags, tmp_path, capsys):
+def test_worse_parameters_are_flagged(bags, workers, tmp_path, capsys):
     good, bad = tmp_path / 'good', tmp_path / 'bad'
     (tmp_path / 'bad.yaml').write_text(
         '/**: {ros__parameters: {submap.max_laser_range: 0.5, reflector.max_range: 0.5}}'
     )
     place = bags / 'r*/room'
-    assert fleet('replay', place, '--out', good, '--jobs', 1, '--no-report') == 0
-    code = fleet('replay', place, '--out', bad, '--jobs', 1, '--no-report', '--baseline', good,
+    assert fleet('replay', place, '--out', good, *workers, '--no-report') == 0
+    code = fleet('replay', place, '--out', bad, *workers, '--no-report', '--baseline', good,
                  '--config', tmp_path / 'bad.yaml')  # fmt: skip
     assert code == 1
     assert '2 got worse' in capsys.readouterr().out
 
 
-def test_sweep_prints_paired_effects(bags, tmp_path, capsys):
+def test_sweep_prints_paired_effects(bags, workers, tmp_path, capsys):
     out = tmp_path / 'sweep'
-    code = fleet('sweep', bags / 'r*/room', '--out', out, '--jobs', 1, '--json',
+    code = fleet('sweep', bags / 'r*/room', '--out', out, *workers, '--json',
                  '--set', 'reflector.gate=0.99,0.999')  # fmt: skip
     assert code == 0
     found = json.loads(capsys.readouterr().out)

@@ -9,6 +9,7 @@ import pytest
 from made_bags import simulated_bag
 
 from rlml_slam.cli.main import main
+from rlml_slam.fleet.cluster import open_client
 
 pytest.importorskip('distributed')
 fsspec = pytest.importorskip('fsspec')
@@ -18,33 +19,38 @@ pytest.importorskip('moto', reason='no package moto: `make s3` installs it')
 
 def replay(capsys, *words) -> tuple[int, dict]:
     capsys.readouterr()
-    code = main(['fleet', 'replay', *map(str, words), '--jobs', '1', '--no-report', '--json'])
+    code = main(['fleet', 'replay', *map(str, words), '--no-report', '--json'])
     return code, json.loads(capsys.readouterr().out)
 
 
-def test_bags_and_results_in_s3_give_the_same_table(tmp_path, capsys):
+def test_bags_and_results_in_s3_give_the_same_table(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv('AWS_MAX_ATTEMPTS', '2')  # the server that has gone is asked that often
     bags, here = tmp_path / 'bags', tmp_path / 'here'
     simulated_bag(bags / 'r1/room', seed=1)
     (bags / 'r2').mkdir()
     (bags / 'r2/broken.mcap').write_text('nonsense')
-    assert replay(capsys, bags, '--out', here)[0] == 1  # one is broken
+    assert replay(capsys, bags, '--out', here, '--jobs', '1')[0] == 1  # one is broken
     from rlml_lab.fleet.stores import s3_server
 
-    with s3_server():
+    # the workers are started where the server is: they read and write as well
+    with s3_server(), open_client(None, 1) as client:
         fs = fsspec.filesystem('s3')
         fs.mkdir('fleet')
         fs.put(str(bags), 'fleet/bags', recursive=True)
         place, out = 's3://fleet/bags', 's3://fleet/runs'
-        assert replay(capsys, place, '--out', out)[0] == 1
+        workers = ('--cluster', client.scheduler.address)
+        assert replay(capsys, place, '--out', out, *workers)[0] == 1
         assert fs.cat('fleet/runs/fleet.parquet') == (here / 'fleet.parquet').read_bytes()
         assert fs.exists('fleet/runs/r1/room/map.rlml')
 
         fs.rm('fleet/runs/r1/room/run.json')  # as a kill leaves it
-        code, figures = replay(capsys, place, '--out', out)
+        code, figures = replay(capsys, place, '--out', out, *workers)
         assert (code, figures['found_again']) == (1, 0)
-        code, figures = replay(capsys, place, '--out', out, '--baseline', here, '--same-bytes')
+        options = ('--baseline', here, '--same-bytes', *workers)
+        code, figures = replay(capsys, place, '--out', out, *options)
         assert (code, figures['found_again'], figures['worse']) == (0, 1, {})
-        code, figures = replay(capsys, place, '--out', 's3://fleet/again', '--baseline', out)
+        options = ('--baseline', out, *workers)
+        code, figures = replay(capsys, place, '--out', 's3://fleet/again', *options)
         assert (code, figures['found_again'], figures['same_bytes']) == (0, 0, 1)
 
         for words, why in (

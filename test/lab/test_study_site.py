@@ -11,7 +11,7 @@ from rlml_slam import se2
 
 
 def test_sessions_of_a_site_become_one_map(tmp_path, capsys):
-    args = ['--sessions', '7', '--length', '100', '--scans', '2', '--out', str(tmp_path), '--json']
+    args = ['--sessions', '7', '--length', '70', '--scans', '2', '--out', str(tmp_path), '--json']
     mine = np.ones(100_000_000)  # 800 MB, which are none of the process that merges
     assert main(['study', 'site', *args]) == 0
     del mine
