@@ -97,9 +97,8 @@ def cluster() -> Iterator[str]:
     try:
         yield address
     finally:
-        for process in (workers, scheduler):
+        for process in (workers, scheduler):  # workers wait for a scheduler that has gone
             process.terminate()
-        for process in (workers, scheduler):
             process.wait(30.0)
 
 
