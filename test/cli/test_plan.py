@@ -10,11 +10,16 @@ import pytest
 from rlml_slam.cli.main import main
 from rlml_slam.maps import nav2_map
 from rlml_slam.planning import site as sites
+from rlml_slam.report import plan_page
 from rlml_slam.simulation.world_file import load_world
 
 
-def plan(capsys, *arguments) -> tuple[int, str, str]:
-    code = main(['plan', *map(str, arguments)])
+def plan(capsys, *arguments, drawn=True) -> tuple[int, str, str]:
+    """Exit code and what is printed; without pictures where others of the test are drawn."""
+    with pytest.MonkeyPatch.context() as patch:
+        if not drawn:
+            patch.setattr(plan_page, '_map', lambda *arguments: b'')
+        code = main(['plan', *map(str, arguments)])
     out = capsys.readouterr()
     return code, out.out, out.err
 
@@ -45,7 +50,7 @@ def test_map_of_nav2_with_a_layout_and_an_area(tmp_path, capsys):
     rows = [f'{x},{y}' for x, y in site.reflectors.points.tolist()]
     layout.write_text('\n'.join(['x,y', *rows]), encoding='utf-8')
     common = ('--reflectors', layout, '--out', tmp_path / 'out', '--spacing', 1, '--json')
-    _, whole, _ = plan(capsys, tmp_path / 'hall.yaml', *common)
+    _, whole, _ = plan(capsys, tmp_path / 'hall.yaml', *common, drawn=False)
     _, part, _ = plan(capsys, tmp_path / 'hall.yaml', *common, '--area', '0,0 10,0 10,10 0,10')
     assert 0 < json.loads(part)['places'] < json.loads(whole)['places']
 
@@ -77,7 +82,7 @@ def test_layout_as_imk_gives_the_plan_of_the_same_layout_as_csv(tmp_path, capsys
     for name in ('a.csv', 'a.imk'):
         code, out, _ = plan(
             capsys, 'symmetric', '--reflectors', tmp_path / name, '--out', tmp_path / 'out',
-            '--spacing', 1, '--goal', 0.05, '--json',
+            '--spacing', 1, '--goal', 0.05, '--json', drawn=name == 'a.imk',
         )  # fmt: skip
         assert code == 0
         found.append(json.loads(out))
@@ -97,10 +102,11 @@ def test_sensor_file_has_the_noise_the_laser_and_the_range(tmp_path, capsys):
         'both': 'front_end: {ros__parameters: {reflector.sigma_range: 0.04, '
         'reflector.sigma_bearing: 0.006}}\nsimulator: {ros__parameters: {markers.max_range: 8.0}}',
     }
-    found = {'none': json.loads(plan(capsys, *common)[1])}
+    found = {'none': json.loads(plan(capsys, *common, drawn=False)[1])}
     for name, text in sections.items():
         (tmp_path / f'{name}.yaml').write_text(text, encoding='utf-8')
-        found[name] = json.loads(plan(capsys, *common, '--sensor', tmp_path / f'{name}.yaml')[1])
+        options = ('--sensor', tmp_path / f'{name}.yaml')
+        found[name] = json.loads(plan(capsys, *common, *options, drawn=name == 'both')[1])
     sigma = {k: v['reflectors_sigma_m']['median'] for k, v in found.items()}
     assert sigma['noise'] == pytest.approx(2.0 * sigma['none'], rel=1e-6)
     assert found['range']['in_view_median'] < found['none']['in_view_median']
@@ -111,8 +117,13 @@ def test_sensor_file_has_the_noise_the_laser_and_the_range(tmp_path, capsys):
 def test_slower_drives_are_more_accurate_and_hidden_reflectors_count(tmp_path, capsys):
     common = ('symmetric', '--out', tmp_path, '--spacing', 3, '--goal', 0.008, '--json')
     slow, fast, single, hidden = (
-        json.loads(plan(capsys, *common, *more)[1])
-        for more in (('--speed', 0.3), (), ('--speed', 0), ('--redundant', 1))
+        json.loads(plan(capsys, *common, *more, drawn=drawn)[1])
+        for more, drawn in (
+            (('--speed', 0.3), False),
+            ((), False),
+            (('--speed', 0), True),
+            (('--redundant', 1), True),
+        )
     )
     sigma = [f['driving_sigma_m']['median'] for f in (slow, fast, single)]
     assert sigma == sorted(sigma)
@@ -133,8 +144,9 @@ def test_suggested_layout_is_written_and_plans_the_same(tmp_path, capsys):
     for name in ('layout.csv', 'layout.imk'):
         layout = tmp_path / 'a' / name
         _, out, _ = plan(
-            capsys, 'symmetric', '--reflectors', layout, '--out', tmp_path / 'b', *common
-        )
+            capsys, 'symmetric', '--reflectors', layout, '--out', tmp_path / 'b', *common,
+            drawn=name == 'layout.imk',
+        )  # fmt: skip
         again = json.loads(out)
         assert again['reflectors'] == 12
         assert again['driving_sigma_m']['max'] == pytest.approx(
