@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
+from made_bags import beginning
 
 pytest.importorskip('rclpy', reason='needs ROS 2 or its wheels')
 
@@ -77,7 +78,8 @@ def test_demo_drives_maps_and_reports(world, tmp_path):
 
 def test_bag_over_dds_ends_where_its_replay_does(tmp_path, capsys):
     """At twice the recording's pace, to be quick; every message of a small bag gets through."""
-    bag, live, replayed = str(ROOT / 'bags' / 'room'), tmp_path / 'live', tmp_path / 'replayed'
+    bag = str(beginning(ROOT / 'bags' / 'room', tmp_path / 'room', 15.0))
+    live, replayed = tmp_path / 'live', tmp_path / 'replayed'
     mcap = tmp_path / 'live.mcap'
     args = ['live', bag, '--out', str(live), '--rate', '2', '--mcap', str(mcap), '--json']
     assert main(args) == 0
