@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import subprocess
 import sys
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -45,10 +47,38 @@ def name_of(path: Path) -> str:
     return '.'.join(path.relative_to(ROOT).with_suffix('').parts)
 
 
-def imports(path: Path) -> set[str]:
+class Facts(NamedTuple):
+    """What the tests ask of a file."""
+
+    imports: frozenset[str]
+    calls: frozenset[str]  # names of the functions
+    classes: dict[str, int]  # lines
+    arguments: list[int]  # of each function
+
+
+@functools.cache
+def facts(path: Path) -> Facts:
+    """Of a file, which is parsed once."""
+    nodes = list(ast.walk(ast.parse(path.read_text(encoding='utf-8'))))
+    calls = {n.func.id for n in nodes if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)}
+    classes = [n for n in nodes if isinstance(n, ast.ClassDef)]
+    arguments = [n.args for n in nodes if isinstance(n, ast.FunctionDef)]
+    return Facts(
+        frozenset(imports_of(path, nodes)),
+        frozenset(calls),
+        {f'{n.name} in line {n.lineno}': n.end_lineno - n.lineno + 1 for n in classes},
+        [len(a.posonlyargs + a.args + a.kwonlyargs) for a in arguments],
+    )
+
+
+def imports(path: Path) -> frozenset[str]:
     """Every module that a file imports, at its top or inside of a function."""
+    return facts(path).imports
+
+
+def imports_of(path: Path, nodes: list[ast.AST]) -> set[str]:
     found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+    for node in nodes:
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -93,10 +123,7 @@ def test_core_needs_only_numbers(path):
     'path', [p for p in MODULES if tier(name_of(p)) == 'core'], ids=name_of
 )  # fmt: skip
 def test_core_neither_prints_nor_logs(path):
-    tree = ast.parse(path.read_text(encoding='utf-8'))
-    calls = {n.func.id for n in ast.walk(tree) if isinstance(n, ast.Call)
-             and isinstance(n.func, ast.Name)}  # fmt: skip
-    assert 'print' not in calls
+    assert 'print' not in facts(path).calls
     assert 'logging' not in imports(path)
 
 
@@ -134,12 +161,14 @@ def test_folders_import_one_way_at_every_level():
             pytest.fail(f'{level or "top"}: {" imports ".join(e.args[1])}')
 
 
+GRAPH = {name_of(p) for p in MODULES if PACKAGE / 'graph' in p.parents}
+
+
 @pytest.mark.parametrize(
     'path', [p for p in MODULES if PACKAGE / 'graph' not in p.parents], ids=name_of
 )
 def test_graph_is_used_through_its_facade(path):
-    inside = {name_of(p) for p in MODULES if PACKAGE / 'graph' in p.parents}
-    assert imports(path) & inside <= {'rlml_slam.graph.__init__'}
+    assert imports(path) & GRAPH <= {'rlml_slam.graph.__init__'}
 
 
 @pytest.mark.parametrize(
@@ -173,22 +202,14 @@ TESTS_WITH_A_STUDY = {
 PLAIN = re.compile(r'\bt(?:ell(?:s|ing)?|old)\b|\bg(?:one)\b|\ba(?:new)\b', re.IGNORECASE)
 
 
-def nodes_of(kind):
-    for path in MODULES:
-        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
-            if isinstance(node, kind):
-                yield node
-
-
 def test_classes_are_small():
-    for node in nodes_of(ast.ClassDef):
-        lines = node.end_lineno - node.lineno + 1
-        assert lines <= MAX_CLASS, node.name
+    for path in MODULES:
+        for name, lines in facts(path).classes.items():
+            assert lines <= MAX_CLASS, name
 
 
 def test_argument_lists_are_short():
-    arguments = [n.args for n in nodes_of(ast.FunctionDef)]
-    long = [a for a in arguments if len(a.posonlyargs + a.args + a.kwonlyargs) > 8]
+    long = [n for path in MODULES for n in facts(path).arguments if n > 8]
     assert len(long) <= MAX_LONG_LISTS
 
 
