@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import copy
+import functools
 import pickle
 from dataclasses import replace
 
@@ -114,7 +115,7 @@ def test_what_closures_leave_behind_does_not_grow_with_the_laps():
 
 def test_nothing_that_is_kept_grows_with_the_laps():
     """Sightings, edges, records, and all there is together, once the place is mapped."""
-    laps = 24
+    laps = 16
     path = drive(*ROUND * laps, start=START)
     observed = observations(SQUARE, path, rng=np.random.default_rng(0))
     parameters = replace(
@@ -311,6 +312,15 @@ def test_jump_is_not_forgotten_with_the_keyframe_that_it_led_to():
     assert [k.jumped for k in left] == [False, False, True, False]
 
 
+@functools.cache
+def three_laps():
+    """The path of three laps, their observations, and the back end that kept all of them."""
+    path = drive(*ROUND * 3, start=START)
+    observed = observations(SQUARE, path, rng=np.random.default_rng(0))
+    parameters = replace(params(keyframes_per_place=0), node=Node(map_start_pose=START))
+    return path, observed, mapped(observed, parameters)[0]
+
+
 @pytest.mark.parametrize('share', [0.3, 1.0])
 def test_keyframe_that_cannot_be_let_go_of_stays_with_all_it_tells(monkeypatch, share):
     rng = np.random.default_rng(8)
@@ -322,13 +332,9 @@ def test_keyframe_that_cannot_be_let_go_of_stays_with_all_it_tells(monkeypatch, 
             raise SolverError('cannot be tied')
         return marginalize_pose(graph, pose, floor2)
 
+    path, observed, all_ = three_laps()
     monkeypatch.setattr(sparsification, 'marginalize_pose', eliminated)
-    path = drive(*ROUND * 3, start=START)
-    observed = observations(SQUARE, path, rng=np.random.default_rng(0))
-    node = Node(map_start_pose=START)
-    few, all_ = (
-        mapped(observed, replace(params(keyframes_per_place=n), node=node))[0] for n in (2, 0)
-    )
+    few, _ = mapped(observed, replace(params(), node=Node(map_start_pose=START)))
     assert refused
     here = {key.stamp for key in few.keyframes}
     assert len(few.graph.poses) == len(few.keyframes)
