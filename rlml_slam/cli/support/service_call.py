@@ -40,7 +40,11 @@ def asking() -> Iterator[Any]:
 
     rclpy.init()
     try:
-        yield rclpy.create_node('rlml_ask')
+        asker = rclpy.create_node('rlml_ask')
+        try:
+            yield asker
+        finally:
+            asker.destroy_node()
     finally:
         rclpy.shutdown()
 
