@@ -49,7 +49,7 @@ DEEP = QoSProfile(depth=5000)
 SETTLED = 60.0  # [s] of the drive after which memory and time per update are taken
 START_TIMEOUT = 90.0  # [s] for the node to start
 UPDATE = 'time of an update, p99 [ms]'  # in the node's diagnostics
-LINGER = 2.5  # [s] after the drive in which the last diagnostics come
+LINGER = 2.5  # [s] after the drive in which the last answer and diagnostics come
 
 
 @dataclass(frozen=True)
@@ -119,6 +119,7 @@ def run_node(
     Anonymous detections come with ghosts. RlmlError with its last words where a process dies.
     """
     duration, domain = 60.0 * minutes, free_domain()
+    asked = math.floor(duration * Carrier().rate) + 1
     environment = {'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
     simulated = {
         'seed': seed, 'rate': rate, 'duration': duration, 'wait_for_subscribers': 2,
@@ -155,8 +156,13 @@ def run_node(
             listen_until(lambda: ear.time() >= min(SETTLED, 0.5 * duration), patience)
             before, heard = processes.usage('deformable_slam'), ear.time()
             listen_until(lambda: processes.has_ended('carrier_simulator'), patience)
-            end = time.monotonic() + LINGER
-            listen_until(lambda: time.monotonic() > end, START_TIMEOUT)
+            end, reports = time.monotonic() + LINGER, len(ear.heard['/diagnostics'])
+
+            def is_told() -> bool:
+                is_answered = len(ear.heard['pose']) >= asked
+                return is_answered and len(ear.heard['/diagnostics']) > reports
+
+            listen_until(lambda: is_told() or time.monotonic() > end, START_TIMEOUT)
             after = processes.usage('deformable_slam')
         finally:
             executor.shutdown(timeout_sec=1.0)
@@ -165,7 +171,6 @@ def run_node(
     if before is not None and after is not None:
         growth = after.rss_mb - before.rss_mb
         cpu = 1e3 * (after.cpu_s - before.cpu_s) / ((ear.time() - heard) * Carrier().rate)
-    asked = math.floor(duration * Carrier().rate) + 1
     return Drive(asked, *evaluate(ear), growth, cpu)
 
 

@@ -28,6 +28,13 @@ def replayed(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope='module')
+def plan(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('audit') / 'plan'
+    main(['plan', 'room', '--out', str(folder), '--spacing', '0.5'])
+    return folder
+
+
 def audit(capsys, *arguments) -> tuple[int, str, str]:
     capsys.readouterr()
     code = main(['audit', *map(str, arguments)])
@@ -61,16 +68,14 @@ def test_layout_with_another_reflector_has_a_finding(replayed, tmp_path, capsys)
     np.testing.assert_allclose(shift, [-0.06, 0.0], atol=0.02)
 
 
-def test_bag_is_replayed_in_the_map_of_the_plan(tmp_path, capsys):
-    plan = tmp_path / 'plan'
-    main(['plan', 'room', '--out', str(plan), '--spacing', '0.5'])
+def test_bag_is_replayed_in_the_map_of_the_plan(plan, tmp_path, capsys):
     code, out, _ = audit(capsys, ROOM, '--plan', plan, '--out', tmp_path / 'out')
     assert code == 0
     assert 'all is as planned' in out
     assert (tmp_path / 'out/run' / SIGHTINGS).exists()
 
 
-def test_incident_is_audited_as_a_bag(tmp_path, capsys):
+def test_incident_is_audited_as_a_bag(plan, tmp_path, capsys):
     """A file of the black box: inputs as they came, beside poses and health of its node."""
     with AnyReader([ROOM]) as bag:
         received = [Received(at, c.topic, c.msgtype, data) for c, at, data in bag.messages()]
@@ -79,8 +84,6 @@ def test_incident_is_audited_as_a_bag(tmp_path, capsys):
     pose = Published(moving[9].time, moving[9].time, np.zeros(3), np.eye(3), Health())
     path = tmp_path / 'incident-20260101-120000-lost.mcap'
     incident_file.write(path, {'reason': 'lost'}, static, moving, [pose], Parameters())
-    plan = tmp_path / 'plan'
-    main(['plan', 'room', '--out', str(plan), '--spacing', '0.5'])
     code, out, _ = audit(capsys, path, '--plan', plan, '--out', tmp_path / 'out')
     assert code == 0
     assert 'all is as planned' in out

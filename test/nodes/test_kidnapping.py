@@ -44,8 +44,8 @@ def drive(live, front, back, events, end):
             mapper = back.mapper
             for worker in (mapper.worker, mapper.searcher.worker, mapper.worker):
                 worker.submit(lambda: None).result()
-            # and so is that of an answer on its way
-            live.drain(rounds=3 if stamp > START + KIDNAPPED * SECOND else 1)
+            if stamp > START + KIDNAPPED * SECOND:  # and so is that of an answer on its way
+                live.drain(rounds=3)
         if event.time >= START + end * SECOND:
             break
     return frames, truth

@@ -145,7 +145,7 @@ def mapped(reach, path):
 
 
 def test_drive_is_the_same_with_and_without_those_out_of_reach():
-    out = drive((1.0, 0.0, 150.0))
+    out = drive((1.0, 0.0, 100.0))
     path = np.concatenate([out, out[::-1]])
     far, whole = mapped(8.0, path), mapped(1000.0, path)
     np.testing.assert_allclose(far[1], whole[1], atol=1e-7)
