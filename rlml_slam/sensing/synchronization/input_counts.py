@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 class InputCounts:
     """Inputs by stream: used, late, duplicate, future, invalid, waited_out.
 
-    Of the used ones, ``no_returns`` are scans without a valid beam. ``repeated`` ones are old
+    Of the used ones, ``no_returns`` are scans without a valid beam, and ``robot_parts`` those of
+    which beams were left out that see the robot itself. ``repeated`` ones are old
     scans of a robot that has moved since; they are not used.
     """
 

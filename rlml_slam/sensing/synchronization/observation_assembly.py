@@ -16,6 +16,7 @@ from rlml_slam.sensing.deskew import project, sweep_time
 from rlml_slam.sensing.detection_frames import placed
 from rlml_slam.sensing.reflectors.scan_reflectors import ScanReflectors
 from rlml_slam.sensing.repeated_scans import RepeatedScans
+from rlml_slam.sensing.robot_parts import RobotParts
 from rlml_slam.sensing.synchronization.input_counts import InputCounts
 from rlml_slam.sensing.synchronization.odometry_sources import PoseHistory
 from rlml_slam.sensing.synchronization.waiting_queue import Waiting
@@ -43,7 +44,7 @@ class ObservationAssembly:
         self._transforms = transforms or PoseHistory(self._node.tf_buffer_duration)
         self._sensor_poses: dict[str, Array] = {self._node.base_frame: np.zeros(3)}
         self._default_frame: dict[str, str] = {}
-        self._repeats = RepeatedScans()
+        self._repeats, self._parts = RepeatedScans(), RobotParts()
         self.reflectors = ScanReflectors(params.detector, self._node.detect_reflectors)
         self._detects = self._node.use_reflectors
         self.last: int | None = None
@@ -86,7 +87,10 @@ class ObservationAssembly:
             if not isinstance(w.item, Scan):
                 detections = self._in_base(w.item, T_base_sensor)
             elif self._node.use_scan:
-                scan, T = w.item, T_base_sensor
+                T = T_base_sensor
+                scan = self._parts.left_out(w.item, odom_pose, float(T[2]))
+                if scan is not w.item:
+                    self._inputs.count('scan', 'robot_parts')
                 sweep, noise, known = self._sweep(w.item, w.delay, moved)
                 sweep_cov = noise if known else None
                 if self._detects and not any(w.stream == 'reflectors' for w in group):
