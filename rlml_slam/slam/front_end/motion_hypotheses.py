@@ -156,7 +156,7 @@ def _is_odd(motion: Motion, velocity: Array, dt: float) -> bool:
     """Whether the odometry stands exactly still at a speed, or moves suddenly."""
     goes_on = np.abs(se2.exp(velocity * dt))
     if not motion.delta.any():
-        return bool((goes_on > MOVED).any())
+        return bool((goes_on > SAME).any())
     # of a burst of stamps, the times say nothing of the speed
     return dt >= SHORTEST and _penalty(motion.delta, velocity, dt) > 0.5
 

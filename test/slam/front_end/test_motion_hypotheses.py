@@ -55,6 +55,18 @@ def test_odometry_that_stands_while_the_robot_drives_is_doubted():
     np.testing.assert_allclose(found[-1], STEP, atol=1e-9)
 
 
+@pytest.mark.parametrize('dt', [0.03, 0.08])
+def test_odometry_that_stands_in_a_slow_turn_is_doubted_at_once(dt):
+    twist, still = np.array([0.0, 0.0, 0.6]), np.zeros(3)
+    hypotheses, odometry = MotionHypotheses(PARAMS), np.array([1.0, 2.0, 0.3])
+    first = Observation(10**9, motion_of(still, dt, PARAMS.motion), odom_pose=odometry)
+    hypotheses.learn(first, still)
+    stamp = 10**9 + round(dt * 1e9)
+    stalled = Observation(stamp, motion_of(still, dt, PARAMS.motion), odom_pose=odometry)
+    found = [h.observation.motion.delta for h in hypotheses.of(stalled, twist)]
+    np.testing.assert_allclose(found, [still, se2.exp(twist * dt)], atol=1e-9)
+
+
 @pytest.mark.parametrize('known', [True, False], ids=['stands still', 'is missing'])
 def test_step_after_a_stall_is_compared_with_what_scans_have_shown(known):
     drive = Drive()
