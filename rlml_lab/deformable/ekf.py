@@ -22,17 +22,14 @@ class Estimate(NamedTuple):
     cov: Array
 
 
-@kernel
 def predict(state: Array, P: Array, control: Array, drift: Array, noise: Noise) -> None:
     """The state one step on, in place: P <- F P F^T + Q, Q = diag(noise of pose and features).
 
     ``drift`` (M, 2) is the nominal translation of each feature.
     """
     x, y, theta, a, b = motion(state[0], state[1], state[2], control)
-    state[0], state[1], state[2] = x, y, theta
-    for j in range(len(drift)):
-        state[3 + 2 * j] += drift[j, 0]
-        state[4 + 2 * j] += drift[j, 1]
+    state[:3] = x, y, theta
+    state[3:] += drift.reshape(-1)
     advance(P, a, b, noise)
 
 
@@ -46,7 +43,9 @@ def update(
     rows one after the other is the joint update exactly.
     """
     n, M = len(state), len(feature)
-    predicted, gain = state.copy(), np.empty(n)
+    predicted, gain = np.empty(n), np.empty(n)
+    for k in range(n):
+        predicted[k] = state[k]
     z, H, index = np.empty(2), np.empty((2, 5)), np.array([0, 1, 2, 0, 0])
     for j in range(M):
         if math.isnan(sigma[j]):
@@ -58,7 +57,8 @@ def update(
             for k in range(5):
                 innovation -= H[r, k] * (state[index[k]] - predicted[index[k]])
             absorb(P, index, H[r], sigma[j] ** 2, gain)
-            state += gain * innovation
+            for k in range(n):
+                state[k] += gain[k] * innovation
     difference, ends = np.array([-1.0, 1.0]), np.empty(2, np.int64)
     for e in range(len(pairs)):
         if math.isnan(edge[e, 0]):
@@ -67,62 +67,34 @@ def update(
             ends[0], ends[1] = 3 + 2 * pairs[e, 0] + r, 3 + 2 * pairs[e, 1] + r
             innovation = edge[e, r] - (state[ends[1]] - state[ends[0]])
             absorb(P, ends, difference, noise.edge**2, gain)
-            state += gain * innovation
+            for k in range(n):
+                state[k] += gain[k] * innovation
 
 
-@kernel
 def initialize(
     state: Array, P: Array, feature: Array, sigma: Array, edge: Array, pairs: Indices, noise: Noise
 ) -> None:
     """Step 1: pose exactly 0, each feature where it is seen, then the edges, in place."""
-    state[:] = 0.0
-    P[:] = 0.0
-    unseen = np.full(len(sigma), np.nan)
-    for j in range(len(sigma)):
-        for r in range(2):
-            state[3 + 2 * j + r] = feature[j, r]
-            P[3 + 2 * j + r, 3 + 2 * j + r] = sigma[j] ** 2
-    update(state, P, feature, unseen, edge, pairs, noise)
-
-
-@kernel
-def _filter(
-    control: Array, drift: Array, feature: Array, sigma: Array, edge: Array, pairs: Indices,
-    noise: Noise, mean: Array, cov: Array,
-) -> None:  # fmt: skip
-    for run in range(len(mean)):
-        state, P = mean[run], cov[run]
-        initialize(
-            state[0], P[0], feature[run, 0], sigma[run, 0], edge[run, 0], pairs, noise
-        )  # fmt: skip
-        for i in range(1, mean.shape[1]):
-            state[i], P[i] = state[i - 1], P[i - 1]
-            predict(state[i], P[i], control[run, i - 1], drift[run, i - 1], noise)
-            update(
-                state[i], P[i], feature[run, i], sigma[run, i], edge[run, i], pairs, noise
-            )  # fmt: skip
+    state[:3], state[3:] = 0.0, feature.reshape(-1)
+    P[:] = np.diag([0.0, 0.0, 0.0, *np.repeat(sigma**2, 2)])
+    update(state, P, feature, np.full(len(sigma), np.nan), edge, pairs, noise)
 
 
 def run_ekf(measurements: Measurements, noise: Noise) -> Estimate:
     """The filtered estimate of S runs; every feature must be seen at step 1."""
-    S, N, M, _ = measurements.feature.shape
-    n = 3 + 2 * M
-    mean, cov = np.zeros((S, N, n)), np.zeros((S, N, n, n))
     m = measurements
-    _filter(m.control, m.drift, m.feature, m.sigma, m.edge, edges(M), noise, mean, cov)
-    return Estimate(mean, cov)
-
-
-@kernel
-def _reckon(control: Array, drift: Array, feature: Array, mean: Array) -> None:
-    S, N, _ = mean.shape
+    S, N, M, _ = m.feature.shape
+    n, pairs = 3 + 2 * M, edges(M)
+    mean, cov = np.zeros((S, N, n)), np.zeros((S, N, n, n))
     for run in range(S):
-        mean[run, 0, 3:] = feature[run, 0].reshape(-1)
+        state, P = mean[run], cov[run]
+        feature, sigma, edge = m.feature[run], m.sigma[run], m.edge[run]
+        initialize(state[0], P[0], feature[0], sigma[0], edge[0], pairs, noise)
         for i in range(1, N):
-            before, after = mean[run, i - 1], mean[run, i]
-            x, y, theta, _, _ = motion(before[0], before[1], before[2], control[run, i - 1])
-            after[0], after[1], after[2] = x, y, theta
-            after[3:] = before[3:] + drift[run, i - 1].reshape(-1)
+            state[i], P[i] = state[i - 1], P[i - 1]
+            predict(state[i], P[i], m.control[run, i - 1], m.drift[run, i - 1], noise)
+            update(state[i], P[i], feature[i], sigma[i], edge[i], pairs, noise)
+    return Estimate(mean, cov)
 
 
 def dead_reckoning(measurements: Measurements) -> Array:
@@ -130,5 +102,10 @@ def dead_reckoning(measurements: Measurements) -> Array:
     m = measurements
     S, N, M, _ = m.feature.shape
     mean = np.zeros((S, N, 3 + 2 * M))
-    _reckon(m.control, m.drift, m.feature, mean)
+    mean[:, 0, 3:] = m.feature[:, 0].reshape(S, -1)
+    for run in range(S):
+        for i in range(1, N):
+            before, after = mean[run, i - 1], mean[run, i]
+            after[:3] = motion(before[0], before[1], before[2], m.control[run, i - 1])[:3]
+            after[3:] = before[3:] + m.drift[run, i - 1].reshape(-1)
     return mean

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rlml_lab.deformable.ekf import dead_reckoning
 from rlml_lab.deformable.experiment import Measurements, edges
-from rlml_slam.compiled import kernel
+from rlml_slam.compiled import kernel, part
 from rlml_slam.deformable.block_tridiagonal import factorize, solve, solve_upper
 from rlml_slam.deformable.model import Indices, Noise, motion, observe_feature
 from rlml_slam.se2 import Array
@@ -42,7 +42,6 @@ class Smoothed(NamedTuple):
     converged: NDArray[np.bool_]
 
 
-@kernel
 def marginals(diagonal: Array, below: Array, cov: Array) -> None:
     """Cov (N, n, n) <- the diagonal blocks of A^-1, after factorize.
 
@@ -53,14 +52,14 @@ def marginals(diagonal: Array, below: Array, cov: Array) -> None:
         inner = np.eye(n)
         if i + 1 < N:
             inner += below[i].T @ cov[i + 1] @ below[i]
-        for c in range(n):
-            solve_upper(diagonal[i], inner[:, c])
-        for r in range(n):
-            solve_upper(diagonal[i], inner[r])
+        for _ in range(2):  # the columns, then the rows
+            inner = inner.T.copy()
+            for row in inner:
+                solve_upper(diagonal[i], row)
         cov[i] = 0.5 * (inner + inner.T)
 
 
-@kernel
+@part
 def _add_motion(
     before: Array, after: Array, control: Array, drift: Array, noise: Noise, A: Array, B: Array,
     C: Array, g: Array, h: Array,
@@ -108,7 +107,7 @@ def _add_motion(
     return cost
 
 
-@kernel
+@part
 def _add_sightings(
     state: Array, feature: Array, sigma: Array, edge: Array, pairs: Indices, noise: Noise,
     A: Array, g: Array,
@@ -174,43 +173,30 @@ def linearize(
     return cost
 
 
-@kernel
-def _smooth(
-    control: Array, drift: Array, feature: Array, sigma: Array, edge: Array, pairs: Indices,
-    noise: Noise, max_iterations: int, tolerance: float, mean: Array, cov: Array,
-    diagonal: Array, below: Array, cost: Array, iterations: Indices, converged: NDArray[np.bool_],
-) -> None:  # fmt: skip
-    g, A, B = np.empty_like(mean[0]), np.empty_like(diagonal[0]), np.empty_like(below[0])
-    for run in range(len(mean)):
-        state = mean[run]
-        for iteration in range(max_iterations + 1):
-            cost[run] = linearize(
-                state, control[run], drift[run], feature[run], sigma[run], edge[run], pairs,
-                noise, diagonal[run], below[run], g,
-            )  # fmt: skip
-            A[:], B[:] = diagonal[run], below[run]
-            if not factorize(A, B) or converged[run] or iteration == max_iterations:
-                break
-            solve(A, B, g)
-            state -= g
-            iterations[run] = iteration + 1
-            converged[run] = np.max(np.abs(g)) < tolerance
-        marginals(A, B, cov[run])
-        cov[run, 0, :3, :3] = 0.0  # pose 1 is known
-
-
 def run_nls(measurements: Measurements, noise: Noise, start: Array | None = None) -> Smoothed:
     """The smoothed estimate of S runs; ``start`` (S, N, n) is dead reckoning unless given."""
     m = measurements
     mean = dead_reckoning(m) if start is None else np.array(start)
     S, N, n = mean.shape
+    pairs = edges((n - 3) // 2)
     out = Smoothed(
         mean, np.zeros((S, N, n, n)), np.zeros((S, N, n, n)), np.zeros((S, N - 1, n, n)),
         np.zeros(S), np.zeros(S, np.int64), np.zeros(S, np.bool_),
     )  # fmt: skip
-    _smooth(
-        m.control, m.drift, m.feature, m.sigma, m.edge, edges((n - 3) // 2), noise,
-        MAX_ITERATIONS, TOLERANCE, out.mean, out.cov, out.diagonal, out.below, out.cost,
-        out.iterations, out.converged,
-    )  # fmt: skip
+    g = np.empty((N, n))
+    for run in range(S):
+        for iteration in range(MAX_ITERATIONS + 1):
+            out.cost[run] = linearize(
+                mean[run], m.control[run], m.drift[run], m.feature[run], m.sigma[run],
+                m.edge[run], pairs, noise, out.diagonal[run], out.below[run], g,
+            )  # fmt: skip
+            A, B = out.diagonal[run].copy(), out.below[run].copy()
+            if not factorize(A, B) or out.converged[run] or iteration == MAX_ITERATIONS:
+                break
+            solve(A, B, g)
+            mean[run] -= g
+            out.iterations[run] = iteration + 1
+            out.converged[run] = np.max(np.abs(g)) < TOLERANCE
+        marginals(A, B, out.cov[run])
+        out.cov[run, 0, :3, :3] = 0.0  # pose 1 is known
     return out

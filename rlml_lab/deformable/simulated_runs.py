@@ -17,13 +17,13 @@ from rlml_lab.deformable.experiment import (
     edges,
     nominal,
 )
-from rlml_slam.compiled import kernel
+from rlml_slam.compiled import kernel, part
 from rlml_slam.deformable.active import HORIZON, choose_control, offsets
 from rlml_slam.deformable.model import Indices, Noise, Sensor, motion, observe_feature, sigma_at
 from rlml_slam.se2 import Array
 
 
-@kernel
+@part
 def _move(
     state: Array, control: Array, translation: Array, odometry: Array, drift: Array, noise: Noise
 ) -> None:
@@ -37,7 +37,7 @@ def _move(
             state[3 + 2 * j + r] += translation[r] + math.sqrt(noise.drift2) * drift[j, r]
 
 
-@kernel
+@part
 def _measure(
     state: Array, first: bool, draw_feature: Array, draw_edge: Array, pairs: Indices, noise: Noise,
     sensor: Sensor, feature: Array, sigma: Array, edge: Array,
@@ -48,11 +48,11 @@ def _measure(
         observe_feature(state, j, z, H)
         distance = math.hypot(z[0], z[1])
         if not first and not sensor.near <= distance <= sensor.far:
-            feature[j] = np.nan
-            sigma[j] = np.nan
+            feature[j, 0], feature[j, 1], sigma[j] = np.nan, np.nan, np.nan
             continue
         sigma[j] = sigma_at(distance, sensor)
-        feature[j] = z + sigma[j] * draw_feature[j]
+        for r in range(2):
+            feature[j, r] = z[r] + sigma[j] * draw_feature[j, r]
     for e in range(len(pairs)):
         for r in range(2):
             difference = state[3 + 2 * pairs[e, 1] + r] - state[3 + 2 * pairs[e, 0] + r]
@@ -60,49 +60,23 @@ def _measure(
 
 
 @kernel
-def _simulate(
-    planned: Array, translation: Array, start: Array, odometry: Array, walk: Array,
+def _drive(
+    start: int, stop: int, control: Array, translation: Array, odometry: Array, walk: Array,
     draw_feature: Array, draw_edge: Array, pairs: Indices, noise: Noise, sensor: Sensor,
-    candidates: Array, truth: Array, control: Array, feature: Array, sigma: Array, edge: Array,
+    truth: Array, feature: Array, sigma: Array, edge: Array,
 ) -> None:  # fmt: skip
-    S, N, n = truth.shape
-    M = (n - 3) // 2
-    horizon = len(translation) - (N - 1)
-    drift, belief, P = np.empty((M, 2)), np.empty(n), np.empty((n, n))
-    plan = np.empty((horizon, 3))
-    for run in range(S):
-        state = truth[run]
-        state[0, :3] = 0.0
-        state[0, 3:] = start
-        for i in range(N):
-            if i > 0:
-                if len(candidates) == 0:
-                    control[run, i - 1] = planned[i - 1]
-                else:
-                    plan[:] = planned[i - 1]  # the plan is the same at every step
-                    ahead = translation[i - 1 : i - 1 + horizon]
-                    choose_control(
-                        belief, P, plan, ahead, candidates, pairs, noise, sensor,
-                        control[run, i - 1],
-                    )  # fmt: skip
-                state[i] = state[i - 1]
-                _move(
-                    state[i], control[run, i - 1], translation[i - 1], odometry[run, i - 1],
-                    walk[run, i - 1], noise,
-                )  # fmt: skip
-            _measure(
-                state[i], i == 0, draw_feature[run, i], draw_edge[run, i], pairs, noise, sensor,
-                feature[run, i], sigma[run, i], edge[run, i],
+    """The true states of the steps from ``start`` to before ``stop``, and what is measured."""
+    for i in range(start, stop):
+        if i > 0:
+            for k in range(truth.shape[1]):
+                truth[i, k] = truth[i - 1, k]
+            _move(
+                truth[i], control[i - 1], translation[i - 1], odometry[i - 1], walk[i - 1], noise
             )  # fmt: skip
-            if len(candidates) == 0:
-                continue
-            z, s, e = feature[run, i], sigma[run, i], edge[run, i]
-            if i == 0:
-                initialize(belief, P, z, s, e, pairs, noise)
-            else:
-                drift[:] = translation[i - 1]
-                predict(belief, P, control[run, i - 1], drift, noise)
-                update(belief, P, z, s, e, pairs, noise)
+        _measure(
+            truth[i], i == 0, draw_feature[i], draw_edge[i], pairs, noise, sensor, feature[i],
+            sigma[i], edge[i],
+        )  # fmt: skip
 
 
 def simulate(row: Row, draws: Draws) -> tuple[Array, Measurements]:
@@ -112,15 +86,32 @@ def simulate(row: Row, draws: Draws) -> tuple[Array, Measurements]:
     """
     plan = nominal(row.path, HORIZON)
     S, N, M, _ = draws.feature.shape
-    pairs = edges(M)
-    truth, control = np.empty((S, N, 3 + 2 * M)), np.empty((S, N - 1, 3))
+    n, pairs = 3 + 2 * M, edges(M)
+    noise, sensor, candidates = Noise(), SENSORS[row.sensing], offsets()
+    truth, control = np.empty((S, N, n)), np.tile(plan.control[: N - 1], (S, 1, 1))
     feature, sigma = np.empty((S, N, M, 2)), np.empty((S, N, M))
     edge = np.empty((S, N, len(pairs), 2))
-    candidates = offsets() if row.control == 'active' else np.empty((0, 2))
-    _simulate(
-        plan.control, plan.translation, START_FEATURES.reshape(-1), draws.odometry, draws.drift,
-        draws.feature, draws.edge, pairs, Noise(), SENSORS[row.sensing], candidates, truth,
-        control, feature, sigma, edge,
-    )  # fmt: skip
     drift = np.broadcast_to(plan.translation[: N - 1, None], (S, N - 1, M, 2)).copy()
+    belief, P = np.empty(n), np.empty((n, n))
+    for run in range(S):
+        truth[run, 0, :3], truth[run, 0, 3:] = 0.0, START_FEATURES.reshape(-1)
+        u, z, s, e = control[run], feature[run], sigma[run], edge[run]
+        world = (
+            u, plan.translation, draws.odometry[run], draws.drift[run], draws.feature[run],
+            draws.edge[run], pairs, noise, sensor, truth[run], z, s, e,
+        )  # fmt: skip
+        if row.control == 'predetermined':
+            _drive(0, N, *world)
+            continue
+        _drive(0, 1, *world)
+        initialize(belief, P, z[0], s[0], e[0], pairs, noise)
+        for i in range(1, N):
+            # the plan is the same at every step
+            planned, ahead = np.tile(u[i - 1], (HORIZON, 1)), plan.translation[i - 1 :][:HORIZON]
+            choose_control(
+                belief, P, planned, ahead, candidates, pairs, noise, sensor, u[i - 1]
+            )  # fmt: skip
+            _drive(i, i + 1, *world)
+            predict(belief, P, u[i - 1], drift[run, i - 1], noise)
+            update(belief, P, z[i], s[i], e[i], pairs, noise)
     return truth, Measurements(control, drift, feature, sigma, edge)
