@@ -60,6 +60,7 @@ def add_parser(subparsers: Any) -> None:
         '--mcap', metavar='FILE', type=Path,
         help='inputs and estimates as one file for Foxglove, RViz and others',
     )  # fmt: skip
+    parser.add_argument('--no-report', action='store_true', help='no report.html')
     parser.add_argument('--json', action='store_true', help='print metrics.json and no more')
 
 
@@ -91,7 +92,8 @@ def run(args: argparse.Namespace) -> int:
         )
     source = source_of(args.bag)
     result.origin = replace(result.origin, command=args.command_line, source=source)
-    return print_summary(result, write_outputs(result, args.out), args.out, args.json)
+    figures = write_outputs(result, args.out, not args.no_report)
+    return print_summary(result, figures, args.out, args.json, not args.no_report)
 
 
 def load_known(path: Path) -> SavedMap:

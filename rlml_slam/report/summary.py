@@ -98,13 +98,15 @@ def summary_text(title: str, figures: Mapping[str, Any]) -> str:
     return '\n'.join([title, *(f'  {name:<{width}}  {value}' for name, value in rows)])
 
 
-def print_summary(run: Run, figures: Mapping[str, Any], folder: Path, as_json: bool) -> int:
+def print_summary(
+    run: Run, figures: Mapping[str, Any], folder: Path, as_json: bool, report: bool = True
+) -> int:
     """Print the figures of a run whose results are in a folder, and its problem; the exit code."""
     if as_json:
         print(json.dumps(figures))
     else:
         print(summary_text(run.name, figures))
-        print(f'report: {folder / "report.html"}')
+        print(f'report: {folder / "report.html"}' if report else f'results: {folder}')
     if run.problem:
         print(f'rlml: {run.problem}', file=sys.stderr)
     return 1 if run.problem else 0

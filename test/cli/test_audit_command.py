@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +23,9 @@ ROOM = Path(__file__).resolve().parents[2] / 'bags' / 'room'
 
 
 @pytest.fixture(scope='module')
-def replayed(tmp_path_factory):
-    folder = tmp_path_factory.mktemp('audit') / 'run'
-    assert main(['replay', str(ROOM), '--out', str(folder)]) == 0
-    return folder
+def replayed(room_run, tmp_path_factory):
+    """A copy, since an audit writes into the folder of the run."""
+    return shutil.copytree(room_run / 'run', tmp_path_factory.mktemp('audit') / 'run')
 
 
 @pytest.fixture(scope='module')

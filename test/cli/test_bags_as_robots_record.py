@@ -147,16 +147,21 @@ def recorded(tmp_path_factory):
     return folder
 
 
-def test_trajectory_and_reflectors_are_as_with_the_topics(recorded):
+@pytest.fixture(scope='module')
+def with_topics(recorded):
+    """The figures of the drive with topics, without the IMU, which /tf does not have."""
+    p = Parameters()
+    return metrics(replay(recorded / 'topics', replace(p, node=replace(p.node, use_imu=False))))
+
+
+def test_trajectory_and_reflectors_are_as_with_the_topics(recorded, with_topics):
     """Without the IMU, which such a bag does not have.
 
     A laser of 1440 beams measures a reflector at least as well as the simulated detector, 2 cm and
     3 mrad. One of 360 beams, 17 mrad apart, does not, whatever is done with them.
     """
-    p = Parameters()
-    without_imu = replace(p, node=replace(p.node, use_imu=False))
-    topics = metrics(replay(recorded / 'topics', without_imu))
-    run = replay(recorded / 'tf', p)
+    topics = with_topics
+    run = replay(recorded / 'tf', Parameters())
     alone = metrics(run)
     assert alone['health']['OK'] == 1.0
     for error in ('live_ate_rmse_m', 'ate_rmse_m', 'reflector_rmse_m'):
@@ -237,13 +242,10 @@ def as_recorded(source, target, brightness):
     ids=['levels', 'bytes'],
 )
 def test_a_recording_with_all_that_robots_have(
-    recorded, tmp_path, capsys, brightness, said, proposed
+    recorded, with_topics, tmp_path, capsys, brightness, said, proposed
 ):
-    p = Parameters()
     bag = as_recorded(recorded / 'tf', tmp_path / 'bag', brightness)
-    without_imu = replace(p, node=replace(p.node, use_imu=False))
-    topics = metrics(replay(recorded / 'topics', without_imu))
-    run = replay(bag, p)
+    run = replay(bag, Parameters())
     figures = metrics(run)
     assert said in run.topics['reflectors']
     assert run.topics['odom'] == '/tf, odom to base_link'
@@ -251,7 +253,7 @@ def test_a_recording_with_all_that_robots_have(
     assert figures['reflectors_found'] == figures['reflectors_true']
     assert figures['reflectors_spurious'] == figures['reflectors_twice'] == 0
     # at a few levels of brightness the middle of a spot is that of its beams, not of its light
-    assert figures['live_ate_rmse_m'] < 1.5 * topics['live_ate_rmse_m']
+    assert figures['live_ate_rmse_m'] < 1.5 * with_topics['live_ate_rmse_m']
     assert main(['doctor', str(bag)]) == 0
     words = capsys.readouterr().out
     assert said in words

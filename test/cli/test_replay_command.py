@@ -27,22 +27,39 @@ BAGS = Path(__file__).resolve().parents[2] / 'bags'
 SECOND = 1_000_000_000
 
 
-@pytest.fixture(scope='module')
-def replayed(tmp_path_factory):
-    """Two replays of one bag."""
-    folder = tmp_path_factory.mktemp('replay')
-    codes = [main(['replay', str(BAGS / 'room'), '--out', str(folder / n)]) for n in ('a', 'b')]
-    assert codes == [0, 0]
-    return folder
+@pytest.fixture
+def mapped(room_run):
+    """The results of one replay of the room."""
+    return room_run / 'run'
 
 
-def test_two_replays_are_byte_identical(replayed):
-    for name in ('trajectory.tum', 'front_end.tum', 'map.pgm', 'map.yaml', 'reflectors.csv'):
-        assert (replayed / 'a' / name).read_bytes() == (replayed / 'b' / name).read_bytes()
+def test_two_replays_are_byte_identical_but_for_times(mapped, room_again):
+    """The second one has no report, and all other files."""
+    again = room_again / 'run'
+    names = {p.name for p in again.iterdir()}
+    assert {p.name for p in mapped.iterdir()} == names | {'report.html'}
+    assert {'trajectory.tum', 'front_end.tum', 'map.pgm', 'map.yaml', 'reflectors.csv'} < names
+    assert 'report.html' not in names
+    for name in names - {'metrics.json'}:
+        assert (mapped / name).read_bytes() == (again / name).read_bytes(), name
+    figures = [json.loads((folder / 'metrics.json').read_text()) for folder in (mapped, again)]
+    assert figures[0].keys() == figures[1].keys()
+    assert figures[0]['ate_rmse_m'] == figures[1]['ate_rmse_m']
 
 
-def test_room_is_mapped(replayed):
-    f = json.loads((replayed / 'a' / 'metrics.json').read_text())
+def test_summary_names_the_report_where_there_is_one(tmp_path, capsys):
+    write_scans(tmp_path / 'bag', [k * SECOND // 10 for k in range(10, 20)])
+    arguments = ['replay', str(tmp_path / 'bag'), '--out', str(tmp_path / 'out')]
+    assert main([*arguments, '--no-report']) == 0
+    assert capsys.readouterr().out.endswith(f'\nresults: {tmp_path / "out"}\n')
+    assert not (tmp_path / 'out' / 'report.html').exists()
+    assert main(arguments) == 0
+    assert capsys.readouterr().out.endswith(f'\nreport: {tmp_path / "out" / "report.html"}\n')
+    assert (tmp_path / 'out' / 'report.html').exists()
+
+
+def test_room_is_mapped(mapped):
+    f = json.loads((mapped / 'metrics.json').read_text())
     assert f['alignment'] == 'none'
     # a room of a few metres, 2 cm range noise; the bound is a few times what is reached
     assert f['live_ate_rmse_m'] < 0.03
@@ -51,23 +68,23 @@ def test_room_is_mapped(replayed):
     assert f['reflectors_spurious'] == 0
     assert f['inputs']['scan']['invalid'] == 0
     assert f['topics']['scan'] == '/scan'
-    assert len(read_tum(replayed / 'a' / 'trajectory.tum')) == f['scans']
+    assert len(read_tum(mapped / 'trajectory.tum')) == f['scans']
 
 
-def test_bag_is_localized_in_the_map_that_another_replay_made(replayed, tmp_path):
+def test_bag_is_localized_in_the_map_that_another_replay_made(mapped, tmp_path):
     """The robot starts elsewhere than assumed, and the map comes out as it went in."""
     start = tmp_path / 'start.yaml'
     start.write_text('/**:\n  ros__parameters:\n    map_start_pose: [4.0, 3.0, 1.0]\n')
-    arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out')]
-    arguments += ['--map', str(replayed / 'a'), '--config', str(start)]
+    arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out'), '--no-report']
+    arguments += ['--map', str(mapped), '--config', str(start)]
     assert main(arguments) == 0
     f = json.loads((tmp_path / 'out' / 'metrics.json').read_text())
     assert f['keyframes'] == 0
     assert f['health']['OK'] > 0.95
     for name in ('map.pgm', 'map.yaml', 'reflectors.csv'):
-        assert (tmp_path / 'out' / name).read_bytes() == (replayed / 'a' / name).read_bytes()
+        assert (tmp_path / 'out' / name).read_bytes() == (mapped / name).read_bytes()
     found = read_tum(tmp_path / 'out' / 'trajectory.tum')
-    mapped = read_tum(replayed / 'a' / 'trajectory.tum')
+    mapped = read_tum(mapped / 'trajectory.tum')
     error = se2.between(mapped.poses, found.poses)[10:]
     assert np.hypot(error[:, 0], error[:, 1]).max() < 0.04
     assert np.abs(error[:, 2]).max() < 0.02
@@ -79,12 +96,13 @@ def test_folder_without_a_map_is_refused(tmp_path, capsys):
     assert 'neither reflectors.csv nor map.csv' in capsys.readouterr().err
 
 
-def test_given_truth_is_aligned(replayed, tmp_path, capsys):
-    path = read_tum(replayed / 'a' / 'trajectory.tum')
+def test_given_truth_is_aligned(mapped, tmp_path, capsys):
+    path = read_tum(mapped / 'trajectory.tum')
     moved = Trajectory(path.stamps, path.poses + np.array([1.0, 2.0, 0.0]))
     write_tum(tmp_path / 'truth.tum', moved)
     arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out'), '--json']
-    assert main([*arguments, '--truth', str(tmp_path / 'truth.tum')]) == 0
+    arguments += ['--no-report', '--truth', str(tmp_path / 'truth.tum')]
+    assert main(arguments) == 0
     f = json.loads(capsys.readouterr().out)
     assert f['alignment'] == 'se2'
     assert f['ate_rmse_m'] < 1e-6
@@ -93,7 +111,7 @@ def test_given_truth_is_aligned(replayed, tmp_path, capsys):
 def test_summary_says_which_topic_was_taken(tmp_path, capsys):
     config = tmp_path / 'c.yaml'
     config.write_text('/**:\n  ros__parameters:\n    scan_topic: front/scan\n')
-    arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out')]
+    arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out'), '--no-report']
     assert main([*arguments, '--config', str(config)]) == 0
     (row,) = re.findall(r'input scan +(.*)', capsys.readouterr().out)
     # not the one that was asked for, but the only scans there are
@@ -110,7 +128,7 @@ def test_both_topics_of_reflectors_are_told():
 def test_configuration_is_used(tmp_path, capsys):
     config = tmp_path / 'c.yaml'
     config.write_text('/**:\n  ros__parameters:\n    use_scan: false\n')
-    arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out')]
+    arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out'), '--no-report']
     assert main([*arguments, '--config', str(config)]) == 0
     assert 'scan' not in json.loads((tmp_path / 'out' / 'metrics.json').read_text())['inputs']
     config.write_text('/**:\n  ros__parameters:\n    use_scam: false\n')
@@ -120,7 +138,8 @@ def test_configuration_is_used(tmp_path, capsys):
 
 def test_odometry_is_left_out_where_it_is_withheld(tmp_path, capsys):
     out = tmp_path / 'out'
-    assert main(['replay', str(BAGS / 'room'), '--out', str(out), '--no-odometry', '--json']) == 0
+    arguments = ['replay', str(BAGS / 'room'), '--out', str(out), '--no-report']
+    assert main([*arguments, '--no-odometry', '--json']) == 0
     figures = json.loads(capsys.readouterr().out)
     assert 'odom' not in figures['inputs']
     assert figures['inputs']['scan']['used'] > 0
@@ -159,7 +178,9 @@ def test_bag_without_anything_usable_says_why(tmp_path, capsys):
 def test_clock_that_jumps_back_gives_what_came_before(tmp_path, capsys):
     first = [(100 + k) * SECOND for k in range(20)]
     write_scans(tmp_path / 'bag', first + [k * SECOND for k in range(1, 20)])
-    assert main(['replay', str(tmp_path / 'bag'), '--out', str(tmp_path / 'out')]) == 1
+    assert (
+        main(['replay', str(tmp_path / 'bag'), '--out', str(tmp_path / 'out'), '--no-report']) == 1
+    )
     assert 'jumped back' in capsys.readouterr().err
     assert len(read_tum(tmp_path / 'out' / 'trajectory.tum')) == 20
     assert 'jumped back' in json.loads((tmp_path / 'out' / 'metrics.json').read_text())['problem']

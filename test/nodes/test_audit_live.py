@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from live import DOMAIN, ROOM
+from live import DOMAIN
 from std_srvs.srv import Trigger
 
 from rlml_slam.cli.main import main
@@ -56,7 +56,7 @@ def test_live_drive_names_what_is_not_as_planned(faulty, tmp_path, capsys, monke
     assert found[1]['what'].startswith(f'reflector {HIDDEN} at (3.10, 0.15) was seen ')
 
 
-def test_incident_names_what_is_not_as_in_the_map(faulty, live, start, tmp_path, capsys):
+def test_incident_names_what_is_not_as_in_the_map(faulty, room_run, live, start, tmp_path, capsys):
     live.listen('pose', 'geometry_msgs/msg/PoseWithCovarianceStamped')
     front_end = start('front_end', *PARAMETERS)
     live.spin_until(lambda: live.ear.count_publishers('pose') == 1, timeout=60.0)
@@ -70,10 +70,9 @@ def test_incident_names_what_is_not_as_in_the_map(faulty, live, start, tmp_path,
         process.interrupt()
         assert process.finish()[0] == 0
     (incident,) = folder.glob('incident-*.mcap')
-    mapped, run = tmp_path / 'mapped', tmp_path / 'run'
-    assert main(['replay', str(ROOM), '--out', str(mapped)]) == 0
-    assert main(['replay', str(incident), '--map', str(mapped / 'map.rlml'),
-                 '--out', str(run)]) == 0  # fmt: skip
+    run = tmp_path / 'run'
+    assert main(['replay', str(incident), '--map', str(room_run / 'run' / 'map.rlml'),
+                 '--out', str(run), '--no-report']) == 0  # fmt: skip
     found = findings(capsys, run)
     assert [f['kind'] for f in found] == ['moved', 'hidden']
     for finding, at in zip(found, (STOOD, WAS_HIDDEN), strict=True):

@@ -35,19 +35,9 @@ def test_bag_writes_one_file_of_that_name(tmp_path):
 
 
 @pytest.fixture(scope='module')
-def recorded(tmp_path_factory):
-    """Two replays of the sample bag, each with a file."""
-    folder = tmp_path_factory.mktemp('mcap')
-    for name in 'ab':
-        out, mcap = str(folder / name), str(folder / f'{name}.mcap')
-        assert main(['replay', str(ROOM), '--out', out, '--mcap', mcap]) == 0
-    return folder
-
-
-@pytest.fixture(scope='module')
-def messages(recorded):
+def messages(room_run):
     """The messages of the file by topic."""
-    with BagReader(recorded / 'a.mcap') as bag:
+    with BagReader(room_run / 'run.mcap') as bag:
         out = {topic: [] for topic in bag.topics}
         for time, topic, message in bag.messages():
             out[topic].append((time, message))
@@ -55,12 +45,12 @@ def messages(recorded):
     return out
 
 
-def test_two_replays_give_the_same_bytes(recorded):
-    assert (recorded / 'a.mcap').read_bytes() == (recorded / 'b.mcap').read_bytes()
+def test_two_replays_give_the_same_bytes(room_run, room_again):
+    assert (room_run / 'run.mcap').read_bytes() == (room_again / 'run.mcap').read_bytes()
 
 
-def test_poses_are_those_of_the_front_end(recorded, messages):
-    live = read_tum(recorded / 'a' / 'front_end.tum')
+def test_poses_are_those_of_the_front_end(room_run, messages):
+    live = read_tum(room_run / 'run' / 'front_end.tum')
     poses = [decode.pose_estimate(m) for _, m in messages['/pose']]
     assert [p.stamp for p in poses] == live.stamps.tolist()
     assert np.allclose([p.pose for p in poses], live.poses, atol=1e-6)
@@ -91,16 +81,16 @@ def _pose(transform):
     )
 
 
-def test_inputs_are_those_of_the_bag(recorded):
+def test_inputs_are_those_of_the_bag(room_run):
     topics = ('/scan', '/odom', '/reflectors', '/ground_truth')
     for topic in topics:
-        with BagReader(ROOM) as a, BagReader(recorded / 'a.mcap') as b:
+        with BagReader(ROOM) as a, BagReader(room_run / 'run.mcap') as b:
             assert topic in a.topics
             assert list(a.serialized([topic])) == list(b.serialized([topic]))
 
 
-def test_errors_are_those_of_the_report(recorded, messages):
-    figures = json.loads((recorded / 'a' / 'metrics.json').read_text())
+def test_errors_are_those_of_the_report(room_run, messages):
+    figures = json.loads((room_run / 'run' / 'metrics.json').read_text())
     distances = np.array([m.data for _, m in messages['/estimate/error/position']])
     assert np.sqrt((distances**2).mean()) == pytest.approx(figures['live_ate_rmse_m'], abs=1e-6)
     assert len(messages['/estimate/sigma/position']) == figures['scans']
@@ -119,9 +109,9 @@ def test_times_go_on(messages):
         assert times == sorted(times), topic
 
 
-def test_file_replays_as_the_bag_does(recorded):
-    again = replay(recorded / 'a.mcap', Parameters())
-    first = read_tum(recorded / 'a' / 'trajectory.tum')
+def test_file_replays_as_the_bag_does(room_run):
+    again = replay(room_run / 'run.mcap', Parameters())
+    first = read_tum(room_run / 'run' / 'trajectory.tum')
     assert np.array_equal(again.trajectory.stamps, first.stamps)
     # the odometry comes from /tf, which has no speeds
     assert np.allclose(again.trajectory.poses, first.poses, atol=2e-3)
@@ -185,7 +175,7 @@ def test_failed_replay_leaves_no_file(tmp_path, capsys):
 
 
 def test_filter_is_recorded_as_well(tmp_path):
-    args = ['replay', str(ROOM), '--out', str(tmp_path / 'out'), '--system', 'ekf']
+    args = ['replay', str(ROOM), '--out', str(tmp_path / 'out'), '--system', 'ekf', '--no-report']
     assert main([*args, '--mcap', str(tmp_path / 'run.mcap')]) == 0
     with BagReader(tmp_path / 'run.mcap') as bag:
         assert bag.topics['/pose'].count > 10

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,16 +14,13 @@ from rlml_slam.recordings.bag_replay import Given, replay
 from rlml_slam.slam.store import map_file
 from rlml_slam.types import Level
 
-ROOM = Path(__file__).resolve().parents[3] / 'bags' / 'room'
 # the scan fits the submap of the drive again within a few scans; it fits the map elsewhere
 CARRIED = ((1, 6.02, 9.8), (12, 5.50, 9.8), (41, 6.91, 9.1))  # seed, time [s], distance [m]
 
 
-@pytest.fixture(scope='module')
-def known(tmp_path_factory):
-    out = tmp_path_factory.mktemp('room')
-    assert main(['replay', str(ROOM), '--out', str(out), '--json']) == 0
-    return map_file.saved_map(map_file.load(out / 'map.rlml'))
+@pytest.fixture
+def known(room_run):
+    return map_file.saved_map(map_file.load(room_run / 'run' / 'map.rlml'))
 
 
 @pytest.mark.parametrize(('seed', 'at', 'distance'), CARRIED)
