@@ -128,6 +128,8 @@ def locate(
         if best.chi2 > gate(1.0 - params.false_positive_probability, dof):
             scale = best.chi2 / dof
             result = _Search(z, scale * z_cov, p, scale * p_cov, params, max_tests).run(prior)
+    if k == len(points):
+        return result
 
     def of_all(c: Candidate) -> Candidate:
         match = np.full(len(points), -1, dtype=np.int64)
@@ -157,6 +159,8 @@ class _Search:
         self._floor2 = self._gate2 * self._noise
         # expected ghosts per m^2
         self._ghosts = max(1.0, params.false_share * len(z)) / _area(z, self._floor2)
+        covered = len(p) * np.pi * self._gate2 * (self._p_var.mean() + self._z_var.mean())
+        self._covered = min(float(covered / _area(p, self._floor2)), 1.0)  # share, by gates
 
     def run(self, prior: Prior | None) -> Constellation:
         """Verdict and candidates."""
@@ -164,9 +168,8 @@ class _Search:
         if not searched:
             return _not_searched(len(self._z), len(self._p))
         if found:
-            found = [
-                replace(c, chance=self._chance([c.num_matches], proposals)) for c in found
-            ]  # fmt: skip
+            chance = {n: self._chance([n], proposals) for n in {c.num_matches for c in found}}
+            found = [replace(c, chance=chance[c.num_matches]) for c in found]
             result = self._judged(found, proposals)
             return replace(result, rivals=tuple(found[len(result.candidates) :]))
         why = f'no pose matches three of the {len(self._z)} detections with the map'
@@ -187,24 +190,24 @@ class _Search:
         before = PosePrior(pose, information, gate(self._params.gate, 3))
         votes = vote(seen, known, pairs, buckets, self._gate2, before, self._max_tests)
         found: list[Candidate] = []
-        matches = np.full((MAX_CANDIDATES, len(self._z)), -1, dtype=np.int64)
-        for n in np.argsort(-votes.counts, kind='stable'):
-            a, b, i, j = votes.bases[n]
+        matches = np.full((len(self._z), MAX_CANDIDATES), -1, dtype=np.int64)
+        bases = votes.bases[np.argsort(-votes.counts, kind='stable')]
+        for base, (a, b, i, j) in zip(bases, bases.tolist(), strict=True):
             # a pose that has both matches of the proposal already is what it would lead to
-            if ((matches[:, a] == i) & (matches[:, b] == j)).any():
+            if ((matches[a] == i) & (matches[b] == j)).any():
                 continue
             T, cov, match, chi2 = refine(
-                votes.bases[n], seen, known, buckets, self._gate2, self._noise, before
+                base, seen, known, buckets, self._gate2, self._noise, before
             )
             if (match >= 0).sum() < MIN_MATCHES:
                 continue
             candidate = self._scored(T, cov, match, chi2)
             twin = _twin(candidate, found)
             if twin is None:
-                matches[len(found)] = match
+                matches[:, len(found)] = match
                 found.append(candidate)
             elif _rank(candidate) < _rank(found[twin]):
-                matches[twin], found[twin] = match, candidate
+                matches[:, twin], found[twin] = match, candidate
             if len(found) == MAX_CANDIDATES:
                 break
         return sorted(found, key=_rank), votes.proposals, votes.searched
@@ -275,9 +278,7 @@ class _Search:
         has some of its own.
         """
         others = len(self._z) - 2
-        var = self._p_var.mean() + self._z_var.mean()
-        covered = len(self._p) * np.pi * self._gate2 * var / _area(self._p, self._floor2)
-        share = min(float(covered), 1.0)
+        share = self._covered
         if len(num_matches) > TYPICAL:
             s = sorted(num_matches)[-1 - TYPICAL] - 2
             # at which so many proposals are expected to reach what that many do
@@ -296,7 +297,8 @@ def _area(points: Array, floor2: float) -> float:
     6 sqrt(det cov) is the area of a square with the points on its sides, and half of it with the
     points all over it: the less is safe, for it makes chance likelier.
     """
-    l_0, l_1 = np.linalg.eigvalsh(np.cov(points.T, bias=True))
+    d = (points - points.mean(axis=0)).T
+    l_0, l_1 = np.linalg.eigvalsh(d.dot(d.T) * (1.0 / len(points)))  # faster than np.cov
     return float(6.0 * np.sqrt((l_0 + floor2) * (l_1 + floor2)))
 
 
