@@ -62,6 +62,9 @@ class Node(Group, prefix=''):
     filter_stamps: bool = param(
         True, 'remove the jitter of the stamps of sensors with a constant rate'
     )
+    leave_out_robot_parts: bool = param(
+        True, 'leave out beams that see the robot itself: their range stays the same as it moves'
+    )
     use_scan: bool = param(True, 'match scans against the submap')
     use_reflectors: bool = param(True, 'use reflector detections')
     detect_reflectors: str = param(

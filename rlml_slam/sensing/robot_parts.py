@@ -2,9 +2,10 @@
 """Beams that see the robot itself: its frame, a mast, a cart that it tows.
 
 They have the same range wherever the robot goes, and so hold it where it is. A thing that stays
-where it is comes nearer or moves away: a wall by three times its distance while the robot turns by
+where it is comes nearer or moves away: a wall to three times its distance while the robot turns by
 TURN; and while it drives straight on, whatever is no surface along its way. Beams whose range has
-not changed meanwhile are left out, until they see something else.
+not changed meanwhile are left out, until they see something else. A pillar that a robot goes round
+looks the same, so nothing is left out that is farther away than FARTHEST.
 """
 
 from __future__ import annotations
@@ -22,6 +23,10 @@ from rlml_slam.types import Scan
 SAME = 0.05  # [m] from the first of these ranges: noise of a laser at short range
 TURN = 2.5  # [rad] between the two ends of the headings at which a range was the same
 MOVED, STRAIGHT = 0.25, 0.05  # [m], [rad] straight on, with the same range
+TURNED = 0.3  # [rad] or MOVED: a step, after which the scan must have changed
+# share of the returns that have changed after a step, by [m] and by [m] per range: odometry alone
+# may drift or spin
+CHANGED, FAR, FARTHER = 0.1, 0.125, 0.01
 # [m] width across the way of what neighbours see, and of that per metre along it: a robot comes
 # nearer by more than 2 SAME to any surface that is as wide
 ACROSS, SLANT = 0.1, 0.5
@@ -36,31 +41,43 @@ MOST = 0.5  # share of the returns: if more do not change, it is the odometry th
 class _Beams:
     """Of each beam of a lidar (n,): its range, number of scans, and headings with that range.
 
-    ``since`` (n, 2) is the position by odometry at the first of these scans, ``away`` the number
-    of scans in a row with another range.
+    ``away`` is the number of scans in a row with another range. The last step began ``scans``
+    ago at ``pose`` (3,) with the ranges ``then`` (n,).
     """
 
     range: Array
     count: NDArray[np.int64]
     least: Array
     most: Array
-    since: Array
     is_part: NDArray[np.bool_]
     away: NDArray[np.int64]
+    pose: Array
+    last: Array
+    then: Array
+    scans: int = -1
+    heading: float = 0.0  # sum of the turns of all steps after which the scan had changed
 
-    def begin(self, which: NDArray[np.bool_], ranges: Array, place: Array) -> None:
+    @classmethod
+    def of(cls, ranges: Array, pose: Array) -> _Beams:
+        """Nothing is known of these ranges (n,), NaN where there is no return."""
+        n = len(ranges)
+        return cls(
+            ranges.copy(), np.zeros(n, np.int64), np.zeros(n), np.zeros(n), np.zeros(n, np.bool_),
+            np.zeros(n, np.int64), pose, pose, ranges,
+        )  # fmt: skip
+
+    def begin(self, which: NDArray[np.bool_], ranges: Array) -> None:
         """These beams have other ranges from now on."""
         self.is_part[which], self.count[which], self.away[which] = False, 0, 0
-        self.least[which], self.most[which] = math.inf, -math.inf
-        self.range[which], self.since[which] = ranges[which], place
+        self.least[which] = self.most[which] = self.heading
+        self.range[which] = ranges[which]
 
 
 class RobotParts:
-    """What each lidar sees of its robot, by its frame; odometry tells how that moved."""
+    """What each lidar sees of its robot, by its frame, from how ranges change with odometry."""
 
     def __init__(self) -> None:
         self._beams: dict[str, _Beams] = {}
-        self._heading: float | None = None  # of the odometry, without jumps by a full turn
 
     def left_out(self, scan: Scan, odometry: Array | None, mounted: float) -> Scan:
         """The scan with NaN where a beam sees the robot; itself if none does.
@@ -68,60 +85,74 @@ class RobotParts:
         ``odometry`` (3,) is the pose at the stamp of the scan; without it, nothing is learned.
         ``mounted`` [rad] is the heading of the lidar on the robot.
         """
-        n = len(scan.ranges)
-        beams = self._beams.get(scan.frame_id)
-        if beams is None or len(beams.range) != n:
-            none, never = np.zeros(n, np.int64), np.full(n, math.inf)
-            beams = _Beams(
-                np.zeros(n), none, never, -never, np.zeros((n, 2)), none > 0, none.copy()
-            )
-            self._beams[scan.frame_id] = beams
         returns = (scan.ranges >= scan.range_min) & (scan.ranges <= scan.range_max)
+        ranges = np.where(returns, scan.ranges, np.nan)
+        b = self._beams.get(scan.frame_id)
         if odometry is not None:
-            last = float(odometry[2]) if self._heading is None else self._heading
-            self._heading = last + float(se2.wrap(odometry[2] - last))
-            pose = np.array([odometry[0], odometry[1], self._heading])
-            _learn(beams, np.where(returns, scan.ranges, np.nan), pose)
-            _find(beams, scan, pose, mounted, int(returns.sum()))
-        parts = beams.is_part & returns
-        if not parts.any():
+            if b is None or len(b.range) != len(ranges) or _jumps(b.last, odometry):
+                b = self._beams[scan.frame_id] = _Beams.of(ranges, odometry)
+            b.last = odometry
+            _learn(b, ranges)
+            _find(b, scan, ranges, mounted)
+        if b is None or len(b.range) != len(ranges) or not (b.is_part & returns).any():
             return scan
-        return replace(scan, ranges=np.where(parts, np.float32(np.nan), scan.ranges))
+        return replace(scan, ranges=np.where(b.is_part, np.float32(np.nan), scan.ranges))
 
 
-def _learn(b: _Beams, ranges: Array, pose: Array) -> None:
-    """Take the ranges (n,) at a pose (3,), NaN where there is no return."""
-    same = (np.abs(ranges - b.range) < SAME) & (b.count > 0)
-    other = ~same & np.isfinite(ranges)
-    b.away = np.where(other, b.away + 1, np.where(same, 0, b.away))
-    begins = other & (~b.is_part | (b.away >= GONE))
-    b.begin(begins, ranges, pose[:2])
-    seen = same | begins
-    b.count[seen] += 1
-    b.least[seen] = np.minimum(b.least[seen], pose[2])
-    b.most[seen] = np.maximum(b.most[seen], pose[2])
+def _jumps(last: Array, pose: Array) -> bool:
+    """Whether odometry was set to another pose, or drove too far between two scans to tell."""
+    x, y, turn = se2.between(last, pose)
+    return math.hypot(x, y) > 2.0 * MOVED or abs(turn) > 1.0
 
 
-def _find(b: _Beams, scan: Scan, pose: Array, mounted: float, returns: int) -> None:
-    """Find the beams that no thing which stays where it is can explain."""
-    often = (b.count >= FEWEST) & ~b.is_part
-    found = often & (b.most - b.least > TURN)
-    way = pose[:2] - b.since
-    moved = often & (b.most - b.least < STRAIGHT) & (np.hypot(way[:, 0], way[:, 1]) > MOVED)
-    if moved.any():
-        angles = scan.angle_min + scan.angle_increment * np.arange(len(b.range))
-        # end points along and across the way of each
-        turned = angles + mounted + pose[2] - np.arctan2(way[:, 1], way[:, 0])
-        along, across = b.range * np.cos(turned), b.range * np.sin(turned)
-        joined = moved[1:] & moved[:-1] & (np.abs(np.diff(b.range)) < ACROSS)
-        ends = np.concatenate(([-1], np.flatnonzero(~joined), [len(moved) - 1]))
-        for k in np.flatnonzero(np.diff(ends) >= NEIGHBOURS).tolist():
-            one = slice(ends[k] + 1, ends[k + 1] + 1)
-            wide = np.ptp(across[one])
-            found[one] |= bool(wide > max(ACROSS, SLANT * np.ptp(along[one])))
-    if not found.any():
+def _learn(b: _Beams, ranges: Array) -> None:
+    """Take the ranges (n,), NaN where there is no return."""
+    known = np.isfinite(ranges)
+    same = np.abs(ranges - b.range) < SAME
+    b.away = np.where(same, 0, b.away + known)
+    b.begin(~same & (~b.is_part | (b.away >= GONE)), ranges)
+    b.count += known
+
+
+def _find(b: _Beams, scan: Scan, ranges: Array, mounted: float) -> None:
+    """After a step, find the beams that no thing which stays where it is can explain."""
+    b.scans += 1
+    x, y, turn = se2.between(b.pose, b.last)
+    way = math.hypot(x, y)
+    if way < MOVED and abs(turn) < TURNED:
         return
-    if found.sum() > MOST * returns:
-        b.begin(found, b.range, pose[:2])
-    else:
-        b.is_part |= found & (b.range < FARTHEST)
+    returns = np.isfinite(ranges).sum()
+    changed = np.abs(ranges - b.then) > FAR + FARTHER * ranges
+    if changed.sum() >= CHANGED * returns:
+        b.heading += float(turn)
+        b.least, b.most = np.minimum(b.least, b.heading), np.maximum(b.most, b.heading)
+        found = b.is_part | _without_single(b.most - b.least > TURN)
+        if way >= MOVED and abs(turn) < STRAIGHT:
+            found |= _in_the_way(b, scan, math.atan2(y, x) - mounted)
+        found &= (b.count >= FEWEST) & np.isfinite(ranges)
+        if found.sum() > MOST * returns:
+            b.begin(found, ranges)
+        else:
+            b.is_part |= found & (b.range < FARTHEST)
+    b.pose, b.then, b.scans = b.last, ranges, 0
+
+
+def _without_single(found: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The beams (n,) of three neighbours or more: noise may hold one at its range."""
+    middle = found & np.roll(found, 1) & np.roll(found, -1)
+    return middle | np.roll(middle, 1) | np.roll(middle, -1)
+
+
+def _in_the_way(b: _Beams, scan: Scan, heading: float) -> NDArray[np.bool_]:
+    """Beams (n,) with the same range during a step, on what is no surface along it."""
+    same = b.count > b.scans
+    angles = scan.angle_min + scan.angle_increment * np.arange(len(same)) - heading
+    along, across = b.range * np.cos(angles), b.range * np.sin(angles)
+    joined = same[1:] & same[:-1] & (np.abs(np.diff(b.range)) < ACROSS)
+    ends = np.concatenate(([-1], np.flatnonzero(~joined), [len(same) - 1]))
+    found = np.zeros(len(same), np.bool_)
+    for k in np.flatnonzero(np.diff(ends) >= NEIGHBOURS).tolist():
+        one = slice(ends[k] + 1, ends[k + 1] + 1)
+        wide = np.ptp(across[one])
+        found[one] = wide > max(ACROSS, SLANT * np.ptp(along[one]))
+    return found

@@ -35,7 +35,7 @@ class HeardMap:
         self.newest[topic] = data
 
     def read(self, guard: MessageGuard) -> None:
-        """Look into the newest messages; one that cannot be read leaves its part as it was."""
+        """Look into the newest messages; without one that can be read, its part stays empty."""
         use: dict[str, Callable[[Any], None]] = {
             'map': self.use_grid, 'trajectory': self.use_path, 'graph': self.use_graph,
         }  # fmt: skip

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import random
 import signal
@@ -111,6 +112,7 @@ def free_domain() -> int:
             continue
         if all(map(_is_free, ports)):
             _RESERVED.append(own)
+            atexit.register(own.close)
             return domain
         own.close()
     raise RlmlError('no free ROS domain on this machine')

@@ -29,6 +29,7 @@ class Progress:
             self._bar = Bar(
                 TextColumn('{task.description}'), BarColumn(), TaskProgressColumn(),
                 TextColumn('{task.fields[note]}'), console=Console(stderr=True), transient=True,
+                redirect_stdout=sys.stdout.isatty(),  # else what is printed would go to stderr
             )  # fmt: skip
             self._task = self._bar.add_task(what, total=self._total, note='')
 

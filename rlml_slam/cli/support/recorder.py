@@ -36,6 +36,7 @@ from rlml_slam.se2 import Array
 from rlml_slam.types import Detections, Frame, Health, Level, Reflectors, Status
 
 SCAN = ('scan', 'sensor_msgs/msg/LaserScan')
+TRUTH = 'ground_truth'
 DEEP = QoSProfile(depth=1000)  # of the small messages, none may be lost
 SENSOR = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 PATIENCE = 15.0  # [s] in which a busy machine may catch up with what was sent
@@ -109,7 +110,7 @@ class Recorder(Node):
             (PointCloud2, 'rlml/frames', self.on_frame, DEEP),
             (PointCloud2, 'reflectors/associated', self.on_associated, DEEP),
             (PointCloud2, 'updates', self.on_update, DEEP),
-            (Odometry, 'ground_truth', self.on_truth, DEEP),
+            (Odometry, TRUTH, self.on_truth, DEEP),
             (PointCloud2, TRUE_REFLECTORS, self.on_true_reflectors, LATCHED),
             (PointCloud2, 'reflector_map_points', self.on_reflectors, LATCHED),
             (DiagnosticArray, '/diagnostics', self.on_diagnostics, DEEP),
@@ -186,11 +187,11 @@ class Recorder(Node):
 
     def on_truth(self, msg: Odometry) -> None:
         """Where the robot really is."""
-        pose = decode.planar_pose(msg.pose.pose, 'ground_truth')
+        stamp, pose = decode.stamp(msg, TRUTH), decode.planar_pose(msg.pose.pose, TRUTH)
         if self._last_true is not None:
             self.distance += float(np.hypot(*(pose - self._last_true)[:2]))
         self._last_true = pose
-        self.true[decode.stamp(msg, 'ground_truth')] = pose
+        self.true[stamp] = pose
 
     def on_true_reflectors(self, msg: PointCloud2) -> None:
         """Where the reflectors really are."""

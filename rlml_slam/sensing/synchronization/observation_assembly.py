@@ -87,8 +87,9 @@ class ObservationAssembly:
             if not isinstance(w.item, Scan):
                 detections = self._in_base(w.item, T_base_sensor)
             elif self._node.use_scan:
-                T = T_base_sensor
-                scan = self._parts.left_out(w.item, odom_pose, float(T[2]))
+                scan, T = w.item, T_base_sensor
+                if self._node.leave_out_robot_parts:
+                    scan = self._parts.left_out(w.item, odom_pose, float(T[2]))
                 if scan is not w.item:
                     self._inputs.count('scan', 'robot_parts')
                 sweep, noise, known = self._sweep(w.item, w.delay, moved)

@@ -50,6 +50,7 @@ def run(place, seed=None, seen=1.0, way=TWICE, **kwargs):
 def rmse(slam):
     """Of the position [m]."""
     poses = slam.back_end.trajectory()[1]
+    assert len(poses) in (len(TWICE), len(ROUND))
     return float(np.sqrt(((poses[:, :2] - ROUND[: len(poses), :2]) ** 2).sum(axis=1).mean()))
 
 
