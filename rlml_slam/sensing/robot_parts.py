@@ -100,7 +100,7 @@ class RobotParts:
 
 
 def _jumps(last: Array, pose: Array) -> bool:
-    """Whether odometry was set to another pose, or drove too far between two scans to tell."""
+    """Whether odometry was set to another pose, or drove too far between two scans."""
     x, y, turn = se2.between(last, pose)
     return math.hypot(x, y) > 2.0 * MOVED or abs(turn) > 1.0
 

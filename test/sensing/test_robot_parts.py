@@ -119,8 +119,8 @@ def test_odometry_that_is_reset_beside_a_wall_is_no_way():
     for k, x in enumerate(np.linspace(1.0, 5.0, 60)):
         pose = np.array([x, 4.5, 0.0])
         given = scan(in_room(pose, 0.01, rng))
-        told = pose if k < 30 else pose - np.array([3.0, 1.0, 0.0])
-        assert parts.left_out(given, told, 0.0) is given
+        reported = pose if k < 30 else pose - np.array([3.0, 1.0, 0.0])
+        assert parts.left_out(given, reported, 0.0) is given
 
 
 def test_wall_that_is_out_of_sight_in_a_turn_and_there_again_is_no_part():
