@@ -16,12 +16,11 @@ from nav_msgs.msg import MapMetaData, OccupancyGrid, Odometry
 from rclpy.node import Node
 
 from rlml_lab.dropin.robot import LATCHED, TRUTH
+from rlml_lab.dropin.tf_messages import tf_message
 from rlml_slam import se2
 from rlml_slam.ros.codecs import decode, encode
 from rlml_slam.ros.codecs.message_types import make_rclpy as make
-from rlml_slam.ros.codecs.message_types import rclpy_class
 from rlml_slam.ros.run import run
-from rlml_slam.ros.tf import TF_MESSAGE
 from rlml_slam.simulation.robot import SECOND
 
 TOPICS = ('map', 'map_metadata', 'amcl_pose', 'particle_cloud')
@@ -41,7 +40,7 @@ class Amcl(Node):
 
     def __init__(self) -> None:
         super().__init__('amcl')
-        kind: Any = rclpy_class(TF_MESSAGE)
+        kind = tf_message()
         self._odom: dict[int, Any] = {}
         self._next = 0
         self._tf = self.create_publisher(kind, '/tf', 100)

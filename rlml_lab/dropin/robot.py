@@ -18,13 +18,12 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import LaserScan
 
+from rlml_lab.dropin.tf_messages import tf_message
 from rlml_slam.params import Simulator, SimulatorParameters
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_rclpy as make
-from rlml_slam.ros.codecs.message_types import rclpy_class
 from rlml_slam.ros.run import run
 from rlml_slam.ros.systems.simulator_messages import SimulatedMessages
-from rlml_slam.ros.tf import TF_MESSAGE
 from rlml_slam.simulation.simulation import START, GroundTruth, Simulation
 from rlml_slam.simulation.world_file import load_world
 from rlml_slam.types import Odometry as Wheels
@@ -43,7 +42,7 @@ class Robot(Node):
         values = SimulatorParameters(node=Simulator(world=WORLD, repeat=True))
         self._simulation = Simulation(load_world(WORLD), values)
         self._convert = SimulatedMessages(make, values)
-        kind: Any = rclpy_class(TF_MESSAGE)
+        kind = tf_message()
         self._tf = self.create_publisher(kind, '/tf', 100)
         self._scan = self.create_publisher(LaserScan, 'scan', qos_profile_sensor_data)
         self._truth = self.create_publisher(Odometry, TRUTH, 100)

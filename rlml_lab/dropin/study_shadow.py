@@ -22,6 +22,7 @@ from rclpy.serialization import deserialize_message
 
 from rlml_lab.dropin import amcl
 from rlml_lab.dropin.robot import TRUTH
+from rlml_lab.dropin.tf_messages import tf_message
 from rlml_slam.cli.main import main
 from rlml_slam.cli.support.live_session import node, own_domain
 from rlml_slam.cli.support.processes import Processes, free_domain
@@ -49,6 +50,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print what came on shared names, and how far the two were apart; 1 where we were there."""
+    tf_message()
     domain = free_domain()
     environment = {
         'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',

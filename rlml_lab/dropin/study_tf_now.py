@@ -23,12 +23,11 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from rlml_lab.dropin.buffer_core import INSTALL, BufferCore, is_installed
+from rlml_lab.dropin.tf_messages import tf_message
 from rlml_slam.cli.support.live_session import node, own_domain
 from rlml_slam.cli.support.processes import Processes, free_domain
 from rlml_slam.errors import RlmlError
 from rlml_slam.ros.codecs import decode
-from rlml_slam.ros.codecs.message_types import rclpy_class
-from rlml_slam.ros.tf import TF_MESSAGE
 from rlml_slam.simulation.robot import SECOND
 
 PERIOD = 0.02  # [s] between questions
@@ -47,6 +46,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print how often tf2 refused, of which question; 1 where it ever did."""
+    tf_message()
     if not is_installed():
         raise RlmlError(f"the system's Python has no tf2: {INSTALL}")
     domain = free_domain()
@@ -86,7 +86,7 @@ class Listener(Node):
         self.waits: list[float] = []  # [ms]
         self.ahead: list[float] = []  # [ms] of the newest map to odom, when it is asked for
         self._dated = 0
-        kind: Any = rclpy_class(TF_MESSAGE)
+        kind = tf_message()
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.create_subscription(kind, '/tf', self._on_tf, QoSProfile(depth=100))
         self.create_subscription(kind, '/tf_static', self._on_tf, latched)
