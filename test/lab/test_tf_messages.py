@@ -5,8 +5,8 @@ import pytest
 
 pytest.importorskip('rclpy', reason='needs ROS 2 or its wheels')
 
-from rlml_lab.dropin import study_shadow, study_tf_now, tf_messages  # noqa: E402
-from rlml_slam.errors import RlmlError  # noqa: E402
+from rlml_lab.dropin import study_shadow, study_tf_now, tf_messages
+from rlml_slam.errors import RlmlError
 
 
 @pytest.mark.parametrize('study', [study_shadow, study_tf_now])
