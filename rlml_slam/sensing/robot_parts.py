@@ -89,8 +89,11 @@ class RobotParts:
         ranges = np.where(returns, scan.ranges, np.nan)
         b = self._beams.get(scan.frame_id)
         if odometry is not None:
-            if b is None or len(b.range) != len(ranges) or _jumps(b.last, odometry):
+            if b is None or len(b.range) != len(ranges):
                 b = self._beams[scan.frame_id] = _Beams.of(ranges, odometry)
+            elif _jumps(b.last, odometry):
+                b.begin(~b.is_part, ranges)
+                b.pose, b.then, b.scans = odometry, ranges, -1
             b.last = odometry
             _learn(b, ranges)
             _find(b, scan, ranges, mounted)

@@ -103,6 +103,16 @@ def test_a_cart_that_is_left_behind_is_seen_again():
     assert not out[-1].any()
 
 
+def test_mast_that_was_found_stays_left_out_where_scans_are_far_apart():
+    seen, change = mast(0.0)
+    parts, rng = RobotParts(), np.random.default_rng(8)
+    out = drive(parts, straight(0.5), change, rng=rng)
+    assert (out[-1] == seen).all()
+    out = drive(parts, straight(5.0, 6), change, rng=rng)
+    assert out[:, seen].all()
+    assert not out[:, ~seen].any()
+
+
 @pytest.mark.parametrize('turn', [0.0, 1.0], ids=['straight', 'turning'])
 @pytest.mark.parametrize('here', [[2.0, 2.5, 0.0], [1.0, 4.0, 0.3]])
 @pytest.mark.parametrize('noise', [0.005, 0.02])
