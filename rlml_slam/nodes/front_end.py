@@ -62,7 +62,7 @@ class FrontEndNode(ManagedNode):
     def problems(self) -> tuple[str, ...]:
         """What is wrong around the estimate."""
         alone = () if self.back_end_is_active() else ('back_end is not active',)
-        around = self.control, self.sensors, self.black_box
+        around = self.answers, self.control, self.sensors, self.black_box
         return sum((part.problems() for part in around), alone)
 
     @property

@@ -208,6 +208,11 @@ class ManagedNode(LifecycleNode):
         """A service, which answers while the node is inactive as well."""
         return super().create_service(srv_type, self._name(srv_name), callback, **options)
 
+    def publishers_of(self, topic: str) -> list[str]:
+        """Full names of the nodes that publish a topic, itself among them."""
+        found = self.get_publishers_info_by_topic(topic)
+        return sorted(f'{i.node_namespace.rstrip("/")}/{i.node_name}' for i in found)
+
     def every(self, period: float, act: Callable[[], object]) -> Any:
         """A timer [s] of the wall clock, whatever /clock does."""
         return self.create_timer(period, act, clock=Clock(clock_type=ClockType.STEADY_TIME))

@@ -173,10 +173,10 @@ class Sensors:
         """Sensors of which there is one, and that several nodes publish."""
         out = []
         for stream, listener in self._queues:
-            found = self._node.get_publishers_info_by_topic(listener.topic_name)
-            if stream in ('odom', 'imu') and len(found) > 1:
-                names = sorted(f'{i.node_namespace.rstrip("/")}/{i.node_name}' for i in found)
-                out.append(f'{stream} has {len(found)} publishers: {", ".join(names)}')
+            if stream in ('odom', 'imu'):
+                found = self._node.publishers_of(listener.topic_name)
+                if len(found) > 1:
+                    out.append(f'{stream} has {len(found)} publishers: {", ".join(found)}')
         return (*out, *self._feed.odometry_problems())
 
     def _tell_of_missing(self) -> None:

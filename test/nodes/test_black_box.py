@@ -56,6 +56,8 @@ def test_degraded_for_long_and_jumps_are_incidents():
     assert reasons([frame(), *[bad] * 5]).count('degraded') == 0
     assert reasons([frame(), frame(jumped=True)]) == ['', 'jump']
     assert reasons([frame(Level.LOST), frame(jumped=True)]) == ['', '']  # found again
+    assert reasons([bad, frame(jumped=True)]) == ['', '']  # found at the start in a saved map
+    assert reasons([frame(), bad, frame(jumped=True)]) == ['', '', 'jump']
 
 
 def publish(live, node, seconds):

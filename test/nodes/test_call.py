@@ -3,6 +3,10 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -14,6 +18,11 @@ from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.nodes.back_end import BackEndNode
 from rlml_slam.ros.back_end.map_folder import MapFolder
 from rlml_slam.types import Reflectors
+
+CALL = (
+    "import sys; from rlml_slam.cli.main import main; print('ready', flush=True); "
+    'sys.exit(main(sys.argv[1:]))'
+)
 
 
 @pytest.fixture
@@ -75,6 +84,21 @@ def test_absent_node_is_reported_at_once_with_those_that_are_there(live, command
     code, out, err = command('save_map', '--node', '/nobody')
     assert (code, out) == (1, '')
     assert '/nobody: no such node; --node /back_end has the service save_map' in err
+
+
+@pytest.mark.parametrize('delay', [0.0, 0.4, 1.5])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_signal_ends_a_call_in_one_line(number, delay, monkeypatch):
+    """Of a call that waits for a node which is not there."""
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(DOMAIN))
+    argv = [sys.executable, '-c', CALL, 'call', 'save_map', '--node', '/absent']
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as p:
+        assert p.stdout.readline() == 'ready\n'
+        time.sleep(delay)
+        p.send_signal(number)
+        _, err = p.communicate(timeout=30.0)
+    assert 'Traceback' not in err, err
+    assert p.returncode in (130, -number)
 
 
 def test_map_is_saved_under_another_name(live, command, tmp_path):

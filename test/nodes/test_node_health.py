@@ -9,11 +9,12 @@ from pathlib import Path
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import Twist
+from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
 from live import LATCHED, room
 
 from rlml_slam.nodes.front_end import FrontEndNode
 from rlml_slam.ros import diagnostics
+from rlml_slam.ros.front_end import frame_publisher
 from rlml_slam.types import Health, Level
 
 GATE = Path(__file__).resolve().parents[2] / 'docs' / 'examples' / 'cmd_vel_gate.py'
@@ -52,6 +53,17 @@ def test_each_scan_has_its_health_at_once(live, node):
             wanted = f'{node.last.stamp // 10**9}.{node.last.stamp % 10**9:09d}'
             live.spin_until(partial(has_stamp, live, wanted), timeout=2.0)
     assert poses > 20
+
+
+def test_another_publisher_of_the_pose_is_a_problem(live, node, monkeypatch):
+    """Most likely the node was started twice; one that was killed is forgotten by DDS first."""
+    live.ear.create_publisher(PoseWithCovarianceStamped, 'pose', 10)
+    live.spin_until(lambda: node.publishers_of('/pose') == ['/ear', '/front_end'])
+    assert node.answers.problems() == ()
+    monkeypatch.setattr(frame_publisher, 'FORGOTTEN', 0.0)
+    assert node.answers.problems() == ('/pose has 2 publishers: /ear, /front_end',)
+    node.health.publish()
+    live.spin_until(lambda: '/pose has 2' in live.heard[HEALTH][-1].message)
 
 
 def test_silence_is_said_without_waiting_for_diagnostics(live, node, monkeypatch):

@@ -35,7 +35,7 @@ def message_of(answer: Any) -> str:
 
 @contextlib.contextmanager
 def asking() -> Iterator[Any]:
-    """A node that asks."""
+    """A node that asks. KeyboardInterrupt where a signal ended ROS meanwhile."""
     import rclpy
 
     rclpy.init()
@@ -45,8 +45,12 @@ def asking() -> Iterator[Any]:
             yield asker
         finally:
             asker.destroy_node()
+    except Exception:
+        if rclpy.utilities.ok():
+            raise
+        raise KeyboardInterrupt from None
     finally:
-        rclpy.shutdown()
+        rclpy.utilities.try_shutdown()
 
 
 def call(node: str, service: str, kind: Any, fields: dict[str, Any]) -> Any:

@@ -33,20 +33,22 @@ class Triggers:
 
     def __init__(self, degraded_time: float) -> None:
         self._patience = degraded_time
-        self._was_good = False  # the robot knew where it was
+        self._was_good = False  # the robot was not LOST
+        self._was_ok = False  # and has been OK since it was
         self._degraded: float | None = None
 
     def reason(self, frame: Frame, now: float) -> str:
         """``lost``, ``degraded``, ``jump``, or nothing. ``now`` [s] is of any clock."""
-        level, was_good = frame.health.level, self._was_good
+        level, was_good, was_ok = frame.health.level, self._was_good, self._was_ok
         self._was_good = level < Level.LOST
+        self._was_ok = level is Level.OK or (was_ok and self._was_good)
         if level is Level.OK:
             self._degraded = None
         elif self._degraded is None:
             self._degraded = now
         if level is Level.LOST:
             return 'lost' if was_good else ''
-        if frame.jumped and was_good:
+        if frame.jumped and was_ok:
             return 'jump'
         if self._degraded is not None and now - self._degraded > self._patience:
             self._degraded = float('inf')  # said once

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
@@ -29,13 +30,15 @@ TOPICS = {
     'rlml/frames': (CLOUD, 50),
 }
 SHORT = 0.005  # [s] steps of several lidars: too short for a speed
+FORGOTTEN = 30.0  # [s] after which DDS has forgotten a node that was killed
 
 
 class FramePublisher:
     """Publishes frames, those of the back end and of viewers only where somebody subscribes."""
 
     def __init__(self, node: Any, params: Node) -> None:
-        self._p = params
+        self._p, self._node = params, node
+        self._alone = time.monotonic()  # when no other node published the pose
         self._publishers = {
             topic: node.create_publisher(rclpy_class(kind), topic, depth)
             for topic, (kind, depth) in TOPICS.items()
@@ -46,6 +49,16 @@ class FramePublisher:
     def with_odometry(self, frame: Frame) -> Frame:
         """The frame; where the robot has no odometry, with the one that is published for it."""
         return frame if self._odom is None else self._odom.publish(frame)
+
+    def problems(self) -> tuple[str, ...]:
+        """Another node that publishes the pose: most likely this one was started twice."""
+        now, topic = time.monotonic(), self._publishers['pose'].topic_name
+        found = self._node.publishers_of(topic)
+        if len(found) < 2:
+            self._alone = now
+        if now - self._alone <= FORGOTTEN:
+            return ()
+        return (f'{topic} has {len(found)} publishers: {", ".join(found)}',)
 
     def begin_session(self) -> None:
         """From now on, the local frame is another one."""
