@@ -10,10 +10,12 @@ import numpy as np
 
 from rlml_lab.carrier.carrier import CarrierStep
 from rlml_lab.carrier.carrier_parameters import CarrierParameters
-from rlml_slam.deformable.window import CarrierVelocity
+from rlml_slam.deformable.window import CarrierVelocity, Features
+from rlml_slam.errors import InputError
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import Make, make_rclpy, rclpy_class
-from rlml_slam.ros.systems.deformable_messages import build_velocity
+from rlml_slam.ros.codecs.point_cloud import read_cloud
+from rlml_slam.ros.systems.deformable_messages import FEATURE, build_twist
 from rlml_slam.se2 import compose
 from rlml_slam.simulation.simulation import START
 from rlml_slam.types import Detections
@@ -85,3 +87,27 @@ class CarrierTopics:
         self._clock.publish(encode.clock(make_rclpy, START + step.stamp))
         for topic, message in self._messages(step, after):
             self._publishers[topic].publish(message)
+
+
+def build_velocity(make: Make, time: int, axes: str, velocity: CarrierVelocity) -> Any:
+    """TwistStamped; the inverse of read_velocity."""
+    return make(
+        'geometry_msgs/msg/TwistStamped',
+        header=encode.header(make, time, axes),
+        twist=build_twist(make, np.append(velocity.linear, velocity.angular)),
+    )
+
+
+def read_features(msg: Any, topic: str = 'features') -> Features:
+    """The inverse of build_features; InputError if it is another kind of cloud."""
+    cloud = read_cloud(msg, topic)
+    missing = set(FEATURE.names or ()) - set(cloud.dtype.names or ())
+    if missing:
+        raise InputError(f'{topic}: cloud has no field {", ".join(sorted(missing))}')
+    cov = np.stack([cloud['cov_xx'], cloud['cov_xy'], cloud['cov_xy'], cloud['cov_yy']], -1)
+    return Features(
+        cloud['key'].astype(np.int64),
+        cloud['id'].astype(np.int64),
+        np.stack([cloud['x'], cloud['y']], -1).astype(np.float64),
+        cov.astype(np.float64).reshape(-1, 2, 2),
+    )

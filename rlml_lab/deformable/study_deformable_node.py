@@ -23,6 +23,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 
+from rlml_lab.carrier.carrier_messages import read_features
 from rlml_lab.carrier.carrier_parameters import Carrier
 from rlml_lab.deformable.scoring import chi2_bounds
 from rlml_lab.deformable.study_deformable_window import KINDS
@@ -34,7 +35,6 @@ from rlml_slam.params import MotionNoise, Reflector
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.codecs.message_types import rclpy_class
 from rlml_slam.ros.sensors import SENSOR
-from rlml_slam.ros.systems.deformable_messages import read_features
 from rlml_slam.se2 import Array, wrap
 
 TYPES = {

@@ -95,16 +95,17 @@ def test_the_note_s_jz_has_one_wrong_sign():
 
 def test_the_note_s_line_landmark_follows_the_robot_s_error():
     """Its range and bearing, made with a pose that is 0.5 m off along the wall, fit that pose."""
-    from rlml_slam.sensing.features.lines import nearest_point, range_and_bearing
-
     true, wrong = np.array([1.0, 0.0, 0.0]), np.array([1.5, 0.0, 0.0])
     seen = np.array([[2.0, 0.5 * np.pi]])  # a wall along x, 2 m to the left
     fixed = np.zeros(2)
 
     def as_range_and_bearing(pose):
         n = np.array([np.cos(seen[0, 1] + pose[2]), np.sin(seen[0, 1] + pose[2])])
-        in_map = np.array([[seen[0, 0] + n @ pose[:2], seen[0, 1] + pose[2]]])
-        return range_and_bearing(nearest_point(in_map, fixed), pose)
+        rho, normal = seen[0, 0] + n @ pose[:2], seen[0, 1] + pose[2]
+        # the note's landmark: the point of the line in the map that is nearest to the fixed one
+        axis = np.array([np.cos(normal), np.sin(normal)])
+        d = fixed + (rho - axis @ fixed) * axis - pose[:2]
+        return np.array([np.hypot(*d), se2.wrap(np.arctan2(d[1], d[0]) - pose[2])])
 
     landmark = np.array([[0.0, 2.0]])
     for pose in (true, wrong):

@@ -12,7 +12,7 @@ import pytest
 from rclpy.qos import QoSProfile
 
 from rlml_lab.carrier.carrier import simulate_carrier
-from rlml_lab.carrier.carrier_messages import CarrierMessages
+from rlml_lab.carrier.carrier_messages import CarrierMessages, build_velocity, read_features
 from rlml_lab.carrier.carrier_parameters import Carrier, CarrierParameters
 from rlml_lab.deformable import study_deformable_node as study
 from rlml_lab.deformable.scoring import chi2_bounds
@@ -21,7 +21,6 @@ from rlml_slam.errors import InputError
 from rlml_slam.nodes.deformable_slam import DeformableSlamNode
 from rlml_slam.ros.codecs import decode, encode
 from rlml_slam.ros.codecs.message_types import make_rclpy as make
-from rlml_slam.ros.systems.deformable_messages import build_velocity, read_features
 
 SECOND = 1_000_000_000
 SECONDS = 12

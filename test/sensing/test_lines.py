@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rlml_slam.params import Ransac
-from rlml_slam.sensing.features.lines import extract, nearest_point, range_and_bearing
+from rlml_slam.sensing.features.lines import extract
 from rlml_slam.sensing.features.ransac import find_lines, fit
 
 ORIGIN = np.zeros(2)
@@ -67,13 +67,6 @@ def test_too_few_readings_or_too_short_a_wall_are_no_line():
     assert len(extract(room()[:40], ORIGIN, Ransac()).lines) == 0
     short = np.stack([np.linspace(2.0, 2.5, 200), np.full(200, 1.0)], -1)
     assert len(extract(short, ORIGIN, Ransac()).lines) == 0
-
-
-def test_a_line_becomes_the_point_nearest_to_the_fixed_one():
-    points = nearest_point(np.array([[2.0, 0.5 * np.pi]]), np.array([3.0, 7.0]))
-    assert points[0] == pytest.approx([3.0, 2.0], abs=1e-12)
-    z = range_and_bearing(points, np.array([3.0, 0.0, 0.5]))
-    assert z[0] == pytest.approx([2.0, 0.5 * np.pi - 0.5], abs=1e-12)
 
 
 def test_readings_of_one_line_beyond_a_gap_are_a_line_of_their_own():

@@ -15,7 +15,7 @@ from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.decode import FASTEST, frame, stamp
 from rlml_slam.ros.codecs.markers import reflector_markers
 from rlml_slam.ros.codecs.message_types import Make, make_rclpy, rclpy_class
-from rlml_slam.ros.codecs.point_cloud import bounded, build_cloud, read_cloud
+from rlml_slam.ros.codecs.point_cloud import bounded, build_cloud
 from rlml_slam.se2 import Array
 from rlml_slam.types import Reflectors
 
@@ -62,15 +62,6 @@ def build_twist(make: Make, twist: Array) -> Any:
     )
 
 
-def build_velocity(make: Make, time: int, axes: str, velocity: CarrierVelocity) -> Any:
-    """TwistStamped; the inverse of read_velocity."""
-    return make(
-        'geometry_msgs/msg/TwistStamped',
-        header=encode.header(make, time, axes),
-        twist=build_twist(make, np.append(velocity.linear, velocity.angular)),
-    )
-
-
 def build_features(make: Make, time: int, map_frame: str, features: Features) -> Any:
     """PointCloud2 of the features with their covariances."""
     cloud = np.zeros(len(features.keys), dtype=FEATURE)
@@ -79,21 +70,6 @@ def build_features(make: Make, time: int, map_frame: str, features: Features) ->
     cloud['cov_yy'] = features.cov[:, 1, 1]
     cloud['key'], cloud['id'] = features.keys, features.ids
     return build_cloud(make, encode.header(make, time, map_frame), cloud)
-
-
-def read_features(msg: Any, topic: str = 'features') -> Features:
-    """The inverse of build_features; InputError if it is another kind of cloud."""
-    cloud = read_cloud(msg, topic)
-    missing = set(FEATURE.names or ()) - set(cloud.dtype.names or ())
-    if missing:
-        raise InputError(f'{topic}: cloud has no field {", ".join(sorted(missing))}')
-    cov = np.stack([cloud['cov_xx'], cloud['cov_xy'], cloud['cov_xy'], cloud['cov_yy']], -1)
-    return Features(
-        cloud['key'].astype(np.int64),
-        cloud['id'].astype(np.int64),
-        np.stack([cloud['x'], cloud['y']], -1).astype(np.float64),
-        cov.astype(np.float64).reshape(-1, 2, 2),
-    )
 
 
 class EstimatePublisher:

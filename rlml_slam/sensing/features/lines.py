@@ -79,21 +79,3 @@ def _line(
     cov = J @ np.diag([var_d, var_a]) @ J.T
     ends = rho * normal + np.array([[low], [high]]) * t
     return np.array([rho, np.arctan2(normal[1], normal[0])]), cov, n, ends
-
-
-def nearest_point(lines: Array, fixed: Array) -> Array:
-    """The note's step from line to landmark: each line's point (k, 2) nearest to ``fixed`` (2,).
-
-    Lines (k, 2) as above; both in one frame.
-    """
-    n = np.stack([np.cos(lines[:, 1]), np.sin(lines[:, 1])], -1)
-    out: Array = fixed + (lines[:, 0] - n @ fixed)[:, None] * n
-    return out
-
-
-def range_and_bearing(points: Array, pose: Array) -> Array:
-    """Range and bearing (k, 2) of map points (k, 2) from the robot's pose (3,)."""
-    d = points - pose[:2]
-    bearing = np.arctan2(d[:, 1], d[:, 0]) - pose[2]
-    wrapped = np.pi - np.mod(np.pi - bearing, 2.0 * np.pi)
-    return np.stack([np.hypot(d[:, 0], d[:, 1]), wrapped], -1)

@@ -52,17 +52,6 @@ class Merged:
     closures: int
 
 
-def merge_maps(first: Content, second: Content, params: Parameters) -> Merged:
-    """One map, in the frame of the first. Raises MapError if their reflectors do not match."""
-    contents = {'the first map': first, 'the second map': second}
-    sessions = [session_of(name, content) for name, content in contents.items()]
-    survey = survey_of_all(sessions)
-    placed = place_sessions(sessions, params, survey)
-    for doubt in placed.left_out.values():
-        raise MapError(f'the reflectors of the maps do not match at exactly one pose: {doubt.why}')
-    return assemble(placed, lambda s: contents[s.name], params, survey)
-
-
 def merge_files(
     paths: Sequence[Path], params: Parameters, survey: Survey | None = None,
     run: Mapper = in_this_process,

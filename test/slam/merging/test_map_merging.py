@@ -19,10 +19,10 @@ from rlml_slam.matching.scans.packed_submap import Unpacked
 from rlml_slam.params import Parameters, Relocalization
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.back_end.trajectory import poses_of
-from rlml_slam.slam.merging.map_merging import _packed, assemble, merge_files, merge_maps
+from rlml_slam.slam.merging.map_merging import _packed, assemble, merge_files, survey_of_all
 from rlml_slam.slam.merging.placement import UNMATCHED_SHARE
 from rlml_slam.slam.merging.site_map import session_of, site_of
-from rlml_slam.slam.merging.site_tree import Placed
+from rlml_slam.slam.merging.site_tree import Placed, place_sessions
 from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.store import map_file
 from rlml_slam.types import Detections, Odometry, Scan, Verdict
@@ -44,6 +44,17 @@ def mapped(world, poses, seed, scan=True):
     return slam.back_end
 
 
+def merge_maps(first, second):
+    """One map, in the frame of the first. Raises MapError if their reflectors do not match."""
+    contents = {'first': first, 'second': second}
+    sessions = [session_of(name, content) for name, content in contents.items()]
+    survey = survey_of_all(sessions)
+    placed = place_sessions(sessions, PARAMS, survey)
+    for doubt in placed.left_out.values():
+        raise MapError(f'do not match at exactly one pose: {doubt.why}')
+    return assemble(placed, lambda s: contents[s.name], PARAMS, survey)
+
+
 @pytest.fixture(scope='module')
 def two():
     first, second = mapped(ROOM, CURVE, 0), mapped(ROOM, AGAIN, 1)
@@ -52,7 +63,7 @@ def two():
 
 @pytest.fixture(scope='module')
 def merged(two):
-    return merge_maps(*two, PARAMS)
+    return merge_maps(*two)
 
 
 def test_second_map_is_put_where_it_lies(two, merged):
@@ -123,18 +134,18 @@ def test_maps_of_which_nothing_tells_how_they_lie_are_refused(two, tmp_path, cap
     ):
         other = map_file.content_of(mapped(world, AGAIN, 3), PARAMS, None)
         with pytest.raises(MapError, match='do not match at exactly one pose'):
-            merge_maps(two[0], other, PARAMS)
+            merge_maps(two[0], other)
     # twice the same square could be turned four ways
     twin = map_file.content_of(mapped(replace(ROOM, reflectors=square), CURVE, 4), PARAMS, None)
     with pytest.raises(MapError, match='do not match'):
-        merge_maps(twin, twin, PARAMS)
+        merge_maps(twin, twin)
 
 
 @pytest.mark.parametrize('is_first', [False, True])
 def test_map_without_a_scan_is_merged_with_one_of_scans(two, is_first):
     blind = map_file.content_of(mapped(ROOM, AGAIN, 2, scan=False), PARAMS, None)
     pair = (blind, two[0]) if is_first else (two[0], blind)
-    merged = merge_maps(*pair, PARAMS)
+    merged = merge_maps(*pair)
     assert merged.joined == len(ROOM.reflectors)
     again = map_file.saved_map(merged.content)
     assert len(again.reflectors) == len(ROOM.reflectors)
@@ -146,7 +157,7 @@ def test_map_of_an_older_program_is_refused(two):
     older = {k: v for k, v in two[1].arrays.items() if k != 'reflector_removed'}
     for pair in ((two[0], two[1]._replace(arrays=older)), (two[1]._replace(arrays=older),) * 2):
         with pytest.raises(MapError, match='is incomplete'):
-            merge_maps(*pair, PARAMS)
+            merge_maps(*pair)
 
 
 def test_command_merges_files(two, tmp_path, capsys):
