@@ -23,8 +23,7 @@ from rlml_slam.graph import (
     write_graph,
 )
 
-INIT = ('auto', 'none', 'odometry', 'spanning_tree', 'chordal')
-METHODS = ('auto', 'gauss_newton', 'levenberg_marquardt', 'dog_leg')
+INIT = ('auto', 'none', 'chordal')
 
 
 def add_parser(subparsers: Any) -> None:
@@ -37,7 +36,6 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('graph', type=Path, metavar='GRAPH.g2o', help='the graph to optimise')
     parser.add_argument('--out', type=Path, metavar='OUT.g2o', help='where the result goes')
     parser.add_argument('--init', choices=INIT, default='auto', help='where the solve starts')
-    parser.add_argument('--method', choices=METHODS, default='auto', help='how steps are chosen')
     parser.add_argument(
         '--robust',
         choices=[*(kind.name.lower() for kind in LossKind), 'select'],
@@ -59,7 +57,6 @@ def run(args: argparse.Namespace) -> int:
     parameters = params.Solver(
         max_iterations=args.max_iterations,
         relative_tolerance=args.tolerance,
-        method=args.method,
         initialization=args.init,
     )
     solution, refused = _solve(file.graph, args.robust, parameters)

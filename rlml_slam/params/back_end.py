@@ -204,14 +204,9 @@ class Solver(Group):
     relative_tolerance: float = param(
         1e-5, 'stops when the cost decreases by less than this share', '', 0.0, 1.0
     )
-    method: str = param(
-        'auto',
-        'step; auto: Gauss-Newton, and dog-leg where that fails',
-        choices=('auto', 'gauss_newton', 'levenberg_marquardt', 'dog_leg'),
-    )
     initialization: str = param(
         'auto',
         'start: the current estimate (none), or one computed from the edges; auto computes one '
         'only if the current estimate fits badly',
-        choices=('none', 'auto', 'odometry', 'spanning_tree', 'chordal'),
+        choices=('none', 'auto', 'chordal'),
     )

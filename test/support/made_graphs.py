@@ -8,9 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rlml_slam import se2
+from rlml_slam import params, se2
+from rlml_slam.graph.batch.solver import ROUNDING, num_residuals, optimize
+from rlml_slam.graph.batch.trust_region import dog_leg
 from rlml_slam.graph.model.factors import Losses
 from rlml_slam.graph.model.graph import Graph
+from rlml_slam.graph.model.normal_equations import build_system
 from rlml_slam.types import EdgeKind
 
 SHARED_GRAPHS = Path(__file__).resolve().parents[2].parent / 'shared' / 'data' / 'graphs-2d'
@@ -21,6 +24,21 @@ def shared_graph(name: str) -> Path:
     if not path.exists():
         pytest.skip(f'needs the shared data set {name} in {SHARED_GRAPHS}')
     return path
+
+
+def chi2_by_gauss_newton(graph: Graph, limits: params.Solver) -> float:
+    return optimize(graph, limits).chi2_final
+
+
+def chi2_by_dog_leg(graph: Graph, limits: params.Solver) -> float:
+    """By the method that ``optimize`` goes on with where Gauss-Newton does not converge."""
+    system = build_system(graph)
+    floor = ROUNDING * num_residuals(system)
+    args = limits.max_iterations, limits.relative_tolerance, floor
+    return dog_leg(system, graph.poses, graph.landmarks, *args).chi2
+
+
+METHODS = (chi2_by_gauss_newton, chi2_by_dog_leg)
 
 
 def loop_graph(

@@ -15,9 +15,8 @@ from rlml_slam.compiled import kernel, part
 from rlml_slam.graph.batch import landmark_start
 from rlml_slam.graph.batch.chordal_relaxation import relax
 from rlml_slam.graph.batch.gauss_newton import Progress, copy, gauss_newton
-from rlml_slam.graph.batch.initialization import initialize
 from rlml_slam.graph.batch.second_start import restart
-from rlml_slam.graph.batch.trust_region import dog_leg, levenberg_marquardt
+from rlml_slam.graph.batch.trust_region import dog_leg
 from rlml_slam.graph.model.buffers import nodes_at, tables_at
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.graph.model.linearization import linearize
@@ -77,30 +76,21 @@ def optimize(graph: Graph, parameters: params.Solver = DEFAULT) -> Solution:
     """
     began = time.perf_counter()
     p = parameters
-    relaxing = {'auto': IF_BAD, 'chordal': ALWAYS}.get(p.initialization, NEVER)
-    start = None
-    if p.initialization in ('odometry', 'spanning_tree'):
-        start = _evaluate(graph)
-        initialize(graph, p.initialization)
-    if p.method in ('auto', 'gauss_newton'):
-        memory = _WORKSPACE.memory
-        used, at, end = _gauss_newton(
-            graph.addresses().at, graph.losses.codes, memory, relaxing, p.max_iterations,
-            p.relative_tolerance,
-        )  # fmt: skip
-        if used < 0:
-            build_system(graph)  # raises, and names the node
-        elif used > len(memory):
-            _WORKSPACE.memory = np.empty(used + used // 4)
-        if not end.converged and relaxing != NEVER:
-            end = _restart(graph, at, end, p, relaxing)
-        if p.method == 'auto' and not end.converged:
-            more = _minimize_by_trust_region(graph, at, p, NEVER)
-            end = more._replace(iterations=end.iterations + more.iterations)
-    else:
-        at = _evaluate(graph)
-        end = _minimize_by_trust_region(graph, at, p, relaxing)
-    start = start or at
+    relaxing = {'auto': IF_BAD, 'chordal': ALWAYS, 'none': NEVER}[p.initialization]
+    memory = _WORKSPACE.memory
+    used, start, end = _gauss_newton(
+        graph.addresses().at, graph.losses.codes, memory, relaxing, p.max_iterations,
+        p.relative_tolerance,
+    )  # fmt: skip
+    if used < 0:
+        build_system(graph)  # raises, and names the node
+    elif used > len(memory):
+        _WORKSPACE.memory = np.empty(used + used // 4)
+    if not end.converged and relaxing != NEVER:
+        end = _restart(graph, start, end, p, relaxing)
+    if not end.converged:
+        more = _minimize_by_trust_region(graph, start, p)
+        end = more._replace(iterations=end.iterations + more.iterations)
     return Solution(
         start.chi2, end.chi2, start.cost, end.cost, end.iterations, end.converged,
         (time.perf_counter() - began) * 1e3,
@@ -120,30 +110,13 @@ def _restart(
     return more._replace(iterations=end.iterations + more.iterations)
 
 
-def _minimize_by_trust_region(
-    graph: Graph, start: Progress, p: params.Solver, relaxing: int
-) -> Progress:
-    """Minimise by a method that never raises the cost."""
-    system, poses, landmarks = build_system(graph), graph.poses, graph.landmarks
+def _minimize_by_trust_region(graph: Graph, start: Progress, p: params.Solver) -> Progress:
+    """Minimise by a method that never raises the cost, also where H is singular."""
+    system = build_system(graph)
     if not len(system.variables):
         return start._replace(converged=True)
-    method = levenberg_marquardt if p.method == 'levenberg_marquardt' else dog_leg
-    num = num_residuals(system)
-    limits = p.max_iterations, p.relative_tolerance, ROUNDING * num
-    if relaxing == ALWAYS or (relaxing == IF_BAD and start.cost > BAD_START * num):
-        before = poses.copy(), landmarks.copy()
-        initialize(graph, 'chordal')
-        end = method(system, poses, landmarks, *limits)
-        if end.cost < start.cost:
-            return end
-        poses[:], landmarks[:] = before
-    return method(system, poses, landmarks, *limits)
-
-
-def _evaluate(graph: Graph) -> Progress:
-    """Cost and chi2 of the current estimate."""
-    cost, chi2 = linearize(build_system(graph), graph.poses, graph.landmarks, False)
-    return Progress(cost, chi2, 0, False)
+    limits = p.max_iterations, p.relative_tolerance, ROUNDING * num_residuals(system)
+    return dog_leg(system, graph.poses, graph.landmarks, *limits)
 
 
 @kernel
@@ -221,6 +194,6 @@ def warm_up() -> None:
     graph.add_edges(EdgeKind.ODOMETRY, [[0, 1], [1, 2]], [[1.0, 0.1, 0.0]] * 2, [np.eye(3)] * 2)
     graph.add_sightings([[0, 0], [2, 0]], [[1.0, 1.0], [-1.0, 1.1]], [np.eye(2)] * 2)
     landmark_start.warm_up()
-    for method in ('auto', 'dog_leg'):
-        optimize(graph, params.Solver(initialization='chordal', method=method))
+    optimize(graph, params.Solver(initialization='chordal'))
+    _minimize_by_trust_region(graph, Progress(math.inf, math.inf, 0, False), DEFAULT)
     restart(build_system(graph), graph.poses, graph.landmarks, 1, 0.0, 0.0)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trust-region methods, which never raise the cost: Levenberg-Marquardt and Powell's dog-leg.
+"""Powell's dog-leg, a trust-region method, which never raises the cost.
 
-Nocedal and Wright, "Numerical Optimization", 2nd ed. (2006), chapter 4. The loops are Python
+Nocedal and Wright, "Numerical Optimization", 2nd ed. (2006), chapter 4. The loop is Python
 around the compiled linearization, factorization and solves. Steps are
 measured in the norm of D, the diagonal of H, so metres and radians count by their information.
 """
@@ -24,8 +24,6 @@ from rlml_slam.se2 import Array
 # A step is accepted if it brings this share of the predicted decrease (Nocedal & Wright, eq. 4.20:
 # anything from 0 to 1/4).
 MIN_RATIO = 1e-4
-# of LM at the start, as a share of the diagonal of H: nearly a Gauss-Newton step
-FIRST_DAMPING = 1e-4
 
 
 @kernel
@@ -97,40 +95,6 @@ def _trial(system: System, poses: Array, landmarks: Array) -> _Trial:
         has = v['size'] > r
         diagonal[v['scalar'][has] + r] = v['address'][has] + r * (v['stride'][has] + 1)
     return _Trial(system, poses, landmarks, math.inf, math.inf, diagonal)
-
-
-def levenberg_marquardt(
-    system: System,
-    poses: Array,
-    landmarks: Array,
-    max_iterations: int,
-    tolerance: float,
-    floor: float,
-) -> Progress:
-    """Steps of (H + damping D) dx = -g with Nielsen's rule for the damping."""
-    trial = _trial(system, poses, landmarks)
-    damping, growth, iterations = FIRST_DAMPING, 2.0, 0
-    scale = trial.linearize()
-    while iterations < max_iterations:
-        damping = trial.factorise(scale, damping)
-        if damping > 1e12:
-            break
-        newton_step(system)
-        step = system.step
-        # model: -2 g dx - dx H dx = -g dx + damping dx D dx
-        predicted = float(-system.g @ step + damping * step @ (scale * step))
-        if predicted <= tolerance * trial.cost + floor:
-            return Progress(trial.cost, trial.chi2, iterations, True)
-        iterations += 1
-        ratio = trial.try_step(step, predicted)
-        if ratio > 0.0:
-            damping *= max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
-            growth = 2.0
-        else:
-            damping *= growth
-            growth *= 2.0
-        scale = trial.linearize()
-    return Progress(trial.cost, trial.chi2, iterations, False)
 
 
 def dog_leg(
