@@ -181,7 +181,8 @@ class ScanTerm:
         if found.score < threshold or found.prior_weight < 0.5:
             searched = match(submap, points, prior, strength, p)
             found = searched if searched.score > found.score else found
-        if has_odometry and found.score < usual:
+        is_doubtful = found.prior_weight < 0.5 or self._fits_badly(submap, points, found)
+        if has_odometry and found.score < usual and is_doubtful:
             # next to its true pose, where a wrong stamp leads, a scan fits, but worse than usual
             searched = self._match_in_window(submap, points, prior, strength, p.wide_window)
             found = searched if searched.score >= usual else found
@@ -231,12 +232,12 @@ class ScanTerm:
         state.turn_with_anchor(before)
 
     def _contradicts(self, submap: Submap, points: Array, found: ScanMatchResult) -> bool:
-        """Whether a scan fits far worse than usual, and not because it sees unmapped space.
+        """Whether a scan fits far worse than usual, and not because it sees unmapped space."""
+        is_misfit = self.kidnapping.is_misfit(found.score, submap.insertions)
+        return is_misfit and self._fits_badly(submap, points, found)
 
-        End points in unknown cells contradict nothing; the others have to fit as usual.
-        """
-        if not self.kidnapping.is_misfit(found.score, submap.insertions):
-            return False
+    def _fits_badly(self, submap: Submap, points: Array, found: ScanMatchResult) -> bool:
+        """Whether what a scan sees of mapped space, if it is enough, fits worse than usual."""
         known = submap.knows(se2.transform(found.pose, points))
         least = AS_USUAL * self.kidnapping.usual
         return known < MIN_KNOWN or found.score - (1.0 - known) * UNKNOWN < known * least

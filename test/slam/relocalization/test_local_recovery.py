@@ -12,6 +12,7 @@ from made_worlds import CORRIDOR, ROOM, TinyWorld, drive, errors, observations, 
 from rlml_slam import se2
 from rlml_slam.params import Parameters
 from rlml_slam.slam.front_end.front_end import FrontEnd
+from rlml_slam.slam.front_end.scan_term import ScanTerm
 from rlml_slam.slam.relocalization.local_recovery import AS_USUAL, recover_locally
 from rlml_slam.types import Level, Motion
 
@@ -113,3 +114,17 @@ def test_scan_of_what_is_new_by_half_contradicts_nothing(turn):
     distance, off = errors(np.array([f.T_local_base for f in frames]), path)
     assert distance.max() < 0.06
     assert off.max() < 0.03
+
+
+def test_scan_of_new_space_is_looked_for_nowhere_else(monkeypatch):
+    """In a corridor with doors alike it would fit at one that is mapped already."""
+    front_end, place, points = mapped(ROOM)
+    searches = []
+    monkeypatch.setattr(ScanTerm, '_match_in_window', lambda *args: searches.append(args))
+    points = points.copy()
+    points[::4] += 40.0
+    scans, sure = front_end._scans, np.diag([1e4, 1e4, 1e5])
+    found = scans._match(front_end.submaps.target, points, place, sure)
+    assert found.score < AS_USUAL * front_end.kidnapping.usual
+    assert np.abs(found.pose - place).max() < 0.03
+    assert not searches
