@@ -41,8 +41,8 @@ MOST = 0.5  # share of the returns: if more do not change, it is the odometry th
 class _Beams:
     """Of each beam of a lidar (n,): its range, number of scans, and headings with that range.
 
-    ``away`` is the number of scans in a row with another range. The last step began ``scans``
-    ago at ``pose`` (3,) with the ranges ``then`` (n,).
+    ``is_doubtful``: odometry may be wrong instead. ``away`` is the number of scans in a row with
+    another range. The last step began ``scans`` ago at ``pose`` (3,) with ranges ``then`` (n,).
     """
 
     range: Array
@@ -50,6 +50,7 @@ class _Beams:
     least: Array
     most: Array
     is_part: NDArray[np.bool_]
+    is_doubtful: NDArray[np.bool_]
     away: NDArray[np.int64]
     pose: Array
     last: Array
@@ -63,12 +64,13 @@ class _Beams:
         n = len(ranges)
         return cls(
             ranges.copy(), np.zeros(n, np.int64), np.zeros(n), np.zeros(n), np.zeros(n, np.bool_),
-            np.zeros(n, np.int64), pose, pose, ranges,
+            np.zeros(n, np.bool_), np.zeros(n, np.int64), pose, pose, ranges,
         )  # fmt: skip
 
     def begin(self, which: NDArray[np.bool_], ranges: Array) -> None:
         """These beams have other ranges from now on."""
-        self.is_part[which], self.count[which], self.away[which] = False, 0, 0
+        self.is_part[which] = self.is_doubtful[which] = False
+        self.count[which] = self.away[which] = 0
         self.least[which] = self.most[which] = self.heading
         self.range[which] = ranges[which]
 
@@ -97,9 +99,11 @@ class RobotParts:
             b.last = odometry
             _learn(b, ranges)
             _find(b, scan, ranges, mounted)
-        if b is None or len(b.range) != len(ranges) or not (b.is_part & returns).any():
+        if b is None or len(b.range) != len(ranges):
             return scan
-        return replace(scan, ranges=np.where(b.is_part, np.float32(np.nan), scan.ranges))
+        out = b.is_part | b.is_doubtful
+        ranges = np.where(out, np.float32(np.nan), scan.ranges)
+        return replace(scan, ranges=ranges) if (out & returns).any() else scan
 
 
 def _jumps(last: Array, pose: Array) -> bool:
@@ -126,17 +130,22 @@ def _find(b: _Beams, scan: Scan, ranges: Array, mounted: float) -> None:
         return
     returns = np.isfinite(ranges).sum()
     changed = np.abs(ranges - b.then) > FAR + FARTHER * ranges
-    if changed.sum() >= CHANGED * returns:
+    is_straight = way >= MOVED and abs(turn) < STRAIGHT
+    found = _in_the_way(b, scan, math.atan2(y, x) - mounted) & is_straight
+    is_sure = changed.sum() >= CHANGED * returns
+    if is_sure:
         b.heading += float(turn)
         b.least, b.most = np.minimum(b.least, b.heading), np.maximum(b.most, b.heading)
-        found = b.is_part | _without_single(b.most - b.least > TURN)
-        if way >= MOVED and abs(turn) < STRAIGHT:
-            found |= _in_the_way(b, scan, math.atan2(y, x) - mounted)
-        found &= (b.count >= FEWEST) & np.isfinite(ranges)
-        if found.sum() > MOST * returns:
-            b.begin(found, ranges)
-        else:
-            b.is_part |= found & (b.range < FARTHEST)
+        found |= _without_single(b.most - b.least > TURN)
+    found &= ~b.is_part & (b.count >= FEWEST) & np.isfinite(ranges)
+    near = found & (b.range < FARTHEST)
+    b.is_doubtful[:] = False
+    if (found | b.is_part).sum() > MOST * returns:
+        b.begin(found, ranges)
+    elif is_sure:
+        b.is_part |= near
+    elif near.sum() == found.sum():  # else what is far came no nearer either: it did not move
+        b.is_doubtful = near
     b.pose, b.then, b.scans = b.last, ranges, 0
 
 
@@ -147,8 +156,8 @@ def _without_single(found: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _in_the_way(b: _Beams, scan: Scan, heading: float) -> NDArray[np.bool_]:
-    """Beams (n,) with the same range during a step, on what is no surface along it."""
-    same = b.count > b.scans
+    """Other beams (n,) with the same range during a step, on what is no surface along it."""
+    same = (b.count > b.scans) & ~b.is_part
     angles = scan.angle_min + scan.angle_increment * np.arange(len(same)) - heading
     along, across = b.range * np.cos(angles), b.range * np.sin(angles)
     joined = same[1:] & same[:-1] & (np.abs(np.diff(b.range)) < ACROSS)

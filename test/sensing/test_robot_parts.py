@@ -31,17 +31,27 @@ def in_room(pose, noise=0.0, rng=None):
     return ranges if rng is None else ranges + noise * rng.standard_normal(len(ranges))
 
 
+def in_corridor(pose, noise=0.0, rng=None):
+    """Ranges of all BEAMS between two walls along x, of which 8 m are seen."""
+    angles = BEAMS + pose[2]
+    with np.errstate(divide='ignore'):
+        away = np.where(np.sin(angles) > 0, 1.0 - pose[1], 1.0 + pose[1])
+        ranges = away / np.abs(np.sin(angles))
+    noise = 0.0 if rng is None else noise * rng.standard_normal(len(BEAMS))
+    return np.where(ranges < 8.0, ranges, np.inf) + noise
+
+
 def scan(ranges, stamp=1):
     none = np.zeros(0, np.float32)
     step = float(BEAMS[1] - BEAMS[0])
     return Scan(stamp, 'laser', -np.pi, step, 0.0, 0.1, 30.0, ranges.astype(np.float32), none)
 
 
-def drive(parts, poses, change=lambda ranges: ranges, mounted=0.0, rng=None):
+def drive(parts, poses, change=lambda ranges: ranges, mounted=0.0, rng=None, ranges=in_room):
     """The beams that are left out after each pose (k, n)."""
     out = []
     for pose in poses:
-        given = scan(change(in_room(pose + np.array([0, 0, mounted]), 0.01, rng)))
+        given = scan(change(ranges(pose + np.array([0, 0, mounted]), 0.01, rng)))
         out.append(np.isnan(parts.left_out(given, pose, mounted).ranges))
     return np.array(out)
 
@@ -111,6 +121,33 @@ def test_mast_that_was_found_stays_left_out_where_scans_are_far_apart():
     out = drive(parts, straight(5.0, 6), change, rng=rng)
     assert out[:, seen].all()
     assert not out[:, ~seen].any()
+
+
+def test_mast_beside_a_wall_as_near_stays_left_out_and_the_wall_in():
+    seen, change = mast(0.3, 1.05)
+    parts, rng = RobotParts(), np.random.default_rng(9)
+    out = drive(parts, straight(0.5), change, rng=rng)
+    assert (out[-1] == seen).all()
+
+    def with_doors(pose, noise, rng):
+        right = np.where((BEAMS < 0.0) & (pose[0] % 0.5 < 0.25), 0.5, 0.0)
+        ahead = np.abs(BEAMS) < 0.5 * np.pi
+        return np.where(ahead, in_corridor(pose, noise, rng) + right, np.inf)
+
+    way = np.linspace([0.0, 0.7, 0.0], [3.0, 0.7, 0.0], 60)
+    out = drive(parts, way, change, rng=rng, ranges=with_doors)
+    assert (out[1:] == seen).all()
+
+
+def test_what_is_ahead_all_along_a_bare_corridor_is_left_out_while_it_is_there():
+    """The walls do not say whether the robot drives: then neither that nor the odometry does."""
+    seen, change = mast(0.0)
+    parts, rng = RobotParts(), np.random.default_rng(10)
+    way = np.linspace([0.0, 0.0, 0.0], [0.5, 0.0, 0.0], 30)
+    out = drive(parts, way, change, rng=rng, ranges=in_corridor)
+    assert not out[:8].any()
+    assert (out[-1] == seen).all()
+    assert not drive(parts, way[-1:], rng=rng, ranges=in_corridor).any()
 
 
 @pytest.mark.parametrize('turn', [0.0, 1.0], ids=['straight', 'turning'])
