@@ -339,6 +339,8 @@ FAULTS: Mapping[str, Fault] = {
     'odometry reset': reset,
     'travel +10 %, turn -10 %': scale(1.1, 0.9),
     'slip': slip(2.0, 1.5, 0.5),
+    'wheels spin': slip(2.0, 3.0, 0.0),
+    'wheels are locked': slip(2.0, 0.2, 0.0),
     **{f'odometry late by {1e3 * s:g} ms': late(s) for s in (0.05, 0.1, 0.2)},
     'stamps jittered by 20 ms': jitter(0.02),
     **{f'scans at {r:g} Hz': decimate(r) for r in (2.0, 1.0)},

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.estimation.kidnapping_detection import agree_with_map
+from rlml_slam.estimation.kidnapping_detection import FEW, RECENT, agree_with_map
 from rlml_slam.estimation.landmark_tracks import LandmarkTracks
 from rlml_slam.matching.reflectors import association
 from rlml_slam.params import Parameters
@@ -25,6 +26,7 @@ from rlml_slam.types import ANONYMOUS, Belief, Detections, Observation, Reflecto
 NONE = np.zeros(0, dtype=np.int64)
 # as plain integers: comparing arrays with members of an enumeration is slow
 USED, GHOST = int(Status.USED), int(Status.GHOST)
+SLIP = 1.0  # 1 sigma, as a share of the motion, of wheels that spin or are locked
 NEW, DEFERRED, AMBIGUOUS = int(Status.NEW), int(Status.DEFERRED), int(Status.AMBIGUOUS)
 
 
@@ -71,6 +73,46 @@ class Matches:
         return int(((detections.ids != ANONYMOUS) & self.unmatched).sum())
 
 
+class Slip:
+    """Motion since reflectors last agreed with the map: wheels may have slipped meanwhile.
+
+    ``cov`` (3, 3) is that of the slip which the newest observation showed, zeros for none.
+    """
+
+    def __init__(self) -> None:
+        self._agreed = self._stamp = -(2**62)  # [ns] of the last frame at which they did, and the last
+        self._way = np.zeros(2)  # distance [m] and turn [rad] since
+        self.cov = np.zeros((3, 3))
+
+    def move(self, observation: Observation, velocity: Array) -> None:
+        """Begin an observation. ``velocity`` (3,) of the last one: a wheel that is locked slides."""
+        dt = min((observation.stamp - self._stamp) * 1e-9, RECENT)
+        way = np.maximum(np.abs(observation.motion.delta), dt * np.abs(velocity))
+        self._way += math.hypot(way[0], way[1]), way[2]
+        self._stamp, self.cov = observation.stamp, np.zeros((3, 3))
+
+    def possible(self, match: NDArray[np.int64]) -> Array | None:
+        """Covariance (3, 3) of slip where reflectors agreed shortly before, and do not now.
+
+        ``match`` (k,) is the association without slip, -1 for none.
+        """
+        matched = int(np.count_nonzero(match >= 0))
+        if agree_with_map(len(match), matched):
+            if matched >= FEW:
+                self.agree(self.cov)
+            return None
+        if self._stamp - self._agreed > RECENT * 1e9 or len(match) < FEW or not self._way.any():
+            return None
+        distance, turn = self._way
+        # one wheel that slips turns a robot that is a metre wide by as much
+        sigma = SLIP * np.array([distance, distance, turn + distance])
+        return np.diag(sigma**2)
+
+    def agree(self, cov: Array) -> None:
+        """Reflectors agree with the map after slip of ``cov`` (3, 3)."""
+        self.cov, self._agreed, self._way = cov, self._stamp, np.zeros(2)
+
+
 class ReflectorTerm:
     """Reflectors of a joint state; ``tracks`` has their identities, row by row."""
 
@@ -84,6 +126,7 @@ class ReflectorTerm:
         r = params.reflector
         self._inactive = InactiveLandmarks(r.max_range, r.min_sightings)
         self._max_range_seen = 0.0
+        self._slip = Slip()
         self._muted = sectors(self._p.reflector.muted_sectors)
 
     def use_map(self, reflectors: Reflectors) -> None:
@@ -91,9 +134,10 @@ class ReflectorTerm:
         self._window = MapWindow(reflectors, self._p.reflector.max_range)
         self._window.update(self._state, self.tracks)
 
-    def select(self, observation: Observation) -> Matches:
+    def select(self, observation: Observation, velocity: Array) -> Matches:
         """Keep only the reflectors in range in the state; matches of the observation: none."""
         detections = observation.detections
+        self._slip.move(observation, velocity)
         if self._window is not None:
             self._window.update(self._state, self.tracks)
         elif self._p.node.mode == 'mapping':
@@ -101,24 +145,28 @@ class ReflectorTerm:
             self._inactive.update(self._state, self.tracks, ids)
         return Matches.none(0 if detections is None else len(detections))
 
-    def update(self, observation: Observation, matches: Matches) -> Matches:
-        """Associate the unmatched detections and update the state with them (e_R of eq. 2)."""
+    def update(
+        self, observation: Observation, matches: Matches, may_slip: bool = False
+    ) -> Matches:
+        """Associate the unmatched detections and update the state with them (e_R of eq. 2).
+
+        With ``may_slip``, detections that agree with the map only if the wheels slipped widen the
+        pose by as much.
+        """
         detections = observation.detections
         rows = np.flatnonzero(matches.unmatched)
         if detections is None or not len(rows):
             return matches
         is_first = len(rows) == len(detections)
-        result = self._associator.associate(
-            detections if is_first else _subset(detections, rows),
-            association.Believed(
-                self._state.pose,
-                self._state.landmarks(),
-                self.tracks.ids,
-                self._state.pose_and_landmarks_cov(),
-                self._recent(observation.stamp),
-                self.tracks.spread2,
-            ),
-        )
+        given = detections if is_first else _subset(detections, rows)
+        result = self._associate(given, observation.stamp, np.zeros((3, 3)))
+        slip = self._slip.possible(result.match) if may_slip else None
+        if slip is not None:
+            again = self._associate(given, observation.stamp, slip)
+            if np.count_nonzero(again.match >= 0) >= FEW:
+                self._state.widen(slip)
+                self._slip.agree(slip)
+                result = again
         index, status, distance2 = (
             matches.index.copy(), matches.status.copy(), matches.distance2.copy()
         )  # fmt: skip
@@ -138,6 +186,18 @@ class ReflectorTerm:
             self.tracks.see(landmarks, observation.stamp, detections.ids[k])
         return Matches(index, matches.keys, status, distance2)
 
+    def _associate(
+        self, detections: Detections, stamp: int, cov: Array
+    ) -> association.Association:
+        """Detections and reflectors, for a pose that is uncertain by ``cov`` (3, 3) besides."""
+        joint = self._state.pose_and_landmarks_cov()
+        joint[:3, :3] += cov
+        believed = association.Believed(
+            self._state.pose, self._state.landmarks(), self.tracks.ids, joint,
+            self._recent(stamp), self.tracks.spread2,
+        )  # fmt: skip
+        return self._associator.associate(detections, believed)
+
     def _recent(self, stamp: int) -> NDArray[np.bool_] | None:
         """(m,): reflectors seen within ``track_timeout``; None in a saved map, which is fixed."""
         if self._p.node.mode != 'mapping':
@@ -145,7 +205,7 @@ class ReflectorTerm:
         return stamp - self.tracks.last_seen < self._p.reflector.track_timeout * 1e9
 
     def widen(self, observation: Observation, matches: Matches) -> Observation:
-        """Add the spread of groups to the noise of their detections; detects groups.
+        """Add slip to the noise of the motion, and spread of groups to that of their detections.
 
         A group are several reflectors that are closer than they can be distinguished. It is one
         reflector of the state; two detections of it at once show that it is a group.
@@ -153,6 +213,11 @@ class ReflectorTerm:
         detections = observation.detections
         if detections is None or not len(detections):
             return observation
+        if self._slip.cov.any():
+            motion = observation.motion
+            observation = replace(
+                observation, motion=replace(motion, cov=motion.cov + self._slip.cov)
+            )
         seen = np.flatnonzero(matches.index >= 0)
         spread2 = np.zeros(len(detections))
         spread2[seen] = self.tracks.spread2[matches.index[seen]]

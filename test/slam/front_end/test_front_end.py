@@ -325,6 +325,39 @@ def test_reflectors_in_the_corridor_make_it_healthy():
     assert frames[-1].cov_local[0, 0] < 0.05**2
 
 
+MARKED_CORRIDOR = replace(
+    CORRIDOR, reflectors=np.array([[-3.0, 1.1], [2.5, -1.1], [6.0, 1.1], [9.0, -1.1], [14.0, 1.1]])
+)
+
+
+@pytest.mark.parametrize('share', [0.0, 0.2, 1.5, 3.0])
+def test_wheels_that_slip_where_reflectors_alone_say_how_far(share):
+    """Wheels travel ``share`` of the robot's motion for 2 s: they are locked, or spin."""
+    path = drive((1.0, 0.0, 8.0))
+    observed = observations(MARKED_CORRIDOR, path, rng=np.random.default_rng(7))
+    odometry = np.zeros(3)
+    for k, o in enumerate(observed):
+        delta = o.motion.delta * (share if 30 < k <= 50 else 1.0)
+        odometry = se2.compose(odometry, delta)
+        motion = replace(o.motion, delta=delta, cov=motion_cov(delta) if k else o.motion.cov)
+        observed[k] = replace(o, motion=motion, odom_pose=odometry)
+    frames, front_end = run(observed)
+    e = np.abs(poses_of(frames) - path)[:, 0]
+    assert e.max() < 0.15
+    assert e[60:].max() < 0.08
+    assert len(front_end.reflectors().keys) == len(MARKED_CORRIDOR.reflectors)
+    assert all(f.health.level is Level.OK for f in frames)
+
+
+def test_reflectors_that_come_into_view_are_no_slip():
+    front_end = FrontEnd(Parameters())
+    front_end.process(Observation(FIRST - STEP, Motion(np.zeros(3), np.zeros((3, 3)))))
+    slip = front_end._reflectors._slip
+    for o in observations(MARKED_CORRIDOR, drive((1.0, 0.0, 8.0)), rng=np.random.default_rng(7)):
+        front_end.process(o)
+        assert not slip.cov.any()
+
+
 def test_room_is_healthy_and_lost_inputs_are_named():
     frames, front_end = run(observations(ROOM, CURVE[:20]))
     assert all(f.health.level is Level.OK and not f.health.reasons for f in frames)
