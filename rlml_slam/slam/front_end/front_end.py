@@ -68,11 +68,7 @@ class FrontEnd:
         observation = self._scans.likeliest(self._motion.hypotheses(observation))
         self._motion.predict(self.state, observation)
         observation, sweep = self._scans.deskew(observation)
-        matches = self._reflectors.update(
-            observation,
-            self._reflectors.select(observation, self._motion.velocity),
-            may_slip=True,
-        )
+        matches = self._reflectors.begin(observation, self._motion.velocity)
         scan = self._update_with_scan(observation, sweep, matches)
         matches = self._reflectors.update(observation, matches)
         contradicted = self._contradicts_map(observation, matches, scan)

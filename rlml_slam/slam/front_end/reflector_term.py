@@ -27,6 +27,7 @@ NONE = np.zeros(0, dtype=np.int64)
 # as plain integers: comparing arrays with members of an enumeration is slow
 USED, GHOST = int(Status.USED), int(Status.GHOST)
 SLIP = 1.0  # 1 sigma, as a share of the motion, of wheels that spin or are locked
+MOST = 2.0 / 3.0  # share of the detections that have to agree for slip to be believed
 NEW, DEFERRED, AMBIGUOUS = int(Status.NEW), int(Status.DEFERRED), int(Status.AMBIGUOUS)
 
 
@@ -80,12 +81,13 @@ class Slip:
     """
 
     def __init__(self) -> None:
-        self._agreed = self._stamp = -(2**62)  # [ns] of the last frame at which they did, and the last
+        # stamps [ns] of the last observation at which they did, and of the newest
+        self._agreed = self._stamp = -(2**62)
         self._way = np.zeros(2)  # distance [m] and turn [rad] since
         self.cov = np.zeros((3, 3))
 
     def move(self, observation: Observation, velocity: Array) -> None:
-        """Begin an observation. ``velocity`` (3,) of the last one: a wheel that is locked slides."""
+        """Begin an observation; ``velocity`` (3,) until then: wheels that are locked slide."""
         dt = min((observation.stamp - self._stamp) * 1e-9, RECENT)
         way = np.maximum(np.abs(observation.motion.delta), dt * np.abs(velocity))
         self._way += math.hypot(way[0], way[1]), way[2]
@@ -134,8 +136,11 @@ class ReflectorTerm:
         self._window = MapWindow(reflectors, self._p.reflector.max_range)
         self._window.update(self._state, self.tracks)
 
-    def select(self, observation: Observation, velocity: Array) -> Matches:
-        """Keep only the reflectors in range in the state; matches of the observation: none."""
+    def begin(self, observation: Observation, velocity: Array) -> Matches:
+        """Keep only the reflectors in range in the state; update it with the detections.
+
+        Wheels may have slipped, at the ``velocity`` (3,) of the robot until now.
+        """
         detections = observation.detections
         self._slip.move(observation, velocity)
         if self._window is not None:
@@ -143,7 +148,8 @@ class ReflectorTerm:
         elif self._p.node.mode == 'mapping':
             ids = NONE if detections is None else detections.ids
             self._inactive.update(self._state, self.tracks, ids)
-        return Matches.none(0 if detections is None else len(detections))
+        none = Matches.none(0 if detections is None else len(detections))
+        return self.update(observation, none, may_slip=True)
 
     def update(
         self, observation: Observation, matches: Matches, may_slip: bool = False
@@ -163,7 +169,8 @@ class ReflectorTerm:
         slip = self._slip.possible(result.match) if may_slip else None
         if slip is not None:
             again = self._associate(given, observation.stamp, slip)
-            if np.count_nonzero(again.match >= 0) >= FEW:
+            # of a robot that was carried away, a few match by chance
+            if np.count_nonzero(again.match >= 0) >= max(FEW, MOST * len(given)):
                 self._state.widen(slip)
                 self._slip.agree(slip)
                 result = again
