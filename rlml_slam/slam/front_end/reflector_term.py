@@ -75,7 +75,7 @@ class Matches:
 
 
 class Slip:
-    """Motion since reflectors last agreed with the map: wheels may have slipped meanwhile.
+    """Motion since reflectors last agreed with the map: wheels may have slipped (eq. 60).
 
     ``cov`` (3, 3) is that of the slip which the newest observation showed, zeros for none.
     """
