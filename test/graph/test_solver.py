@@ -280,7 +280,7 @@ def test_a_second_start_is_left_where_going_on_is_better():
 @pytest.mark.parametrize('start', ['none', 'odometry', 'auto'])
 @pytest.mark.parametrize('name', ['intel/sesync-intel.g2o', 'small/ring-noisy.g2o'])
 def test_what_is_called_converged_has_nothing_left_to_gain(name, start):
-    limits = params.Solver(initialization='none' if start == 'odometry' else start)
+    limits = params.Solver(initialization='auto' if start == 'auto' else 'none')
     graph = read_graph(shared_graph(name)).graph
     if start == 'odometry':
         initialize(graph, start)

@@ -61,7 +61,9 @@ def test_another_publisher_of_the_pose_is_a_problem(live, node, monkeypatch):
     live.spin_until(lambda: node.publishers_of('/pose') == ['/ear', '/front_end'])
     assert node.answers.problems() == ()
     monkeypatch.setattr(frame_publisher, 'FORGOTTEN', 0.0)
-    assert node.answers.problems() == ('/pose has 2 publishers: /ear, /front_end',)
+    assert node.answers.problems() == (
+        '/pose has 2 publishers, was it started twice: /ear, /front_end',
+    )
     node.health.publish()
     live.spin_until(lambda: '/pose has 2' in live.heard[HEALTH][-1].message)
 

@@ -58,7 +58,7 @@ class FramePublisher:
             self._alone = now
         if now - self._alone <= FORGOTTEN:
             return ()
-        return (f'{topic} has {len(found)} publishers: {", ".join(found)}',)
+        return (f'{topic} has {len(found)} publishers, was it started twice: {", ".join(found)}',)
 
     def begin_session(self) -> None:
         """From now on, the local frame is another one."""

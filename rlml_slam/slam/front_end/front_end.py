@@ -53,9 +53,8 @@ class FrontEnd:
         self._map = MapLocalization(self._p)
         self._correction = Correction(np.zeros(3))
         self.health = HealthMonitor(self._p.health)
-        self._jumped = False
+        self._jumped, self._is_settled = False, True
         self._settling = 0.0  # [s] spent in settle() since the last frame
-        self._is_settled = True
 
     def process(self, observation: Observation) -> Frame:
         """Pose at the stamp of the observation; never raises for what was measured.
@@ -210,6 +209,7 @@ class FrontEnd:
             self.state.place(pose, cov)
             self._scans.start_new_submaps()
             self._motion.forget_velocity()
+            self._reflectors.forget_slip()
             T_map_local = self.T_map_local
         # the reference keyframe of the graph is where the robot was before
         self._correction = Correction(T_map_local)

@@ -27,7 +27,8 @@ NONE = np.zeros(0, dtype=np.int64)
 # as plain integers: comparing arrays with members of an enumeration is slow
 USED, GHOST = int(Status.USED), int(Status.GHOST)
 SLIP = 1.0  # 1 sigma, as a share of the motion, of wheels that spin or are locked
-MOST = 2.0 / 3.0  # share of the detections that have to agree for slip to be believed
+WIDTH = 1.0  # [m] of a robot, which one wheel that slips turns
+AGREEING = 2.0 / 3.0  # share of the detections that have to match; of a carried robot, some do
 NEW, DEFERRED, AMBIGUOUS = int(Status.NEW), int(Status.DEFERRED), int(Status.AMBIGUOUS)
 
 
@@ -98,21 +99,22 @@ class Slip:
 
         ``match`` (k,) is the association without slip, -1 for none.
         """
-        matched = int(np.count_nonzero(match >= 0))
-        if agree_with_map(len(match), matched):
-            if matched >= FEW:
-                self.agree(self.cov)
+        if agrees(match):
+            self.agree(self.cov)
             return None
-        if self._stamp - self._agreed > RECENT * 1e9 or len(match) < FEW or not self._way.any():
+        if not 0 <= self._stamp - self._agreed <= RECENT * 1e9 or len(match) < FEW:
             return None
         distance, turn = self._way
-        # one wheel that slips turns a robot that is a metre wide by as much
-        sigma = SLIP * np.array([distance, distance, turn + distance])
-        return np.diag(sigma**2)
+        return np.diag((SLIP * np.array([distance, distance, turn + distance / WIDTH])) ** 2)
 
     def agree(self, cov: Array) -> None:
         """Reflectors agree with the map after slip of ``cov`` (3, 3)."""
         self.cov, self._agreed, self._way = cov, self._stamp, np.zeros(2)
+
+
+def agrees(match: NDArray[np.int64]) -> bool:
+    """Whether so many detections (k,) match that the motion was right, not some by chance."""
+    return int(np.count_nonzero(match >= 0)) >= max(FEW, AGREEING * len(match))
 
 
 class ReflectorTerm:
@@ -169,8 +171,7 @@ class ReflectorTerm:
         slip = self._slip.possible(result.match) if may_slip else None
         if slip is not None:
             again = self._associate(given, observation.stamp, slip)
-            # of a robot that was carried away, a few match by chance
-            if np.count_nonzero(again.match >= 0) >= max(FEW, MOST * len(given)):
+            if agrees(again.match):
                 self._state.widen(slip)
                 self._slip.agree(slip)
                 result = again
@@ -210,6 +211,10 @@ class ReflectorTerm:
         if self._p.node.mode != 'mapping':
             return None
         return stamp - self.tracks.last_seen < self._p.reflector.track_timeout * 1e9
+
+    def forget_slip(self) -> None:
+        """The pose was moved: reflectors did not agree there before."""
+        self._slip = Slip()
 
     def widen(self, observation: Observation, matches: Matches) -> Observation:
         """Add slip to the noise of the motion, and spread of groups to that of their detections.

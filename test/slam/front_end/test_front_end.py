@@ -330,11 +330,10 @@ MARKED_CORRIDOR = replace(
 )
 
 
-@pytest.mark.parametrize('share', [0.0, 0.2, 1.5, 3.0])
-def test_wheels_that_slip_where_reflectors_alone_say_how_far(share):
-    """Wheels travel ``share`` of the robot's motion for 2 s: they are locked, or spin."""
+def slipped(world, share):
+    """Errors (n,) and health of a drive of 8 m; wheels travel ``share`` of its motion for 2 s."""
     path = drive((1.0, 0.0, 8.0))
-    observed = observations(MARKED_CORRIDOR, path, rng=np.random.default_rng(7))
+    observed = observations(world, path, rng=np.random.default_rng(7))
     odometry = np.zeros(3)
     for k, o in enumerate(observed):
         delta = o.motion.delta * (share if 30 < k <= 50 else 1.0)
@@ -342,11 +341,29 @@ def test_wheels_that_slip_where_reflectors_alone_say_how_far(share):
         motion = replace(o.motion, delta=delta, cov=motion_cov(delta) if k else o.motion.cov)
         observed[k] = replace(o, motion=motion, odom_pose=odometry)
     frames, front_end = run(observed)
-    e = np.abs(poses_of(frames) - path)[:, 0]
-    assert e.max() < 0.15
-    assert e[60:].max() < 0.08
+    return np.abs(poses_of(frames) - path)[:, 0], [f.health.level for f in frames], front_end
+
+
+@pytest.mark.parametrize('share', [0.0, 0.2, 1.5, 3.0])
+def test_wheels_that_slip_where_reflectors_alone_say_how_far(share):
+    """They are locked, or spin."""
+    error, levels, front_end = slipped(MARKED_CORRIDOR, share)
+    assert all(level is Level.OK for level in levels)
+    assert error.max() < 0.15
+    assert error[60:].max() < 0.08
     assert len(front_end.reflectors().keys) == len(MARKED_CORRIDOR.reflectors)
-    assert all(f.health.level is Level.OK for f in frames)
+
+
+@pytest.mark.parametrize('spacing', [0.6, 1.0, 1.5])
+@pytest.mark.parametrize('share', [0.2, 3.0])
+def test_wheels_that_slip_along_a_row_of_reflectors(spacing, share):
+    x = np.arange(-3.0, 14.0, spacing)
+    row = replace(CORRIDOR, reflectors=np.stack([x, np.full(len(x), 1.1)], -1))
+    error, levels, front_end = slipped(row, share)
+    assert max(levels) < Level.LOST
+    assert error.max() < 0.15
+    assert error[60:].max() < 0.05
+    assert len(front_end.reflectors().keys) == len(x)
 
 
 def test_reflectors_that_come_into_view_are_no_slip():
