@@ -181,8 +181,9 @@ class ScanTerm:
         if found.score < threshold or found.prior_weight < 0.5:
             searched = match(submap, points, prior, strength, p)
             found = searched if searched.score > found.score else found
-        is_doubtful = found.prior_weight < 0.5 or self._fits_badly(submap, points, found)
-        if has_odometry and found.score < usual and is_doubtful:
+        if (has_odometry and found.score < usual) and (
+            found.prior_weight < 0.5 or self._fits_badly(submap, points, found)
+        ):
             # next to its true pose, where a wrong stamp leads, a scan fits, but worse than usual
             searched = self._match_in_window(submap, points, prior, strength, p.wide_window)
             found = searched if searched.score >= usual else found
