@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rlml_lab.faults.fault_catalog import Fault
+from rlml_lab.faults.fault_catalog import Fault, Messages
 from rlml_lab.faults.recording import Recording
 from rlml_lab.support.drives import feed_one
 from rlml_slam import se2, warm_up
@@ -20,7 +20,7 @@ from rlml_slam.params import Parameters
 from rlml_slam.recordings.bag_replay import patient
 from rlml_slam.se2 import Array
 from rlml_slam.slam.offline.slam import Slam
-from rlml_slam.types import Level
+from rlml_slam.types import Detections, Level, Scan
 
 WRONG, WRONG_TURN = 0.5, np.radians(10.0)  # [m], [rad] beyond 3 sigma: a pose that is wrong
 SIGMAS = 3.0
@@ -53,7 +53,7 @@ def run(
     """Replay with a fault, and compare.
 
     The published poses are compared with the truth, or else with ``reference``, the optimised
-    trajectory of the run without a fault.
+    trajectory of the run without a fault, where the scans were taken, whatever their stamps say.
     """
     messages = fault(recording.messages, np.random.default_rng(seed))
     slam, log = Slam(patient(params)), FrameLog()
@@ -65,11 +65,11 @@ def run(
         log.add(feed_one(slam, message))
     log.add(slam.finish())
     spent = time.process_time() - began
-    stamps, poses = slam.trajectory()
-    path = Trajectory(stamps, poses)
+    taken = stamps_as_recorded(messages, recording.messages)
+    path = restamped(Trajectory(*slam.trajectory()), taken)
     trans, rot = _errors(recording, path, reference)
     true = recording.truth or reference or path
-    wrong = is_wrong(log, true) & (np.array(log.levels) == Level.OK)
+    wrong = is_wrong(log, true, taken) & (np.array(log.levels) == Level.OK)
     at, levels = np.array(log.stamps), np.array(log.levels)
     figures = FaultFigures(
         float(trans.mean()), float(trans.std()), float(np.degrees(rot.mean())),
@@ -91,9 +91,31 @@ def _errors(
     return errors.distances, np.abs(errors.errors[:, 2])
 
 
-def is_wrong(log: FrameLog, truth: Trajectory) -> Array:
-    """Of each frame (n,), whether its pose is off by more than WRONG and SIGMAS."""
-    errors = trajectory_errors(log.trajectory(), truth)
+def stamps_as_recorded(messages: Messages, recorded: Messages) -> dict[int, int]:
+    """Of each stamp [ns] of a scan that a fault has moved, the stamp that was recorded."""
+    pairs: dict[int, int] = {}
+    for kind in (Scan, Detections):
+        now = [m.stamp for m in messages if isinstance(m, kind)]
+        then = [m.stamp for m in recorded if isinstance(m, kind)]
+        if len(now) == len(then):
+            pairs.update((a, b) for a, b in zip(now, then, strict=True) if a != b)
+    return pairs
+
+
+def restamped(path: Trajectory, taken: dict[int, int]) -> Trajectory:
+    """The trajectory with each stamp replaced by that of ``taken``, if it is there, in order."""
+    stamps = np.array([taken.get(s, s) for s in path.stamps.tolist()], dtype=np.int64)
+    stamps, order = np.unique(stamps, return_index=True)
+    return Trajectory(stamps, path.poses[order])
+
+
+def is_wrong(log: FrameLog, truth: Trajectory, taken: dict[int, int] | None = None) -> Array:
+    """Of each frame (n,), whether its pose is off by more than WRONG and SIGMAS.
+
+    ``taken``: stamps at which the truth is looked up instead of the frame's.
+    """
+    at = np.array([(taken or {}).get(s, s) for s in log.stamps], dtype=np.int64)
+    errors = trajectory_errors(Trajectory(at, np.array(log.poses).reshape(-1, 3)), truth)
     out = np.zeros(len(log.stamps), dtype=bool)
     covs = np.array(log.covs)[errors.indices]
     sigma = np.sqrt(np.linalg.eigvalsh(covs[:, :2, :2])[:, 1])

@@ -7,7 +7,13 @@ import pytest
 
 from rlml_lab.faults import fault_catalog as faults
 from rlml_lab.faults import study_faults, study_stalls
-from rlml_lab.faults.fault_run import FaultFigures, is_wrong, longest
+from rlml_lab.faults.fault_run import (
+    FaultFigures,
+    is_wrong,
+    longest,
+    restamped,
+    stamps_as_recorded,
+)
 from rlml_slam import se2
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.evaluation.run_record import FrameLog
@@ -113,6 +119,23 @@ def test_pose_is_wrong_beyond_its_own_covariance_only():
     wrong = is_wrong(log, truth)
     assert wrong.tolist() == [True, False, True, False]
     assert longest(np.array(log.stamps), np.array([True, True, False, True])) == 1.0
+
+
+def test_pose_is_compared_with_the_truth_of_the_moment_its_scan_was_taken():
+    recorded = [m for m in drive(10.0) if isinstance(m, Scan)]
+    moved = applied(faults.jitter(0.02), recorded)
+    taken = stamps_as_recorded(moved, recorded)
+    assert [taken[m.stamp] for m in moved] == [m.stamp for m in recorded]
+    poses = np.column_stack([np.arange(50.0), np.zeros((50, 2))])
+    path = restamped(Trajectory(np.array([m.stamp for m in moved]), poses), taken)
+    assert path.stamps.tolist() == [m.stamp for m in recorded]
+    log = FrameLog()
+    for m, pose in zip(moved, poses, strict=True):
+        log.add_pose(m.stamp, pose, 1e-6 * np.eye(3))
+    truth = Trajectory(np.array([m.stamp for m in recorded]), 40.0 * poses)
+    assert is_wrong(log, truth, taken).tolist() == [False] + 49 * [True]
+    assert not is_wrong(log, Trajectory(truth.stamps, poses), taken).any()
+    assert stamps_as_recorded(recorded[1:], recorded) == {}
 
 
 def test_stalls_in_a_fast_turn_among_furniture_cost_nothing():
