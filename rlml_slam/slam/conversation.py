@@ -14,6 +14,7 @@ from enum import IntEnum
 
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.se2 import Array
+from rlml_slam.slam.search_area import SearchArea
 from rlml_slam.types import Belief, Frame, Observation
 
 RESTARTED, GIVEN = 0, 1  # `request` of a session that nobody asked for, and of a user's pose
@@ -111,6 +112,7 @@ class Search:
     """Find the pose of an observation in a map; ``on_search_result`` is the answer.
 
     A map in the making is not ``complete``. With a ``given`` frame, its pose is tested instead.
+    Scans are searched in the ``area``, None for the whole map.
     """
 
     number: int
@@ -118,6 +120,7 @@ class Search:
     map: SavedMap
     complete: bool
     given: Frame | None = None
+    area: SearchArea | None = None
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from enum import Enum
 
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.slam.conversation import Answer, Command, DrawMap, Search, SessionFrame
+from rlml_slam.slam.search_area import search_area
 
 
 class Purpose(Enum):
@@ -62,8 +63,11 @@ class Searches:
     def _search(self, number: int, saved: SavedMap, complete: bool) -> Search:
         pending = self._pending[number]
         frame = None if pending.record is None else pending.record.frame
+        if frame is None:
+            return Search(number, None, saved, complete)
         given = frame if pending.purpose is Purpose.CONFIRM else None
-        return Search(number, None if frame is None else frame.observation, saved, complete, given)
+        area = search_area(frame) if pending.purpose is Purpose.RECOVER else None
+        return Search(number, frame.observation, saved, complete, given, area)
 
     def take(self, number: int) -> Pending | None:
         """What is under way with this number, and no longer from now on; None if superseded."""

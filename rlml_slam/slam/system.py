@@ -42,6 +42,7 @@ from rlml_slam.slam.relocalization.recovery import Recovery
 from rlml_slam.slam.relocalization.relocalize_answer import relocalize_answer
 from rlml_slam.slam.relocalization.scan_relocalization import Relocation
 from rlml_slam.slam.requests import Requests
+from rlml_slam.slam.search_area import search_area
 from rlml_slam.slam.searches import Pending, Purpose, Searches
 from rlml_slam.types import Belief, Verdict
 
@@ -275,6 +276,10 @@ class System:
         elif self.entry is not None:
             self.entry.why = found.why
         if found.verdict is not Verdict.UNIQUE or pose is None or cov is None:
+            return []
+        area = search_area(record.frame) if pending.purpose is Purpose.RECOVER else None
+        if area is not None and not area.contains(pose):
+            self.recovery.why = f'{found.why}, but it is too far from where odometry led'
             return []
         if self.entry is not None:
             return [self._start(record, pose, cov)]

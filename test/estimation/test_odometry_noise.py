@@ -112,3 +112,41 @@ def test_wheels_that_jitter_where_the_robot_stands_say_nothing():
     drive(noise, 2000, rng, sigmas=0.0, v=0.001, w=0.001)
     assert not noise._sums.any()
     assert drive(noise, 1, rng, v=0.15)[0] == 1.0  # it creeps off
+
+
+def test_gap_after_wheels_that_slip_is_as_uncertain_as_they_are():
+    """Random ways of 30 s: the motion that wheels say errs as much as its covariance says."""
+    rng, dt, rate = np.random.default_rng(4), 0.2, 0.04  # [rad/sqrt(s)], far above the noise
+    noise, known = OdometryNoise(NOISE), np.diag([1e-3, 1e-3, 1e-3]) ** 2
+
+    def step(pose):
+        v, w = rng.uniform(0.3, 0.7), rng.normal(0.0, 0.5)
+        true = se2.exp(np.array([v, 0.0, w]) * dt)
+        slip = rate * np.sqrt(dt) * rng.standard_normal()
+        return se2.compose(pose, true), se2.compose(true, np.array([0.0, 0.0, slip]))
+
+    for k in range(1500):
+        _, wheels = step(np.zeros(3))
+        given = Observation((k + 1) * SECOND, motion=replace(motion(0.5, 0.0, dt), delta=wheels))
+        scaled = noise.scaled(given, dt).motion
+        error = np.array([0.0, 0.0, rate * np.sqrt(dt) * rng.standard_normal()])
+        noise.learn(scaled, (np.zeros(3), known + scaled.cov), (error, known))
+    errors, sigmas = [], []
+    for _ in range(200):
+        there = wheels = np.zeros(3)
+        for _ in range(150):
+            there, one = step(there)
+            wheels = se2.compose(wheels, one)
+        gap = noise.scaled(Observation(SECOND, motion=motion_of(wheels, 30.0, NOISE)), 30.0)
+        errors.append(se2.between(wheels, there))
+        sigmas.append(np.sqrt(np.diag(gap.motion.cov)))
+    ratio = np.array(errors) / np.array(sigmas)
+    assert (np.abs(ratio) < 3.0).mean() > 0.98
+    assert 0.3 < np.sqrt((ratio**2).mean()) < 1.1
+
+
+def test_gap_of_good_wheels_and_of_a_robot_that_stood_keeps_its_noise():
+    noise = OdometryNoise(NOISE)
+    drive(noise, 1000, np.random.default_rng(0), sigmas=2.0)
+    stood = Observation(SECOND, motion=motion(0.001, 0.0, 30.0))
+    assert noise.scaled(stood, 30.0) is stood

@@ -149,6 +149,9 @@ class ScanTerm:
             usual = self.kidnapping.usual
             found = recover_locally(submap, points, prior, usual, self._p, turn) or found
             misfit = self._contradicts(submap, points, found)
+        if misfit and not reflectors_agree and self._motion.drove_unseen:
+            self.submaps.start_again()
+            return ScanEvidence(has_scan=False)
         if found.score < p.min_score or (misfit and not reflectors_agree):
             return ScanEvidence(has_scan=True, misfit=misfit, score=found.score)
         self.kidnapping.learn(found.score)

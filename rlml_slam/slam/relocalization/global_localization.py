@@ -25,6 +25,7 @@ from rlml_slam.slam.relocalization.scan_relocalization import (
     relocalize,
     scan_fits,
 )
+from rlml_slam.slam.search_area import SearchArea
 from rlml_slam.types import Observation, Reflectors, Verdict
 
 
@@ -34,18 +35,20 @@ def localize_globally(
     observation: Observation | None,
     p: Parameters,
     complete: bool = True,
+    area: SearchArea | None = None,
 ) -> Relocation:
     """Search an observation in a map, both parts of which are in the map frame.
 
     Of a map in the making, which is not ``complete``, what is missing speaks against no place.
+    Scans are searched in the ``area``, None for the whole map.
     """
     points = None if observation is None else observation.points
     seen = None if observation is None else observation.detections
     if seen is None or not p.node.use_reflectors:
-        return relocalize(grid, points, p, complete)
+        return relocalize(grid, points, p, complete, area)
     stars = locate(seen.points, seen.cov, reflectors.points, reflectors.cov, p.relocalization)
     places = [c.pose for c in (*stars.candidates, *stars.rivals)]
-    found = _by_both(stars, grid, points, p, complete)
+    found = _by_both(stars, grid, points, p, complete, area)
     return replace(found, rivals=np.array(places).reshape(-1, 3))
 
 
@@ -55,6 +58,7 @@ def _by_both(
     points: Array | None,
     p: Parameters,
     complete: bool,
+    area: SearchArea | None,
 ) -> Relocation:
     """The verdict by what the reflectors say, and by the scan."""
     if stars.verdict is Verdict.UNIQUE:
@@ -68,7 +72,7 @@ def _by_both(
             return Relocation(Verdict.UNIQUE, why, *_at(best), score)
         why = f'{stars.why}, but there the scan has a score of {score:.2f}'
         return Relocation(Verdict.AMBIGUOUS, why, *_at(best), score)
-    by_scan = relocalize(grid, points, p, complete)
+    by_scan = relocalize(grid, points, p, complete, area)
     if stars.verdict is Verdict.IMPOSSIBLE:
         return by_scan
     if stars.verdict is Verdict.NOT_SEARCHED:

@@ -28,7 +28,9 @@ def locate(search: Search, p: Parameters) -> Relocation:
     saved = search.map
     if search.given is not None:
         return evaluate_pose(saved, search.given, p)
-    return localize_globally(saved.grid, saved.reflectors, search.observation, p, search.complete)
+    return localize_globally(
+        saved.grid, saved.reflectors, search.observation, p, search.complete, search.area
+    )
 
 
 def evaluate_pose(saved: SavedMap, frame: Frame, p: Parameters) -> Relocation:

@@ -25,6 +25,7 @@ from rlml_slam.slam.relocalization.grid_submap import (
     possible,
     submap_of,
 )
+from rlml_slam.slam.search_area import SearchArea
 from rlml_slam.types import Verdict
 
 SEARCHED = 150  # end points of the search; all of them count when its places are compared
@@ -54,11 +55,13 @@ class Relocation:
 
 
 def relocalize(
-    grid: OccupancyGrid | None, points: Array | None, p: Parameters, complete: bool = True
-) -> Relocation:
+    grid: OccupancyGrid | None, points: Array | None, p: Parameters, complete: bool = True,
+    area: SearchArea | None = None,
+) -> Relocation:  # fmt: skip
     """Search ``points`` (n, 2), end points in the base frame, in a grid of the map frame.
 
-    Where the map is not ``complete``, what it lacks at the next best place may be there.
+    Where the map is not ``complete``, what it lacks at the next best place may be there. With an
+    ``area``, no pose outside is searched.
     """
     if grid is None or not is_mapped(grid):
         return Relocation(Verdict.IMPOSSIBLE, 'there is no map of scans yet')
@@ -67,7 +70,8 @@ def relocalize(
     saved = submap_of(grid, p.submap)
     submap = saved.submap
     points = voxel_filter.thin(points, p.scan_match.voxel_size, p.scan_match.max_points)
-    found = _search(saved, voxel_filter.thin(points, p.scan_match.voxel_size, SEARCHED), p)
+    searched = voxel_filter.thin(points, p.scan_match.voxel_size, SEARCHED)
+    found = _search(saved, searched, p, area)
     if not found.complete:
         why = f'the search was ended after {found.lookups / 1e6:.0f} million look-ups'
         return Relocation(Verdict.NOT_SEARCHED, why)
@@ -107,8 +111,10 @@ def _compared(
     return Relocation(verdict, why, saved.to_map(pose), cov, score, second)
 
 
-def _search(saved: GridSubmap, points: Array, p: Parameters) -> WideResult:
-    """The two best places in the whole map, from wherever a base may stand.
+def _search(
+    saved: GridSubmap, points: Array, p: Parameters, area: SearchArea | None
+) -> WideResult:
+    """The two best places in the area or the whole map, from wherever a base may stand.
 
     A pose that fits has a lower score when it is refined than in the search. So the next best one
     that could be a rival of the least score that fits has at least ``MAX_SECOND`` of that.
@@ -116,6 +122,9 @@ def _search(saved: GridSubmap, points: Array, p: Parameters) -> WideResult:
     bounds = saved.submap.bounds
     middle, half = 0.5 * (bounds[:2] + bounds[2:]), 0.5 * (bounds[2:] - bounds[:2])
     window = Window(np.array([*middle, 0.0]), (half[0], half[1]), np.pi, mapped=True)
+    if area is not None and area.distance < half.max():
+        reach = (area.distance, area.distance)
+        window = Window(saved.from_map(area.pose), reach, min(area.turn, np.pi), mapped=True)
     criteria = Criteria(
         MAX_SECOND * p.loop_closure.min_score, separation_angle=2.0 * SPREAD[2],
         budget=p.relocalization.max_lookups,

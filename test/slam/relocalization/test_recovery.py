@@ -6,10 +6,16 @@ from types import SimpleNamespace
 import numpy as np
 
 from rlml_slam.params import Parameters
+from rlml_slam.slam.conversation import Relocate, SessionFrame
 from rlml_slam.slam.relocalization.recovery import Recovery
-from rlml_slam.types import Health, Level
+from rlml_slam.slam.relocalization.scan_relocalization import Relocation
+from rlml_slam.slam.search_area import search_area
+from rlml_slam.slam.searches import Purpose
+from rlml_slam.slam.system import System
+from rlml_slam.types import Health, Level, Status, Verdict
 
 SECOND = 1_000_000_000
+UNSURE = np.eye(3)  # within metres
 
 
 def searched(lasts, pose, period=SECOND // 10):
@@ -33,3 +39,39 @@ def test_robot_that_stands_is_looked_for_rarely_and_at_once_where_it_comes():
     after = [t for t in at if t >= 100.0]
     assert after[0] <= 101.2
     assert 10 < len(after) < 15
+
+
+def drove_unseen(there=(0.0, 0.0, 0.0), cov=UNSURE, **changes):
+    given = {
+        'stamp': SECOND, 'T_map_base': np.array(there), 'cov_map': cov, 'unconfirmed': False,
+        'scan_used': False, 'scan_score': float('nan'), 'statuses': np.zeros(0, dtype=int),
+    }  # fmt: skip
+    return SimpleNamespace(**{**given, **changes})
+
+
+def test_robot_that_matches_its_map_is_where_odometry_led_and_others_anywhere():
+    there, cov = np.array([3.0, -2.0, 3.0]), np.diag([1.0, 0.2, 0.3]) ** 2
+    matched = {'statuses': np.array([Status.NEW, Status.USED])}
+    unmatched = {'statuses': np.array([Status.NEW])}
+    for tracks in ({}, {'scan_used': True, 'scan_score': 0.6}, matched):
+        area = search_area(drove_unseen(there, cov, **tracks))
+        assert area is not None
+        for off, fits in (
+            ([3.0, 0.0, 0.0], True), ([4.5, 0.0, 0.0], False), ([0.0, 0.0, 1.1], True),
+            ([0.0, 0.0, 2.0 * np.pi], True), ([0.0, 0.0, 1.4], False),
+        ):  # fmt: skip
+            assert area.contains(there + np.array(off)) is fits
+    for moved in ({'unconfirmed': True}, {'scan_score': 0.2}, unmatched):
+        assert search_area(drove_unseen(there, cov, **moved)) is None
+
+
+def test_robot_that_only_drove_unseen_does_not_jump_through_the_building():
+    """After a gap a scan fits one place of the unfinished map, which may be a twin."""
+    for x, moves in ((1.0, True), (30.0, False)):
+        system = System(Parameters())
+        record = SessionFrame(1, drove_unseen())
+        command = system.searches.begin(Purpose.RECOVER, record, None)
+        found = Relocation(Verdict.UNIQUE, 'fits', np.array([x, 0.0, 0.0]), 1e-4 * np.eye(3), 0.7)
+        out = system.on_search_result(command.number, found)
+        assert any(isinstance(c, Relocate) for c in out) is moves
+        assert ('too far' in system.recovery.why) is not moves

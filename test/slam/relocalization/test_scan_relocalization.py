@@ -12,6 +12,7 @@ from rlml_slam.maps.nav2_map import load, save
 from rlml_slam.maps.occupancy import OccupancyGrid, render
 from rlml_slam.params import Parameters
 from rlml_slam.slam.relocalization.scan_relocalization import relocalize
+from rlml_slam.slam.search_area import SearchArea
 from rlml_slam.types import Verdict
 
 P = Parameters()
@@ -73,6 +74,19 @@ def test_hall_that_looks_the_same_turned_is_ambiguous():
         # either of the two is what is shown
         twins = np.stack([pose, se2.compose(np.array([0.0, 0.0, np.pi]), pose)])
         assert np.hypot(*se2.between(twins, found.pose)[:, :2].T).min() < 0.05
+
+
+def test_of_two_places_that_look_the_same_one_is_in_the_area():
+    T_map_world = np.array([12.0, -7.0, 0.4])
+    grid, rng = mapped(SQUARE_HALL, T_map_world=T_map_world), np.random.default_rng(4)
+    for pose in places(6, seed=5):
+        near = se2.compose(T_map_world, pose)
+        scan, off = scanned(SQUARE_HALL, pose, rng), rng.uniform(-0.5, 0.5, 3)
+        found = relocalize(grid, scan, P, area=SearchArea(near + off, 1.5, 1.0))
+        assert found.verdict is Verdict.UNIQUE, found.why
+        assert np.hypot(*se2.between(near, found.pose)[:2]) < 0.05
+        far = SearchArea(near + np.array([0.0, 0.0, 1.6]), 1.5, 1.0)
+        assert relocalize(grid, scan, P, area=far).verdict is not Verdict.UNIQUE
 
 
 def test_corridor_does_not_tell_the_place():
