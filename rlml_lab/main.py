@@ -131,6 +131,10 @@ COMMANDS: Table = {
                 'rlml_lab.layout.study_plan_suggest',
                 'suggested reflectors against exhaustive search, and drives through layouts',
             ),
+            'mrclam': Command(
+                'rlml_lab.studies.study_mrclam',
+                'maps from MR.CLAM, with known ids and without',
+            ),
             'victoria-park': Command(
                 'rlml_lab.studies.study_victoria_park',
                 'dead reckoning, EKF and RLML among trees, against GPS',
