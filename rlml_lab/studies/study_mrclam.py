@@ -28,7 +28,7 @@ from rlml_slam.params import EkfParameters, from_mapping, read_yaml
 from rlml_slam.recordings.bag_replay import patient
 from rlml_slam.se2 import Array
 from rlml_slam.slam.offline.slam import Slam
-from rlml_slam.types import ANONYMOUS, Level, Odometry, Reflectors
+from rlml_slam.types import ANONYMOUS, Detections, Level, Odometry, Reflectors
 
 SYSTEMS = ('rlml', 'ekf')
 STAGES = ('replay', 'live')
@@ -79,10 +79,12 @@ def drive(
     data: MrclamRobot, system: str, stage: str, params: EkfParameters, ids: bool
 ) -> tuple[Trajectory, Reflectors, FrameLog]:
     """Path, landmarks and frames: of a replay, or ``live``, without what follows the end."""
-    params = patient(params) if stage == 'replay' else params
+    if stage == 'replay':
+        params = dataclasses.replace(params, node=patient(params).node)
     slam: Slam | EkfSlam = Slam(params) if system == 'rlml' else EkfSlam(params)
     log, none = FrameLog(), ANONYMOUS
-    for item in sorted([*data.odometry, *data.detections], key=lambda i: i.stamp):
+    inputs: list[Odometry | Detections] = [*data.odometry, *data.detections]
+    for item in sorted(inputs, key=lambda i: i.stamp):
         if isinstance(item, Odometry):
             log.add(slam.add_odometry(item))
         else:
