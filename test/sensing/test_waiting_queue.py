@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from rlml_slam.motion import SECOND
-from rlml_slam.params import Node
+from rlml_slam.params import MotionNoise, Node, Parameters
 from rlml_slam.sensing.synchronization.input_counts import InputCounts
 from rlml_slam.sensing.synchronization.stamp_check import StampCheck
 from rlml_slam.sensing.synchronization.waiting_queue import PAIRING, WaitingQueue
@@ -11,6 +11,7 @@ from rlml_slam.types import Detections, Scan
 
 MS = SECOND // 1000
 T0 = 10 * SECOND
+MAX_GAP = 1.0  # [s] of the odometry
 T = T0 + 2 * SECOND  # the first second, in which all wait longer, is over
 
 
@@ -31,7 +32,8 @@ def queue(now, **node):
     stamps = StampCheck(inputs)
     stamps.accept('odom', T0, None)
     stamps.accept('odom', now, None)
-    return WaitingQueue(Node(**node), stamps, inputs), stamps
+    params = Parameters(node=Node(**node), motion=MotionNoise(max_gap=MAX_GAP))
+    return WaitingQueue(params, stamps, inputs), stamps
 
 
 def test_scan_waits_for_the_odometry_at_the_end_of_its_sweep():
@@ -57,6 +59,24 @@ def test_nothing_waits_longer_than_the_timeout():
     stamps.accept('imu', T + 201 * MS, None)
     assert len(waiting.pop(T - MS)) == 1
     assert waiting._inputs.totals() == {'scan': {'waited_out': 1}}
+
+
+def test_detections_wait_through_a_pause_of_the_odometry():
+    """Without a lidar: up to the longest gap that is bridged, counted from the odometry's end."""
+    waiting, stamps = queue(T, odom_timeout=0.2)
+    waiting.add('reflectors', detections(T), 0)
+    stamps.accept('reflectors', T + 900 * MS, None)
+    assert waiting.pop(T - 50 * MS) == []
+    stamps.accept('reflectors', T + 951 * MS, None)
+    assert len(waiting.pop(T - 50 * MS)) == 1
+
+
+def test_detections_do_not_wait_beside_a_lidar():
+    waiting, stamps = queue(T, odom_timeout=0.2)
+    waiting.note_lidar(scan(T - 50 * MS))
+    waiting.add('reflectors', detections(T), 0)
+    stamps.accept('reflectors', T + 201 * MS, None)
+    assert len(waiting.pop(T - 50 * MS)) == 1
 
 
 @pytest.mark.parametrize(('apart', 'size'), [(PAIRING, 2), (PAIRING + 1, 1)])

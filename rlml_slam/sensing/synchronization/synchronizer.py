@@ -45,7 +45,7 @@ class Synchronizer:
         self.inputs = InputCounts()
         self._stamps = StampCheck(self.inputs)
         self._jitter = StampJitter(self._node.filter_stamps)
-        self._queue = WaitingQueue(self._node, self._stamps, self.inputs)
+        self._queue = WaitingQueue(params, self._stamps, self.inputs)
         n = self._node
         self.odometry = OdometrySources(n.odom_source, n.tf_buffer_duration)
         self._assembly = ObservationAssembly(params, self.inputs, self.odometry.transforms)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scans and detections that wait: for odometry, for each other, and for other lidars.
 
-Nothing waits longer than ``odom_timeout``, measured by stamps, never by a clock: a replay
-decides in the same way.
+Nothing waits longer than ``odom_timeout``, by stamps, never by a clock: so does a replay. Without
+a lidar, where a guess of the motion would decide what they are of, detections wait ``max_gap``.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from rlml_slam.motion import SECOND
-from rlml_slam.params import Node
+from rlml_slam.params import Parameters
 from rlml_slam.sensing.deskew import sweep_time
 from rlml_slam.sensing.synchronization.input_counts import InputCounts
 from rlml_slam.sensing.synchronization.stamp_check import StampCheck
@@ -37,11 +37,12 @@ class Waiting(NamedTuple):
 class WaitingQueue:
     """Waiting items in the order of their stamps; knows the periods of the lidars."""
 
-    def __init__(self, node: Node, stamps: StampCheck, inputs: InputCounts) -> None:
-        self._node = node
+    def __init__(self, params: Parameters, stamps: StampCheck, inputs: InputCounts) -> None:
+        self._node = params.node
         self._stamps = stamps
         self._inputs = inputs
-        self._timeout = int(node.odom_timeout * SECOND)
+        self._timeout = int(params.node.odom_timeout * SECOND)
+        self._max_gap = int(params.motion.max_gap * SECOND)
         self._items: list[Waiting] = []
         self._lidars: dict[str, tuple[int, int]] = {}  # by frame: newest stamp and period
         # stamp of the last observation that had, or should have had, scan and detections
@@ -96,7 +97,7 @@ class WaitingQueue:
     def _is_ready(self, stamp: int, group: list[Waiting], newest_odometry: int | None) -> bool:
         end = max(w.end for w in group)
         waited = self._stamps.newest - end
-        if waited > self._timeout:
+        if waited > self._timeout and not self._is_in_pause(group, newest_odometry):
             self._inputs.count(group[0].stream, 'waited_out')
             return True
         if self._waits_for_odometry(end, newest_odometry):
@@ -104,6 +105,12 @@ class WaitingQueue:
         if self.has_several_lidars and self._is_lidar_due(stamp, group):
             return False
         return len(group) > 1 or not self._waits_for_pair(stamp, group[0].stream, waited)
+
+    def _is_in_pause(self, group: list[Waiting], newest: int | None) -> bool:
+        """Whether odometry pauses, no longer than can be bridged, where there is no lidar."""
+        if newest is None or self._lidars or any(w.stream == 'scan' for w in group):
+            return False
+        return self._node.use_odom and self._stamps.newest - newest <= self._max_gap
 
     def _waits_for_odometry(self, end: int, newest: int | None) -> bool:
         """Whether odometry at ``end`` is still expected; none is, if none came in a second."""

@@ -246,7 +246,9 @@ class ReflectorGraph:
 
     def used_landmarks(self) -> NDArray[np.bool_]:
         """Whether each landmark of the graph (m,) is a current reflector."""
-        return self._factors.used_landmarks(self.alive())
+        used = np.zeros(len(self._graph.landmarks), dtype=np.bool_)
+        used[[m.index for m in self.alive()]] = True
+        return used
 
     def renumber(self, new: Renumbering) -> None:
         """Follow the removal of poses, landmarks and factors from the graph."""

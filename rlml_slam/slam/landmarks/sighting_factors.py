@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rlml_slam.graph import OnlineSolver, RelativePoses, Renumbering, prune_sightings
 from rlml_slam.slam.landmarks.landmark import Landmark
@@ -95,9 +94,3 @@ class SightingFactors:
             rows['pose'] = new.poses[rows['pose']]
             linked = rows['factor'] >= 0
             rows['factor'][linked] = new.sightings[rows['factor'][linked]]
-
-    def used_landmarks(self, alive: Iterable[Landmark]) -> NDArray[np.bool_]:
-        """Whether each landmark of the graph (m,) is one of the reflectors ``alive``."""
-        kept = np.zeros(len(self._graph.landmarks), dtype=np.bool_)
-        kept[[m.index for m in alive]] = True
-        return kept
