@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from rlml_slam.motion import SECOND
-from rlml_slam.params import MotionNoise, Node, Parameters
+from rlml_slam.params import HealthLimits, Node, Parameters
 from rlml_slam.sensing.synchronization.input_counts import InputCounts
 from rlml_slam.sensing.synchronization.stamp_check import StampCheck
 from rlml_slam.sensing.synchronization.waiting_queue import PAIRING, WaitingQueue
@@ -11,7 +11,7 @@ from rlml_slam.types import Detections, Scan
 
 MS = SECOND // 1000
 T0 = 10 * SECOND
-MAX_GAP = 1.0  # [s] of the odometry
+PAUSE = 1.0  # [s] of the odometry
 T = T0 + 2 * SECOND  # the first second, in which all wait longer, is over
 
 
@@ -32,7 +32,7 @@ def queue(now, **node):
     stamps = StampCheck(inputs)
     stamps.accept('odom', T0, None)
     stamps.accept('odom', now, None)
-    params = Parameters(node=Node(**node), motion=MotionNoise(max_gap=MAX_GAP))
+    params = Parameters(node=Node(**node), health=HealthLimits(input_timeout=PAUSE))
     return WaitingQueue(params, stamps, inputs), stamps
 
 

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scans and detections that wait: for odometry, for each other, and for other lidars.
 
-Nothing waits longer than ``odom_timeout``, by stamps, never by a clock: so does a replay. Without
-a lidar, where a guess of the motion would decide what they are of, detections wait ``max_gap``.
+Nothing waits longer than ``odom_timeout``, measured by stamps, never by a clock: a replay
+decides in the same way. Without a lidar, a guess of the motion would decide what detections are
+of, so they wait for odometry until it counts as missing (``input_timeout``).
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class WaitingQueue:
         self._stamps = stamps
         self._inputs = inputs
         self._timeout = int(params.node.odom_timeout * SECOND)
-        self._max_gap = int(params.motion.max_gap * SECOND)
+        self._longest_pause = int(params.health.input_timeout * SECOND)
         self._items: list[Waiting] = []
         self._lidars: dict[str, tuple[int, int]] = {}  # by frame: newest stamp and period
         # stamp of the last observation that had, or should have had, scan and detections
@@ -107,10 +108,10 @@ class WaitingQueue:
         return len(group) > 1 or not self._waits_for_pair(stamp, group[0].stream, waited)
 
     def _is_in_pause(self, group: list[Waiting], newest: int | None) -> bool:
-        """Whether odometry pauses, no longer than can be bridged, where there is no lidar."""
+        """Whether odometry pauses, but is not missing yet, where there is no lidar."""
         if newest is None or self._lidars or any(w.stream == 'scan' for w in group):
             return False
-        return self._node.use_odom and self._stamps.newest - newest <= self._max_gap
+        return self._node.use_odom and self._stamps.newest - newest <= self._longest_pause
 
     def _waits_for_odometry(self, end: int, newest: int | None) -> bool:
         """Whether odometry at ``end`` is still expected; none is, if none came in a second."""
