@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernels of a library do what Numba's own do, and check what they are given."""
 
+import multiprocessing
 import os
 import pickle
 import subprocess
@@ -15,7 +16,7 @@ import pytest
 
 from rlml_slam import compiled, warm_up  # noqa: F401, so that it is known whether there is one
 from rlml_slam.kernels import build, built, library, missing, native
-from rlml_slam.kernels.emit import check_of, entries_of, machine_for
+from rlml_slam.kernels.emit import check_of, dumps, emit_into, entries_of
 from rlml_slam.kernels.library import Index, Library
 
 PACKAGE = Path(library.__file__).parents[1]
@@ -46,20 +47,52 @@ def arguments(n=4):
     return Pair(np.arange(n, dtype=float), 2.0), 3, True, np.zeros(n)
 
 
+@numba.njit(no_cpython_wrapper=True)
+def long_sum(values):
+    """Too large to be copied into what calls it."""
+    total = 0.0
+    for k in range(len(values) - 1):
+        if values[k] > values[k + 1]:
+            total += np.linalg.solve(np.eye(2) * values[k], np.ones(2)).sum()
+        total += np.sort(values)[k]
+    return total
+
+
+VALUES = np.array([3.0, 2.0, 4.0])
+SUM = 2 / 3 + 2.0 + 3.0  # of them, by long_sum
+
+
+def first(values):
+    return long_sum(values) + 1.0
+
+
+def second(values):
+    return long_sum(values) + 2.0
+
+
+def emitted(work):
+    """In a process of its own: entries and constants, and what the kernels return there."""
+    objects = emit_into(work, library.best_processor())
+    entries, results = [], []
+    called = ((scaled, arguments()), (read, (ROWS,)), (first, (VALUES,)), (second, (VALUES,)))
+    for function, given in called:
+        dispatcher = numba.njit(error_model='numpy')(function)
+        results.append(dispatcher(*given))
+        entries += entries_of(f'{function.__module__}.{function.__name__}', dispatcher)
+    constants = {name: dumps(of.consts) for name, of in objects.environments.items()}
+    return entries, constants, results
+
+
 @pytest.fixture(scope='module')
 def made(tmp_path_factory):
-    """A library of two kernels, and the decorator that takes them from it."""
+    """A library of some kernels, and the decorator that takes them from it."""
     work = tmp_path_factory.mktemp('library')
     runtime = build._start_runtime(work)
-    entries = []
-    for function, given in ((scaled, arguments()), (read, (ROWS,))):
-        dispatcher = numba.njit(error_model='numpy')(function)
-        dispatcher(*given)
-        name = f'{function.__module__}.{function.__name__}'
-        machine = machine_for(library.best_processor())
-        entries += entries_of(name, dispatcher, machine, work, function.__name__)
-    build._write_table(work / 'entries.h', entries)
-    build._link(work, runtime, [entry.object_file for entry in entries])
+    with multiprocessing.get_context('spawn').Pool(1) as pool:
+        entries, constants, results = pool.apply(emitted, (work,))
+    assert (results[0][1], *results[1:]) == (24.0, 0, SUM + 1.0, SUM + 2.0)
+    build._write_table(work / 'entries.h', entries, constants)
+    build._link(work, runtime)
     index = Index((), '', 'generic', {e.kernel: [(e.check, e.name)] for e in entries})
     path = work / library.LIBRARY
     return native.kernel_of(Library(path, index, library._load(path)))
@@ -82,6 +115,11 @@ def test_it_computes_returns_and_raises_as_the_function_does(kernel):
         kernel(pair, -1, on, out)
     assert kernel.__doc__ == scaled.__doc__
     assert not native.CONVERTED
+
+
+def test_large_function_is_compiled_once_for_all_that_call_it(made):
+    assert made(first)(VALUES) == SUM + 1.0
+    assert made(second)(VALUES) == SUM + 2.0
 
 
 def test_array_of_records_is_taken(made):

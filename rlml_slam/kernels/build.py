@@ -20,12 +20,14 @@ from typing import Any
 from rlml_slam.errors import RlmlError
 from rlml_slam.kernels import built, library
 from rlml_slam.kernels.cache import sources_of
-from rlml_slam.kernels.emit import Entry, entries_of, machine_for
+from rlml_slam.kernels.emit import Entry, dumps, emit_into, entries_of
 
 PACKAGE = Path(__file__).parents[1]
 MEMORY = 1.5e9  # [bytes] that a process compiling all kernels may need
+LONGEST = ('graph', 'matching', 'slam', 'deformable', 'sensing')  # to compile
 TICK = 1.0  # [s] at which progress is reported
 Progress = Callable[[int, int, str], None]  # done, of how many, the last module
+Compiled = tuple[list[Entry], dict[str, bytes]]  # with the constants of all functions, pickled
 
 
 class BuildError(RlmlError):
@@ -54,11 +56,11 @@ def _make(folder: Path, index: library.Index, progress: Progress) -> None:
     with tempfile.TemporaryDirectory(prefix='.kernels-', dir=folder) as name:
         work = Path(name)
         runtime = _start_runtime(work)
-        entries = _compile(work, index.processor, progress)
+        entries, constants = _compile(work, index.processor, progress)
         for entry in entries:
             index.entries.setdefault(entry.kernel, []).append((entry.check, entry.name))
-        _write_table(work / 'entries.h', entries)
-        _link(work, runtime, [entry.object_file for entry in entries])
+        _write_table(work / 'entries.h', entries, constants)
+        _link(work, runtime)
         (work / library.INDEX).write_bytes(pickle.dumps(asdict(index)))
         # the index last: a library with another one's index would be of other sources
         (folder / library.INDEX).unlink(missing_ok=True)
@@ -66,8 +68,8 @@ def _make(folder: Path, index: library.Index, progress: Progress) -> None:
         os.replace(work / library.INDEX, folder / library.INDEX)
 
 
-def _compile(work: Path, processor: str, progress: Progress) -> list[Entry]:
-    """Entries of all kernels; the modules are shared out among processes."""
+def _compile(work: Path, processor: str, progress: Progress) -> Compiled:
+    """All kernels; the modules are shared out among processes."""
     os.environ |= {
         library.BY_USER: 'jit', 'RLML_SLAM_NO_CACHE': '1',
         'NUMBA_CPU_NAME': processor, 'NUMBA_CPU_FEATURES': '',
@@ -75,60 +77,75 @@ def _compile(work: Path, processor: str, progress: Progress) -> list[Entry]:
     free = os.sysconf('SC_AVPHYS_PAGES') * os.sysconf('SC_PAGE_SIZE')
     workers = max(1, min(len(os.sched_getaffinity(0)), int(free / MEMORY)))
     found: dict[str, list[Entry]] = {}
+    constants: dict[str, bytes] = {}
     with multiprocessing.get_context('spawn').Pool(workers) as pool:
-        names = pool.apply(_modules)
-        one = functools.partial(_compile_module, work, processor)
-        results, module = pool.imap_unordered(one, names), ''
-        for k in range(len(names)):
+        folders = pool.apply(_folders)
+        one = functools.partial(_compile_folder, work, processor)
+        results, folder, done = pool.imap_unordered(one, folders), [''], 0
+        for _ in folders:
             while True:
-                progress(k, len(names), module)
+                progress(done, sum(map(len, folders)), folder[-1])
                 try:
-                    module, entries = results.next(timeout=TICK)
+                    folder, entries, of_folder = results.next(timeout=TICK)
                     break
                 except multiprocessing.TimeoutError:
                     pass
+            done += len(folder)
             # two processes may have compiled the same kernel; either will do
             found = entries | found
-    return [entry for name in sorted(found) for entry in found[name]]
+            constants |= of_folder
+    return [entry for name in sorted(found) for entry in found[name]], constants
 
 
-def _modules() -> list[str]:
-    """Modules with kernels, those that take longest first."""
+def _folders() -> list[list[str]]:
+    """Modules with kernels by folder, as its kernels have parts in common; the longest first."""
     from rlml_slam import warm_up
 
     warm_up.import_core()
-    names = [name for name, _ in warm_up.loaded()]
-    return sorted(names, key=lambda n: (not n.startswith('rlml_slam.graph'), n))
+    folders: dict[str, list[str]] = {name: [] for name in LONGEST}
+    for name, _ in warm_up.loaded():
+        folders.setdefault(name.split('.')[1], []).append(name)
+    return list(folders.values())
 
 
-def _compile_module(work: Path, processor: str, name: str) -> tuple[str, dict[str, list[Entry]]]:
-    """In a process of its own: what the warm-up of a module compiles."""
+def _compile_folder(
+    work: Path, processor: str, names: list[str]
+) -> tuple[list[str], dict[str, list[Entry]], dict[str, bytes]]:
+    """In a process of its own: what the warm-ups of modules compile."""
     from rlml_slam import warm_up
     from rlml_slam.kernels import jit
 
     warm_up.import_core()
-    dict(warm_up.loaded())[name]()
-    machine = machine_for(processor)
-    made = {}
-    for number, (kernel, dispatcher) in enumerate(sorted(jit.KERNELS.items())):
-        if dispatcher.overloads and kernel not in _EMITTED:
-            _EMITTED.add(kernel)
-            prefix = f'entry_{os.getpid()}_{number}'
-            made[kernel] = entries_of(kernel, dispatcher, machine, work, prefix)
-    return name, made
+    objects = emit_into(work, processor)
+    known = dict(warm_up.loaded())
+    for name in names:
+        known[name]()
+    made = {
+        kernel: entries_of(kernel, dispatcher)
+        for kernel, dispatcher in jit.KERNELS.items()
+        if dispatcher.overloads and kernel not in _EMITTED
+    }
+    constants = {
+        variable: dumps(of.consts)
+        for variable, of in objects.environments.items()
+        if variable not in _EMITTED
+    }
+    _EMITTED.update(made, constants)
+    return names, made, constants
 
 
 _EMITTED: set[str] = set()  # by this process
 
 
-def _write_table(path: Path, entries: list[Entry]) -> None:
+def _write_table(path: Path, entries: list[Entry], constants: dict[str, bytes]) -> None:
     """The tables that Numba's modulemixin.c reads: methods, constants, and where they go."""
-    declared, constants, places = [], [], []
-    others = [one for e in entries for one in e.environments[1:]]
-    for variable, pickled in [*(e.environments[0] for e in entries), *others]:
+    declared, pickles, places = [], [], []
+    # those of the entries first, in their order
+    for variable in dict.fromkeys([*(e.environment for e in entries), *constants]):
+        pickled = constants[variable]
         declared.append(f'extern void *{variable};')
         text = ''.join(f'\\{byte:03o}' for byte in pickled)
-        constants.append(f'{{"{text}", {len(pickled)}, "", 0, 0}},')
+        pickles.append(f'{{"{text}", {len(pickled)}, "", 0, 0}},')
         places.append(f'&{variable},')
     methods = []
     for entry in entries:
@@ -138,7 +155,7 @@ def _write_table(path: Path, entries: list[Entry]) -> None:
     lines = [
         *declared,
         'static PyMethodDef entries[] = {', *methods, '{0}};',
-        'static env_def_t environments[] = {', *constants, '{0}};',
+        'static env_def_t environments[] = {', *pickles, '{0}};',
         'static env_gv_t places[] = {', *places, '0};',
     ]  # fmt: skip
     path.write_text('\n'.join(lines) + '\n', encoding='ascii')
@@ -188,10 +205,11 @@ def _start_runtime(work: Path) -> list[Path]:
     return made
 
 
-def _link(work: Path, runtime: list[Path], objects: list[Path]) -> None:
-    """The shared library of all objects."""
+def _link(work: Path, runtime: list[Path]) -> None:
+    """The shared library of all objects, without what no entry needs."""
     table = str(Path(__file__).with_name('table.c'))
     _run([
-        *_compiler(), *_flags(), f'-I{work}', '-shared', '-Wl,-s', table,
-        *map(str, [*runtime, *objects]), '-o', str(work / library.LIBRARY), '-lpthread', '-lm',
+        *_compiler(), *_flags(), f'-I{work}', '-shared', '-Wl,-s', '-Wl,--gc-sections', table,
+        *map(str, [*runtime, *sorted(work.glob('object_*.o'))]),
+        '-o', str(work / library.LIBRARY), '-lpthread', '-lm',
     ])  # fmt: skip

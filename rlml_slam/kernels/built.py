@@ -17,7 +17,7 @@ from pathlib import Path
 
 from rlml_slam.kernels import library
 
-KEPT = 3  # libraries, of 4 MB each
+KEPT = 3  # libraries, of 2.5 MB each
 MAKERS = ('build.py', 'emit.py', 'table.c')  # beside the sources, they decide what is in it
 COMPILERS = ('numba', 'llvmlite', 'numpy', 'scipy')
 

@@ -25,7 +25,7 @@ F = TypeVar('F', bound=Callable[..., Any])
 PACKAGE = Path(__file__).parents[1]
 # set by the process that makes the library: what is on disk lacks what it needs
 CACHE = 'RLML_SLAM_NO_CACHE' not in os.environ
-OPTIONS: dict[str, Any] = {'cache': CACHE, 'error_model': 'numpy'}
+OPTIONS: dict[str, Any] = {'cache': CACHE, 'error_model': 'numpy', 'no_cfunc_wrapper': True}
 KERNELS: dict[str, Any] = {}  # by module and name, those that are called from Python
 
 if CACHE:
@@ -52,8 +52,8 @@ def _called(dispatcher: Any) -> Any:
 
 def part(function: F) -> F:
     """A kernel that kernels alone call: without an entry from Python it compiles much faster."""
-    options: dict[str, Any] = {'no_cpython_wrapper': True, 'no_cfunc_wrapper': True}
-    return cast(F, numba.njit(nogil=True, **OPTIONS, **options)(function))
+    options: dict[str, Any] = {'no_cpython_wrapper': True, **OPTIONS}
+    return cast(F, numba.njit(nogil=True, **options)(function))
 
 
 def formula(function: F) -> F:
