@@ -20,7 +20,7 @@ from rlml_slam.params import Parameters
 from rlml_slam.recordings.bag_replay import patient
 from rlml_slam.se2 import Array
 from rlml_slam.slam.offline.slam import Slam
-from rlml_slam.types import Detections, Level, Scan
+from rlml_slam.types import Level, Scan
 
 WRONG, WRONG_TURN = 0.5, np.radians(10.0)  # [m], [rad] beyond 3 sigma: a pose that is wrong
 SIGMAS = 3.0
@@ -52,8 +52,9 @@ def run(
 ) -> tuple[FaultFigures, Trajectory, FrameLog]:  # fmt: skip
     """Replay with a fault, and compare.
 
-    The published poses are compared with the truth, or else with ``reference``, the optimised
-    trajectory of the run without a fault, where the scans were taken, whatever their stamps say.
+    The published poses are compared with the truth at their stamps, or else with ``reference``,
+    the optimised trajectory of the run without a fault, at the stamps that were recorded: so
+    relations know which scan a pose is of.
     """
     messages = fault(recording.messages, np.random.default_rng(seed))
     slam, log = Slam(patient(params)), FrameLog()
@@ -65,7 +66,7 @@ def run(
         log.add(feed_one(slam, message))
     log.add(slam.finish())
     spent = time.process_time() - began
-    taken = stamps_as_recorded(messages, recording.messages)
+    taken = {} if recording.truth else stamps_as_recorded(messages, recording.messages)
     path = restamped(Trajectory(*slam.trajectory()), taken)
     trans, rot = _errors(recording, path, reference)
     true = recording.truth or reference or path
@@ -93,13 +94,10 @@ def _errors(
 
 def stamps_as_recorded(messages: Messages, recorded: Messages) -> dict[int, int]:
     """Of each stamp [ns] of a scan that a fault has moved, the stamp that was recorded."""
-    pairs: dict[int, int] = {}
-    for kind in (Scan, Detections):
-        now = [m.stamp for m in messages if isinstance(m, kind)]
-        then = [m.stamp for m in recorded if isinstance(m, kind)]
-        if len(now) == len(then):
-            pairs.update((a, b) for a, b in zip(now, then, strict=True) if a != b)
-    return pairs
+    now, then = ([m.stamp for m in part if isinstance(m, Scan)] for part in (messages, recorded))
+    if len(now) != len(then):
+        return {}
+    return {a: b for a, b in zip(now, then, strict=True) if a != b}
 
 
 def restamped(path: Trajectory, taken: dict[int, int]) -> Trajectory:

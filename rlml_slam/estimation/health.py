@@ -109,15 +109,17 @@ class HealthMonitor:
         """Whether the position is too uncertain to be known in the map.
 
         A map in the making grows away from its start, and the robot's place in it stays known
-        while scan or reflectors hold the pose. What the variance grows by then does not count,
-        but what it regains counts, after the robot went nearer to where its heading was lost. A
-        scan that leaves a direction open to odometry still holds the pose in its submap, but for
-        what the variance grows by relative to that.
+        while scan or reflectors hold the pose. What the variance grows by then, beyond its
+        largest value, does not count: nearer to where its heading was lost, a robot is less
+        uncertain, and farther away as uncertain as before. A scan that leaves a direction open to
+        odometry still holds the pose in its submap, but for what the variance grows by relative
+        to that.
         """
         scan, variance = step.scan, self._variance
         self._variance = sigma**2
         if self._variance < FOUND * variance:
             self._largest = self._variance
+            self._explored = min(self._explored, self._variance)
         grown = max(self._variance - self._largest, 0.0)
         self._largest += grown
         drifted, submap = self._drifted, self._submap
@@ -128,7 +130,7 @@ class HealthMonitor:
             self._explored += grown
         elif step.maps and scan.submap is not None and scan.submap is submap:
             self._explored += grown - (self._drifted - drifted)
-        self._explored = min(max(self._explored, 0.0), self._variance)
+        self._explored = min(max(self._explored, 0.0), self._largest)
         return self._variance - self._explored > self._limits.sigma_lost**2
 
     def _note(self, stamp: int, step: HealthInputs) -> None:

@@ -25,7 +25,7 @@ from rlml_slam.se2 import Array
 from rlml_slam.types import Motion, Observation
 
 AXES = np.array([0, 2])  # along the base, and its turn
-LONGEST = 1.0  # [s] of a motion; a longer one is a gap
+LONGEST = 1.0  # [s] of a motion; odometry that is missing for longer is a gap
 PRIOR = 100.0  # steps that count as if the parameters were right
 MEMORY = 1000.0  # steps after which one counts e times less
 LEAST = 0.05  # smallest share of the variance
@@ -61,22 +61,23 @@ class OdometryNoise:
         One that stands, but for what its wheels jitter, says nothing of how it drives.
         """
         motion, self._applied, self._elapsed = observation.motion, None, dt
-        if motion.known and dt > LONGEST and (np.abs(motion.delta) > MOVED).any():
-            return self._across_gap(observation, dt)
+        if motion.known and motion.gap > LONGEST and (np.abs(motion.delta) > MOVED).any():
+            return self._across_gap(observation)
         fast = self._fast(motion.delta, dt)
         if not motion.known or fast is None:
             return observation
         self._applied = motion.delta, fast, motion.cov[AXES, AXES]
         return replace(observation, motion=replace(motion, cov=self._scaled(motion.cov, fast)))
 
-    def _across_gap(self, observation: Observation, dt: float) -> Observation:
-        """The observation with the noise of a gap of ``dt`` [s], by what came out before it.
+    def _across_gap(self, observation: Observation) -> Observation:
+        """The observation with the noise of its gap, by what came out before it.
 
         Eq. 61: how the robot went is not known, so it drove as far as usual, and each axis has an
         equal share of what its heading erred by on the way. Outliers count as often as they were.
         """
         motion = observation.motion
-        _, far, along2, turn2 = (self._driven * dt / max(self._driven[0], LONGEST)).tolist()
+        share = motion.gap / max(self._driven[0], LONGEST)
+        _, far, along2, turn2 = (self._driven * share).tolist()
         usual2 = along2 + turn2 * far**2 / 6.0
         more: Array = np.maximum(np.array([usual2, usual2, turn2]) - np.diag(motion.cov), 0.0)
         if not more.any():

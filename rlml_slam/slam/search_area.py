@@ -12,6 +12,7 @@ from rlml_slam.se2 import Array
 from rlml_slam.types import Frame, Status
 
 FARTHEST = 4.0  # [sigma] of where odometry led, along any axis: with the heading goes the rest
+LEAST = (0.5, 0.2)  # [m], [rad] by which a place that was found may be moved to fit
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,5 @@ def search_area(frame: Frame) -> SearchArea | None:
     if frame.unconfirmed or misfit or unmatched:
         return None
     sigma = math.sqrt(eigenvalues_2x2(frame.cov_map[:2, :2])[1])
-    return SearchArea(
-        frame.T_map_base, FARTHEST * sigma, FARTHEST * math.sqrt(float(frame.cov_map[2, 2]))
-    )
+    turn = FARTHEST * math.sqrt(float(frame.cov_map[2, 2]))
+    return SearchArea(frame.T_map_base, max(FARTHEST * sigma, LEAST[0]), max(turn, LEAST[1]))

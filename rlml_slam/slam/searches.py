@@ -66,7 +66,9 @@ class Searches:
         if frame is None:
             return Search(number, None, saved, complete)
         given = frame if pending.purpose is Purpose.CONFIRM else None
-        area = search_area(frame) if pending.purpose is Purpose.RECOVER else None
+        # in a map in the making, what fits may be a twin of what is not mapped yet
+        recovers = pending.purpose is Purpose.RECOVER and not complete
+        area = search_area(frame) if recovers else None
         return Search(number, frame.observation, saved, complete, given, area)
 
     def take(self, number: int) -> Pending | None:

@@ -277,7 +277,8 @@ class System:
             self.entry.why = found.why
         if found.verdict is not Verdict.UNIQUE or pose is None or cov is None:
             return []
-        area = search_area(record.frame) if pending.purpose is Purpose.RECOVER else None
+        recovers = pending.purpose is Purpose.RECOVER and self.map is None
+        area = search_area(record.frame) if recovers else None
         if area is not None and not area.contains(pose):
             self.recovery.why = f'{found.why}, but it is too far from where odometry led'
             return []

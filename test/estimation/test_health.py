@@ -385,3 +385,11 @@ def test_place_lost_in_a_gap_stays_lost_while_the_robot_drives_to_and_fro():
     assert set(seen[21:]) == {Level.LOST}
     found = [(0.3, True, True), *[(0.3 + 0.02 * k, True, True) for k in range(150)]]
     assert Level.LOST not in levels([*[(0.1, True, True)] * 20, (3.0, False, True), *found])[21:]
+
+
+def test_map_that_grows_to_and_fro_is_no_reason_to_be_lost():
+    """Near the start, the position is less uncertain; farther away it is what it was there."""
+    begin, out = np.linspace(0.1, 0.8, 20), np.linspace(0.8, 3.0, 100)
+    sigmas = np.concatenate([begin, out, out[::-1], out, out[::-1], 1.2 * out])
+    seen = levels([(float(s), True, True) for s in sigmas])
+    assert Level.LOST not in seen

@@ -9,9 +9,9 @@ from made_worlds import SECOND
 
 from rlml_slam import se2
 from rlml_slam.estimation.odometry_noise import AXES, LEAST, OdometryNoise
-from rlml_slam.motion import motion_of
+from rlml_slam.motion import MotionBuffer, compose_motion, motion_of
 from rlml_slam.params import MotionNoise
-from rlml_slam.types import Motion, Observation
+from rlml_slam.types import Motion, Observation, Odometry
 
 NOISE = MotionNoise()
 SEEN = np.diag([0.004, 0.004, 0.002]) ** 2  # of a pose that is measured
@@ -150,3 +150,22 @@ def test_gap_of_good_wheels_and_of_a_robot_that_stood_keeps_its_noise():
     drive(noise, 1000, np.random.default_rng(0), sigmas=2.0)
     stood = Observation(SECOND, motion=motion(0.001, 0.0, 30.0))
     assert noise.scaled(stood, 30.0) is stood
+
+
+def test_odometry_that_was_there_all_along_is_no_gap():
+    """A laser that sees nothing for 3 s: each second of the odometry has its own noise."""
+    noise = OdometryNoise(NOISE)
+    drive(noise, 1000, np.random.default_rng(0), sigmas=3.0)
+    buffer = MotionBuffer(NOISE, 60.0)
+    for k in range(61):
+        pose = se2.exp(np.array([0.5, 0.0, 0.2]) * k / 10)
+        if not 30 < k < 60:
+            buffer.add_odometry(Odometry(SECOND + k * SECOND // 10, pose))
+    whole, gap = (buffer.motion(SECOND * a, SECOND * b) for a, b in ((1, 4), (4, 7)))
+    assert whole.gap == pytest.approx(0.1)
+    assert gap.gap == pytest.approx(3.0)
+    assert noise.scaled(Observation(SECOND, motion=whole), 3.0).motion is whole
+    assert (noise.scaled(Observation(SECOND, motion=gap), 3.0).motion.cov >= gap.cov).all()
+    assert noise.scaled(Observation(SECOND, motion=gap), 3.0).motion is not gap
+    assert compose_motion(whole, gap).gap == gap.gap
+    assert buffer.motion(5 * SECOND, 5 * SECOND + SECOND // 5).gap == pytest.approx(0.2)

@@ -61,7 +61,7 @@ def relocalize(
     """Search ``points`` (n, 2), end points in the base frame, in a grid of the map frame.
 
     Where the map is not ``complete``, what it lacks at the next best place may be there. With an
-    ``area``, no pose outside is searched.
+    ``area``, the square around it is searched.
     """
     if grid is None or not is_mapped(grid):
         return Relocation(Verdict.IMPOSSIBLE, 'there is no map of scans yet')
@@ -122,9 +122,10 @@ def _search(
     bounds = saved.submap.bounds
     middle, half = 0.5 * (bounds[:2] + bounds[2:]), 0.5 * (bounds[2:] - bounds[:2])
     window = Window(np.array([*middle, 0.0]), (half[0], half[1]), np.pi, mapped=True)
-    if area is not None and area.distance < half.max():
-        reach = (area.distance, area.distance)
-        window = Window(saved.from_map(area.pose), reach, min(area.turn, np.pi), mapped=True)
+    if area is not None:
+        reach = min(area.distance, 2.0 * float(half.max()))
+        turn = min(area.turn, np.pi)
+        window = Window(saved.from_map(area.pose), (reach, reach), turn, mapped=True)
     criteria = Criteria(
         MAX_SECOND * p.loop_closure.min_score, separation_angle=2.0 * SPREAD[2],
         budget=p.relocalization.max_lookups,
