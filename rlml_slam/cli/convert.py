@@ -154,11 +154,7 @@ def _messages(recording: Recording) -> Iterator[tuple[int, str, Any]]:
         yield start, f'/{TRUE_REFLECTORS}', cloud
     none = np.zeros((3, 3))
     for o in recording.odometry:
-        yield (
-            o.stamp,
-            '/odom',
-            encode.odometry(make_bag, o.stamp, (ODOM, BASE), o.pose, none),
-        )
+        yield (o.stamp, '/odom', encode.odometry(make_bag, o.stamp, (ODOM, BASE), o.pose, none))
     for s in recording.scans:
         yield s.stamp, '/scan', encode.laser_scan(make_bag, s)
     for d in recording.detections:

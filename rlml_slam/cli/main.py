@@ -171,10 +171,7 @@ def complete(table: Table, prog: str) -> None:
 
 
 def build_parser(
-    arguments: Sequence[str],
-    table: Table = COMMANDS,
-    prog: str = 'rlml',
-    description: str = '',
+    arguments: Sequence[str], table: Table = COMMANDS, prog: str = 'rlml', description: str = ''
 ) -> tuple[argparse.ArgumentParser, ModuleType | None]:
     """The parser for a command line, and the module of the command it names.
 

@@ -12,9 +12,7 @@ from rlml_slam.errors import MapError
 
 
 def write_atomically(
-    path: Path,
-    *parts: bytes | memoryview,
-    before: Callable[[Path], None] = lambda path: None,
+    path: Path, *parts: bytes | memoryview, before: Callable[[Path], None] = lambda path: None
 ) -> None:
     """Write a file so that a reader sees the old one or the new one, never a part.
 

@@ -53,23 +53,14 @@ class BackEnd(Group):
     )
     resolution: float = param(0.05, 'cell size of the published map', 'm', 0.01, 1.0)
     keyframes_per_place: int = param(
-        6,
-        'keyframes kept per place; others are marginalized; 0: all are kept',
-        '',
-        0,
-        10000,
+        6, 'keyframes kept per place; others are marginalized; 0: all are kept', '', 0, 10000
     )
     place_distance: float = param(
         0.5, 'keyframes closer than this belong to one place', 'm', 0.01, 100.0
     )
     place_heading: float = param(0.6, 'and with headings closer than this', 'rad', 0.01, 3.2)
     correction_speed: float = param(
-        0.0,
-        'rate limit of corrections of map to odom; 0: none',
-        'm/s',
-        0.0,
-        100.0,
-        live=True,
+        0.0, 'rate limit of corrections of map to odom; 0: none', 'm/s', 0.0, 100.0, live=True
     )
     correction_turn_rate: float = param(
         0.1,
@@ -88,15 +79,10 @@ class BackEnd(Group):
         live=True,
     )
     survey: str = param(
-        '',
-        'survey of reflectors (.csv, .json, SICK .imk) in map_directory; defines the map frame',
+        '', 'survey of reflectors (.csv, .json, SICK .imk) in map_directory; defines the map frame'
     )
     survey_sigma: float = param(
-        0.02,
-        'error of a surveyed position per axis, 1 sigma',
-        'm',
-        0.001,
-        1.0,
+        0.02, 'error of a surveyed position per axis, 1 sigma', 'm', 0.001, 1.0
     )
     max_trajectory_frames: int = param(
         1_000_000,

@@ -39,21 +39,13 @@ class Ekf(Group):
         5.0, 'a candidate without a detection for this long is dropped', 's', 0.01, 1e4
     )
     candidate_sigma: float = param(
-        0.5,
-        'a candidate with a larger sigma relative to the robot is dropped',
-        'm',
-        1e-3,
-        100.0,
+        0.5, 'a candidate with a larger sigma relative to the robot is dropped', 'm', 1e-3, 100.0
     )
     range_noise: float = param(
         0.0, 'range noise per range, added to that of the detection', '', 0.0, 1.0
     )
     landmark_sigma: float = param(
-        0.0,
-        'extent of a landmark, 1 sigma, added to the noise of the detection',
-        'm',
-        0.0,
-        10.0,
+        0.0, 'extent of a landmark, 1 sigma, added to the noise of the detection', 'm', 0.0, 10.0
     )
     update: str = param(
         'compressed',

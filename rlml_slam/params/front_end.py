@@ -251,11 +251,7 @@ class ScanMatch(Group):
     )
     max_iterations: int = param(20, 'largest number of Gauss-Newton iterations', '', 1, 200)
     prior_robust_scale: float = param(
-        3.0,
-        'Geman-McClure scale of the odometry prior, in sigmas',
-        '',
-        0.5,
-        100.0,
+        3.0, 'Geman-McClure scale of the odometry prior, in sigmas', '', 0.5, 100.0
     )
 
 
@@ -297,9 +293,5 @@ class HealthLimits(Group, prefix='health.'):
         0.6, 'LOST when scans or reflectors contradict the map for this long', 's', 0.0, 60.0
     )
     new_session_time: float = param(
-        5.0,
-        'mapping: when LOST for this long, a new session starts',
-        's',
-        0.0,
-        1e6,
+        5.0, 'mapping: when LOST for this long, a new session starts', 's', 0.0, 1e6
     )

@@ -146,12 +146,7 @@ class Node(Group, prefix=''):
         0.2, 'longest time that a scan waits for the odometry at its stamp', 's', 0.0, 10.0
     )
     map_update_interval: float = param(
-        2.0,
-        'period at which map, graph and trajectory are published',
-        's',
-        0.05,
-        600.0,
-        live=True,
+        2.0, 'period at which map, graph and trajectory are published', 's', 0.05, 600.0, live=True
     )
     tf_buffer_duration: float = param(
         30.0, 'length of the buffers of odometry and of waiting inputs', 's', 1.0, 600.0

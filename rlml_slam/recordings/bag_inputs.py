@@ -169,8 +169,7 @@ def with_frames_of(tree: Extrinsics, params: Parameters) -> Parameters:
     above = [f for f in known if 'odom' in f.lower() and base and tree.path(f, base)]
     odom = odom or (above[0] if len(above) == 1 else '')
     return replace(
-        params,
-        node=replace(n, odom_frame=odom or n.odom_frame, base_frame=base or n.base_frame),
+        params, node=replace(n, odom_frame=odom or n.odom_frame, base_frame=base or n.base_frame)
     )
 
 

@@ -66,9 +66,7 @@ def collect(slam: Slam | EkfSlam, log: FrameLog, name: str, truth: Truth | None)
 
 
 def fates(
-    counts: Mapping[str, Mapping[str, int]],
-    skipped: Mapping[str, int],
-    topics: Mapping[str, str],
+    counts: Mapping[str, Mapping[str, int]], skipped: Mapping[str, int], topics: Mapping[str, str]
 ) -> dict[str, dict[str, int]]:
     """What became of the inputs of each stream: used, late, invalid, and whatever else occurred.
 

@@ -12,10 +12,7 @@ from rlml_slam.version import __version__
 
 
 def page(
-    title: str,
-    parts: Sequence[str],
-    footer: Mapping[str, str] | None = None,
-    head: str = '',
+    title: str, parts: Sequence[str], footer: Mapping[str, str] | None = None, head: str = ''
 ) -> str:
     """A whole page of these parts, which are HTML, as ``head`` is.
 

@@ -23,14 +23,7 @@ from rcl_interfaces.msg import (
 from rclpy.parameter import Parameter
 
 from rlml_slam.errors import RlmlError
-from rlml_slam.params import (
-    NODES,
-    ROS_OWN,
-    Declaration,
-    Parameters,
-    declarations,
-    from_mapping,
-)
+from rlml_slam.params import NODES, ROS_OWN, Declaration, Parameters, declarations, from_mapping
 
 Check = Callable[[Any], object]
 

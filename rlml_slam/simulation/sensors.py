@@ -157,12 +157,7 @@ class LaserSensor:
         return self._scan(stamp, ranges, power)
 
     def _echoes(
-        self,
-        ranges: Array,
-        objects: NDArray[np.int64],
-        cosines: Array,
-        surface: Array,
-        edges: int,
+        self, ranges: Array, objects: NDArray[np.int64], cosines: Array, surface: Array, edges: int
     ) -> tuple[Array, Array]:
         """Range and received power (n,) of each beam of ``edges`` rays; Inf and 0 for none."""
         row = np.concatenate([surface, np.zeros((1, 4))])[objects]  # -1 is the last, all dark
@@ -274,11 +269,7 @@ class MarkerSensor:
         inside = np.abs(bearing) <= -laser.angle_min + 1e-9
         near = np.hypot(dx, dy) <= self._n.max_range
         _, objects, cosines = cast(
-            T[:, :2],
-            np.arctan2(dy, dx),
-            (at - moment) / SECOND,
-            geometry,
-            self._n.max_range + 1.0,
+            T[:, :2], np.arctan2(dy, dx), (at - moment) / SECOND, geometry, self._n.max_range + 1.0
         )
         met = np.concatenate([geometry.surface[:, REFLECTOR], [-1.0]])[objects]
         flat = ~np.isnan(self.reflectors.normals)

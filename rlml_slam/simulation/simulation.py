@@ -56,10 +56,7 @@ class Simulation:
     """
 
     def __init__(
-        self,
-        world: World,
-        parameters: SimulatorParameters | None = None,
-        seed: int | None = None,
+        self, world: World, parameters: SimulatorParameters | None = None, seed: int | None = None
     ) -> None:
         p = parameters or SimulatorParameters()
         self.world = world

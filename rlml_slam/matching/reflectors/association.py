@@ -123,10 +123,7 @@ class Associator:
         return out
 
     def _jointly(
-        self,
-        d2: Array,
-        compatible: NDArray[np.bool_],
-        joint2: Callable[[Indices, Indices], float],
+        self, d2: Array, compatible: NDArray[np.bool_], joint2: Callable[[Indices, Indices], float]
     ) -> tuple[Indices, Indices]:
         """Joint compatibility branch and bound (Neira, Tardos 2001): most matches, then near.
 

@@ -160,10 +160,7 @@ def graph_markers(make: Make, stamp: int, frame_id: str, graph: Graph) -> Any:
 
 
 def _lines(
-    out: _Markers,
-    name: str,
-    color: tuple[float, float, float, float],
-    ends: NDArray[np.float64],
+    out: _Markers, name: str, color: tuple[float, float, float, float], ends: NDArray[np.float64]
 ) -> None:
     if len(ends):
         out.add(name, LINE_LIST, color, (0.02, 0.0, 0.0), points=ends)

@@ -22,13 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rlml_slam import se2
-from rlml_slam.estimation.correction import (
-    Correction,
-    ReferencePose,
-    carried,
-    either,
-    positive,
-)
+from rlml_slam.estimation.correction import Correction, ReferencePose, carried, either, positive
 from rlml_slam.graph import FactorTable, Graph, OnlineSolver
 from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.closure_records import ClosureRecords

@@ -10,13 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.slam.landmarks.landmark import (
-    HISTORY,
-    SIGHTING,
-    VIEW,
-    DetectionHistory,
-    Landmark,
-)
+from rlml_slam.slam.landmarks.landmark import HISTORY, SIGHTING, VIEW, DetectionHistory, Landmark
 
 
 def arrays_of(reflectors: Iterable[Landmark]) -> dict[str, NDArray[Any]]:

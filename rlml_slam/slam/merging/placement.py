@@ -21,14 +21,7 @@ from rlml_slam.matching.reflectors.constellation import Constellation, locate
 from rlml_slam.matching.reflectors.pair_votes import MAX_TESTS, MIN_MATCHES
 from rlml_slam.params import Relocalization
 from rlml_slam.se2 import Array
-from rlml_slam.slam.merging.site_map import (
-    Session,
-    Site,
-    in_view,
-    match_of,
-    moved,
-    site_of,
-)
+from rlml_slam.slam.merging.site_map import Session, Site, in_view, match_of, moved, site_of
 from rlml_slam.types import Verdict
 
 # most reflectors of a session may be in places that the site does not cover

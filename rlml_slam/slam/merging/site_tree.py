@@ -20,13 +20,7 @@ from rlml_slam.maps.survey import Survey
 from rlml_slam.matching.reflectors.survey_alignment import place as place_in_survey
 from rlml_slam.params import Parameters, Relocalization
 from rlml_slam.se2 import Array
-from rlml_slam.slam.merging.placement import (
-    SAME,
-    Placement,
-    joined,
-    place_session,
-    place_site,
-)
+from rlml_slam.slam.merging.placement import SAME, Placement, joined, place_session, place_site
 from rlml_slam.slam.merging.scan_placement import grid_of, place_by_scans
 from rlml_slam.slam.merging.site_map import Session, Site, site_of
 from rlml_slam.types import Reflectors

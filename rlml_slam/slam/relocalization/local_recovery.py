@@ -29,12 +29,7 @@ NEAR = np.diag(1.0 / SPREAD**2)  # a weak prior at the place found: odometry is 
 
 
 def recover_locally(
-    submap: Submap,
-    points: Array,
-    guess: Array,
-    usual: float,
-    p: Parameters,
-    turn: float = TURN,
+    submap: Submap, points: Array, guess: Array, usual: float, p: Parameters, turn: float = TURN
 ) -> ScanMatchResult | None:
     """The only place near ``guess`` (3,), submap frame, where a scan fits as it should.
 
