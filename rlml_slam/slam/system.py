@@ -284,8 +284,7 @@ class System:
             return []
         if self.entry is not None:
             return [self._start(record, pose, cov)]
-        number = self.requests.new_number()
-        go_on = Relocate(number, record.session, record.frame.stamp, pose, cov)
+        go_on = Relocate(self.requests.new_number(), record.session, record.frame.stamp, pose, cov)
         return [info(f'found again: {found.why}'), self.requests.ask(go_on)]
 
     def _answer(self, number: int, pending: Pending, found: Relocation) -> list[Command]:
