@@ -14,7 +14,6 @@ from rlml_slam.types import Health, Level
 
 FEW = 3  # fewer expected reflectors may all be missed by chance, or stand behind glass
 NEVER = -(2**62)  # [ns]
-FOUND = 0.8  # share of the variance: what a step lowers to less than that, the map has lowered
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,6 @@ class HealthMonitor:
         self._held_by_scan = NEVER
         self._first: int | None = None
         self._variance = 0.0  # [m^2] of the position, at the last step
-        self._largest = 0.0  # [m^2] of that, since the robot was found in the map last
         self._explored = 0.0  # [m^2] of that, what it has grown by while the map held the pose
         self._submap: object = None  # of the last match, and the variance [m^2] relative to it
         self._drifted = 0.0
@@ -109,28 +107,21 @@ class HealthMonitor:
         """Whether the position is too uncertain to be known in the map.
 
         A map in the making grows away from its start, and the robot's place in it stays known
-        while scan or reflectors hold the pose. What the variance grows by then, beyond its
-        largest value, does not count: nearer to where its heading was lost, a robot is less
-        uncertain, and farther away as uncertain as before. A scan that leaves a direction open to
-        odometry still holds the pose in its submap, but for what the variance grows by relative
-        to that.
+        while scan or reflectors hold the pose. What the variance grows by then does not count. A
+        scan that leaves a direction open to odometry still holds the pose in its submap, but for
+        what the variance grows by relative to that.
         """
-        scan, variance = step.scan, self._variance
+        scan, grown = step.scan, sigma**2 - self._variance
         self._variance = sigma**2
-        if self._variance < FOUND * variance:
-            self._largest = self._variance
-            self._explored = min(self._explored, self._variance)
-        grown = max(self._variance - self._largest, 0.0)
-        self._largest += grown
         drifted, submap = self._drifted, self._submap
         if scan.used:
             self._drifted = eigenvalues_2x2(scan.cov_submap[:2, :2])[1]
             self._submap = scan.submap
         if step.maps and stamp in (self._held_by_scan, self._held_by_reflectors):
-            self._explored += grown
+            self._explored += max(grown, 0.0)
         elif step.maps and scan.submap is not None and scan.submap is submap:
             self._explored += grown - (self._drifted - drifted)
-        self._explored = min(max(self._explored, 0.0), self._largest)
+        self._explored = min(max(self._explored, 0.0), self._variance)
         return self._variance - self._explored > self._limits.sigma_lost**2
 
     def _note(self, stamp: int, step: HealthInputs) -> None:

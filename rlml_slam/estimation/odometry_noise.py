@@ -25,13 +25,11 @@ from rlml_slam.se2 import Array
 from rlml_slam.types import Motion, Observation
 
 AXES = np.array([0, 2])  # along the base, and its turn
-LONGEST = 1.0  # [s] of a motion; odometry that is missing for longer is a gap
+LONGEST = 1.0  # [s] of a motion: one across a gap is as uncertain as the parameters say
 PRIOR = 100.0  # steps that count as if the parameters were right
 MEMORY = 1000.0  # steps after which one counts e times less
 LEAST = 0.05  # smallest share of the variance
 OUTLIER = 1000.0  # [S] larger v^2 count as this: wheels that slip once are doubted for long
-GREATEST = 0.5  # [m], [rad] larger errors of a step count as this
-MOVED = 0.05  # [m], [rad] of a robot that did not stand in a gap
 SEEN = 0.2  # share by which a step has to lower the variance, to say something of the motion
 
 
@@ -46,8 +44,6 @@ class OdometryNoise:
         self._slopes = np.array([noise.speed_noise, noise.turn_noise])
         self._sums = np.zeros((2, 2, 2))  # of a Q / S^2 and of Q^2 / S^2
         self._applied: tuple[Array, NDArray[np.int64], Array] | None = None
-        self._elapsed = 0.0  # [s] of the newest step
-        self._driven = np.zeros(4)  # of steps that moved: time, distance, error^2 of AXES
 
     @property
     def shares(self) -> Array:
@@ -60,29 +56,12 @@ class OdometryNoise:
 
         One that stands, but for what its wheels jitter, says nothing of how it drives.
         """
-        motion, self._applied, self._elapsed = observation.motion, None, dt
-        if motion.known and motion.gap > LONGEST and (np.abs(motion.delta) > MOVED).any():
-            return self._across_gap(observation)
+        motion, self._applied = observation.motion, None
         fast = self._fast(motion.delta, dt)
         if not motion.known or fast is None:
             return observation
         self._applied = motion.delta, fast, motion.cov[AXES, AXES]
         return replace(observation, motion=replace(motion, cov=self._scaled(motion.cov, fast)))
-
-    def _across_gap(self, observation: Observation) -> Observation:
-        """The observation with the noise of its gap, by what came out before it.
-
-        Eq. 61: how the robot went is not known, so it drove as far as usual, and each axis has an
-        equal share of what its heading erred by on the way. Outliers count as often as they were.
-        """
-        motion = observation.motion
-        share = motion.gap / max(self._driven[0], LONGEST)
-        _, far, along2, turn2 = (self._driven * share).tolist()
-        usual2 = along2 + turn2 * far**2 / 6.0
-        more: Array = np.maximum(np.array([usual2, usual2, turn2]) - np.diag(motion.cov), 0.0)
-        if not more.any():
-            return observation
-        return replace(observation, motion=replace(motion, cov=motion.cov + np.diag(more)))
 
     def cov_of(self, delta: Array, dt: float, cov: Array) -> Array:
         """The covariance (3, 3) of a motion (3,) of ``dt`` [s], with this noise."""
@@ -113,10 +92,6 @@ class OdometryNoise:
             return
         (_, fast, Q), (pose, P), (corrected, P_new) = self._applied, before, after
         error = se2.between(pose, corrected)
-        step = np.minimum(np.abs(error[AXES]), GREATEST) ** 2
-        far = float(np.hypot(*motion.delta[:2]))
-        self._driven *= 1.0 - 1.0 / MEMORY
-        self._driven += np.array([self._elapsed, far, *step])
         P, P_new = (se2.rotate_cov(p, -pose[2]) for p in (P, P_new))
         for axis, k in enumerate(AXES.tolist()):
             gain = 1.0 - P_new[k, k] / max(P[k, k], 1e-18)

@@ -378,15 +378,6 @@ def test_uncertainty_before_a_corridor_stays():
     assert levels_in_corridor([*gap, *[(4.0, 4.0, True)] * 40])[-1] is Level.LOST
 
 
-def test_place_lost_in_a_gap_stays_lost_while_the_robot_drives_to_and_fro():
-    """Near where its heading was lost, the position is less uncertain, and farther away more."""
-    fro = [(2.6 + 0.4 * np.cos(0.2 * k), True, True) for k in range(300)]
-    seen = levels([*[(0.1, True, True)] * 20, (3.0, False, True), *fro])
-    assert set(seen[21:]) == {Level.LOST}
-    found = [(0.3, True, True), *[(0.3 + 0.02 * k, True, True) for k in range(150)]]
-    assert Level.LOST not in levels([*[(0.1, True, True)] * 20, (3.0, False, True), *found])[21:]
-
-
 def test_map_that_grows_to_and_fro_is_no_reason_to_be_lost():
     """Near the start, the position is less uncertain; farther away it is what it was there."""
     begin, out = np.linspace(0.1, 0.8, 20), np.linspace(0.8, 3.0, 100)

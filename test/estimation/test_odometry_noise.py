@@ -9,9 +9,9 @@ from made_worlds import SECOND
 
 from rlml_slam import se2
 from rlml_slam.estimation.odometry_noise import AXES, LEAST, OdometryNoise
-from rlml_slam.motion import MotionBuffer, compose_motion, motion_of
+from rlml_slam.motion import motion_of
 from rlml_slam.params import MotionNoise
-from rlml_slam.types import Motion, Observation, Odometry
+from rlml_slam.types import Motion, Observation
 
 NOISE = MotionNoise()
 SEEN = np.diag([0.004, 0.004, 0.002]) ** 2  # of a pose that is measured
@@ -112,60 +112,3 @@ def test_wheels_that_jitter_where_the_robot_stands_say_nothing():
     drive(noise, 2000, rng, sigmas=0.0, v=0.001, w=0.001)
     assert not noise._sums.any()
     assert drive(noise, 1, rng, v=0.15)[0] == 1.0  # it creeps off
-
-
-def test_gap_after_wheels_that_slip_is_as_uncertain_as_they_are():
-    """Random ways of 30 s: the motion that wheels say errs as much as its covariance says."""
-    rng, dt, rate = np.random.default_rng(4), 0.2, 0.04  # [rad/sqrt(s)], far above the noise
-    noise, known = OdometryNoise(NOISE), np.diag([1e-3, 1e-3, 1e-3]) ** 2
-
-    def step(pose):
-        v, w = rng.uniform(0.3, 0.7), rng.normal(0.0, 0.5)
-        true = se2.exp(np.array([v, 0.0, w]) * dt)
-        slip = rate * np.sqrt(dt) * rng.standard_normal()
-        return se2.compose(pose, true), se2.compose(true, np.array([0.0, 0.0, slip]))
-
-    for k in range(1500):
-        _, wheels = step(np.zeros(3))
-        given = Observation((k + 1) * SECOND, motion=replace(motion(0.5, 0.0, dt), delta=wheels))
-        scaled = noise.scaled(given, dt).motion
-        error = np.array([0.0, 0.0, rate * np.sqrt(dt) * rng.standard_normal()])
-        noise.learn(scaled, (np.zeros(3), known + scaled.cov), (error, known))
-    errors, sigmas = [], []
-    for _ in range(200):
-        there = wheels = np.zeros(3)
-        for _ in range(150):
-            there, one = step(there)
-            wheels = se2.compose(wheels, one)
-        gap = noise.scaled(Observation(SECOND, motion=motion_of(wheels, 30.0, NOISE)), 30.0)
-        errors.append(se2.between(wheels, there))
-        sigmas.append(np.sqrt(np.diag(gap.motion.cov)))
-    ratio = np.array(errors) / np.array(sigmas)
-    assert (np.abs(ratio) < 3.0).mean() > 0.98
-    assert 0.3 < np.sqrt((ratio**2).mean()) < 1.1
-
-
-def test_gap_of_good_wheels_and_of_a_robot_that_stood_keeps_its_noise():
-    noise = OdometryNoise(NOISE)
-    drive(noise, 1000, np.random.default_rng(0), sigmas=2.0)
-    stood = Observation(SECOND, motion=motion(0.001, 0.0, 30.0))
-    assert noise.scaled(stood, 30.0) is stood
-
-
-def test_odometry_that_was_there_all_along_is_no_gap():
-    """A laser that sees nothing for 3 s: each second of the odometry has its own noise."""
-    noise = OdometryNoise(NOISE)
-    drive(noise, 1000, np.random.default_rng(0), sigmas=3.0)
-    buffer = MotionBuffer(NOISE, 60.0)
-    for k in range(61):
-        pose = se2.exp(np.array([0.5, 0.0, 0.2]) * k / 10)
-        if not 30 < k < 60:
-            buffer.add_odometry(Odometry(SECOND + k * SECOND // 10, pose))
-    whole, gap = (buffer.motion(SECOND * a, SECOND * b) for a, b in ((1, 4), (4, 7)))
-    assert whole.gap == pytest.approx(0.1)
-    assert gap.gap == pytest.approx(3.0)
-    assert noise.scaled(Observation(SECOND, motion=whole), 3.0).motion is whole
-    assert (noise.scaled(Observation(SECOND, motion=gap), 3.0).motion.cov >= gap.cov).all()
-    assert noise.scaled(Observation(SECOND, motion=gap), 3.0).motion is not gap
-    assert compose_motion(whole, gap).gap == gap.gap
-    assert buffer.motion(5 * SECOND, 5 * SECOND + SECOND // 5).gap == pytest.approx(0.2)
