@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -133,7 +132,6 @@ def compose_motion(first: Motion, second: Motion) -> Motion:
         w_a * first.bias_turn + w_b * second.bias_turn,
         drift_gain,
         w_a * first.bias_way + w_b * second.bias_way,
-        max(first.gap, second.gap),
     )
 
 
@@ -156,7 +154,7 @@ def motion_of(delta: Array, dt: float, noise: MotionNoise) -> Motion:
         noise.lateral_noise * v,
     ])  # fmt: skip
     piece = np.array([v, w, dt / n, *(sigma**2 * (noise.noise_interval * n / dt)), 0.0, 0.0])
-    return Motion(delta, integrate(*np.tile(piece[:, None], n))[1:4], gap=dt)
+    return Motion(delta, integrate(*np.tile(piece[:, None], n))[1:4])
 
 
 def is_possible(delta: Array, dt: float, noise: MotionNoise) -> bool:
@@ -506,11 +504,9 @@ class MotionBuffer:
             return STILL
         odometry = _around(self._stamps, start, end, int(self._noise.noise_interval * SECOND))
         imu = _around(self._imu_stamps, start, end)
-        stamps = self._stamps[odometry]
-        gap = min(max((b - a for a, b in pairwise(stamps)), default=0), end - start) / SECOND
         out, known, bias, variance, turned, drove = _drive(
             start, end,
-            np.array(stamps, dtype=np.int64),
+            np.array(self._stamps[odometry], dtype=np.int64),
             np.array(self._twists[odometry], dtype=np.float64).reshape(-1, 3),
             np.array(self._imu_stamps[imu], dtype=np.int64),
             np.array(self._rates[imu], dtype=np.float64),
@@ -518,7 +514,7 @@ class MotionBuffer:
         )  # fmt: skip
         out[0, 2] = se2.wrapped(out[0, 2])
         return Motion(
-            out[0], out[1:4], known, out[4], bias, variance, out[5], turned, out[6], drove, gap
+            out[0], out[1:4], known, out[4], bias, variance, out[5], turned, out[6], drove
         )
 
 

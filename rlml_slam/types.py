@@ -84,8 +84,6 @@ class Motion:
     (3,) are d delta / d (scale error of turn, turn per distance). If it is that of the IMU, the
     bias is ``bias`` plus ``bias_turn`` [rad/s] and ``bias_way`` [m/s] times these errors. The
     scale error of speed needs no gain: its derivative is (x, y) of ``delta``.
-
-    ``gap`` [s] is the longest time in it without a sample of the odometry.
     """
 
     delta: Array
@@ -98,7 +96,6 @@ class Motion:
     bias_turn: float = 0.0
     drift_gain: Array = field(default_factory=lambda: np.zeros(3))
     bias_way: float = 0.0
-    gap: float = 0.0
 
 
 @dataclass(frozen=True)

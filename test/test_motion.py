@@ -556,16 +556,3 @@ def test_old_samples_are_forgotten():
     m = buffer.motion(T0 + 18 * SECOND, T0 + 20 * SECOND)
     assert m.known
     np.testing.assert_allclose(m.delta, [2.0, 0.0, 0.0], atol=1e-9)
-
-
-def test_gap_is_the_longest_time_without_odometry_in_a_motion():
-    buffer = MotionBuffer(MotionNoise(), 60.0)
-    for k in range(61):
-        pose = se2.exp(np.array([0.5, 0.0, 0.2]) * k / 10)
-        if not 30 < k < 60:
-            buffer.add_odometry(Odometry(SECOND + k * SECOND // 10, pose))
-    whole, gap = (buffer.motion(SECOND * a, SECOND * b) for a, b in ((1, 4), (4, 7)))
-    assert whole.gap == pytest.approx(0.1)
-    assert gap.gap == pytest.approx(3.0)
-    assert compose_motion(whole, gap).gap == gap.gap
-    assert buffer.motion(5 * SECOND, 5 * SECOND + SECOND // 5).gap == pytest.approx(0.2)

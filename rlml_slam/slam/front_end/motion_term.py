@@ -32,8 +32,6 @@ from rlml_slam.types import Motion, Observation
 # [ns] shortest time over which a velocity is computed. Scans that arrive in a burst are too close:
 # a pose error of 2 mm would be 0.4 m/s over 5 ms, and is .04 m/s over this time.
 MIN_INTERVAL = 50_000_000
-UNSEEN = 2.0  # [s] without odometry, as where all messages were lost
-LEFT = np.array([1.0, 1.0, 0.5])  # [m, m, rad] by which a robot that drove on has left
 WHOLE = 0.9  # share of a sweep from which on the next stamp counts as its end, for its jitter
 
 
@@ -42,8 +40,7 @@ class MotionTerm:
 
     ``stamp`` [ns] is that of the newest observation, None before the first. ``has_odometry``: at
     least one observation had odometry. ``is_constant_velocity``: the last prediction was made
-    by the constant-velocity model. ``drove_unseen``: the wheels turned in a gap that this motion
-    spans. ``velocity`` (3,) [m/s, m/s, rad/s] is that of the base.
+    by the constant-velocity model. ``velocity`` (3,) [m/s, m/s, rad/s] is that of the base.
     """
 
     def __init__(self, params: Parameters) -> None:
@@ -54,7 +51,7 @@ class MotionTerm:
         self._predicted: tuple[Array, Array] | None = None  # pose in the submap, covariance
         self._odometry = STANDING  # the newest motion that it measured
         self.stamp: int | None = None
-        self.has_odometry = self.is_constant_velocity = self.drove_unseen = False
+        self.has_odometry = self.is_constant_velocity = False
         self.forget_velocity()
 
     def forget_velocity(self) -> None:
@@ -82,8 +79,6 @@ class MotionTerm:
         self.is_constant_velocity = not self.has_odometry and last is not None
         dt = 0.0 if last is None else (observation.stamp - last) * 1e-9
         p, motion = self._p, observation.motion
-        moved = bool((np.abs(motion.delta) > LEFT).any())
-        self.drove_unseen = motion.known and motion.gap > UNSEEN and moved
         if self.is_constant_velocity:
             self._constant_velocity.predict(state, dt, motion)
             return

@@ -131,13 +131,9 @@ class ScanTerm:
         return float(np.mean(fits)) if fits else None
 
     def update(
-        self, observation: Observation, sweep: Sweep, reflectors_agree: bool, maps: bool
+        self, observation: Observation, sweep: Sweep, reflectors_agree: bool
     ) -> ScanEvidence:
-        """Match the scan with the submap and update the state (e_s of eq. 2).
-
-        Where the system ``maps``, and the wheels drove on in a gap, a scan that does not fit is of
-        a new place: submaps start there, with the covariance of the motion.
-        """
+        """Match the scan with the submap and update the state (e_s of eq. 2)."""
         p, submap = self._p.scan_match, self.submaps.target
         if observation.points is None:
             return ScanEvidence(has_scan=False)
@@ -153,9 +149,6 @@ class ScanTerm:
             usual = self.kidnapping.usual
             found = recover_locally(submap, points, prior, usual, self._p, turn) or found
             misfit = self._contradicts(submap, points, found)
-        if misfit and not reflectors_agree and maps and self._motion.drove_unseen:
-            self.submaps.start_again()
-            return ScanEvidence(has_scan=False)
         if found.score < p.min_score or (misfit and not reflectors_agree):
             return ScanEvidence(has_scan=True, misfit=misfit, score=found.score)
         self.kidnapping.learn(found.score)
