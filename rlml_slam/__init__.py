@@ -22,15 +22,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from rlml_slam.api import (
-        Slam,
-        evaluate,
-        load_map,
-        read_bag,
-        read_parameters,
-        replay,
-        save_map,
-    )
+    from rlml_slam.api import Slam, evaluate, load_map, read_bag, read_parameters, replay, save_map
     from rlml_slam.errors import RlmlError
     from rlml_slam.params import Parameters
 else:

@@ -14,12 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rlml_slam.compiled import part
-from rlml_slam.graph.incremental.solver_state import (
-    SEEDS,
-    STEP,
-    State,
-    free_clique,
-)
+from rlml_slam.graph.incremental.solver_state import SEEDS, STEP, State, free_clique
 from rlml_slam.graph.sparse.minimum_degree import minimum_degree
 from rlml_slam.graph.sparse.multifrontal import layout_fronts
 from rlml_slam.graph.sparse.symbolic_analysis import (

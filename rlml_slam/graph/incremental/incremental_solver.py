@@ -20,11 +20,7 @@ from rlml_slam.errors import SolverError
 from rlml_slam.graph.incremental.affected_subtree import extract_affected
 from rlml_slam.graph.incremental.back_substitution import Pool, back_substitute
 from rlml_slam.graph.incremental.joint_covariance import tree_joint
-from rlml_slam.graph.incremental.refactorization import (
-    make_cliques,
-    refactor,
-    reserve,
-)
+from rlml_slam.graph.incremental.refactorization import make_cliques, refactor, reserve
 from rlml_slam.graph.incremental.relinearization import differ, reset_references, synchronize
 from rlml_slam.graph.incremental.relinearization_test import find_stale_factors, is_robust
 from rlml_slam.graph.incremental.renumbering import renumber

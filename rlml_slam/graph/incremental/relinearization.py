@@ -12,11 +12,7 @@ import math
 import numpy as np
 
 from rlml_slam.compiled import part
-from rlml_slam.graph.incremental.relinearization_test import (
-    restrict_validity,
-    squared,
-    valid_turn,
-)
+from rlml_slam.graph.incremental.relinearization_test import restrict_validity, squared, valid_turn
 from rlml_slam.graph.incremental.solver_state import (
     EDGES,
     FIXED_LANDMARKS,

@@ -126,7 +126,7 @@ def grown(pairs: Bytes, windows: Sequence[int]) -> Iterator[Bytes]:
 def _level(grids: Sequence[Bytes], windows: Sequence[int], side: int, phase: int) -> Level:
     """The grids by the remainders of rows and columns.
 
-    Below the largest blocks, a byte holds a value and the one below it. Rows of the largest are
+    A byte holds a value and, in the upper bits, the one below it. Rows of the largest blocks are
     as far apart as blocks are summed up at a time: those beyond the grid are empty then.
     """
     parts = side // phase
@@ -136,12 +136,10 @@ def _level(grids: Sequence[Bytes], windows: Sequence[int], side: int, phase: int
     for out, grid in zip(planes, grids, strict=True):
         split = grid.reshape(rows, parts, columns, parts).transpose(1, 3, 0, 2)
         out[:, :, :columns] = split.reshape(parts * parts, rows, columns)
-        if side < 8:
-            out[:, :-1] |= out[:, 1:] << 4
-    size = parts * parts * rows * stride
-    empty = np.zeros(LANES, np.uint8)
+    size, empty = parts * parts * rows * stride, np.zeros(LANES + stride, np.uint8)
     data = np.concatenate([empty, planes.ravel(), empty])
-    starts = LANES + size * np.arange(len(grids))
+    data[:-stride] |= data[stride:] << 4
+    starts = len(empty) + size * np.arange(len(grids))
     return Level(data, side, phase, stride, rows * stride, np.array(windows), starts)
 
 

@@ -19,12 +19,7 @@ from rlml_slam.matching.scans.scan_match import match
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
-from rlml_slam.slam.relocalization.grid_submap import (
-    GridSubmap,
-    is_mapped,
-    possible,
-    submap_of,
-)
+from rlml_slam.slam.relocalization.grid_submap import GridSubmap, is_mapped, possible, submap_of
 from rlml_slam.slam.search_area import SearchArea
 from rlml_slam.types import Verdict
 
