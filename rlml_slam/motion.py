@@ -30,6 +30,7 @@ Stamps = NDArray[np.int64]
 BATCH = 256
 # of the speed at which floor and slope of the noise are equal: no robot drives slower for long
 CREEP = 0.25
+USUAL = 30.0  # [s] whose mean speed is that at which a robot goes on in a gap
 COAST = 0.2  # [s] for which a robot is taken to go on as it went before its odometry ended
 # Share of the noise of a slow motion that is left where the wheels do not turn: what they miss is
 # less than a tick in all, and adds up to no walk. A larger one lets the noise of the first scan
@@ -220,6 +221,7 @@ def _drive(
     all_known = True
     weight = weighted = turned = drove = 0.0
     open2 = turned2 = 0.0  # [s^2] near the end of a long gap, of which odometry says nothing
+    beside2 = 0.0  # [m^2] by which errors of the heading on a way that is not known led aside
     for k in range(m):
         dt = (cuts[k + 1] - cuts[k]) / SECOND
         middle = (cuts[k] + cuts[k + 1]) // 2
@@ -243,7 +245,8 @@ def _drive(
                 # when inside a long interval the motion happened is uncertain; what is left of it
                 # at the end is less than what was driven: at least as fast as before, and no arc
                 long_interval_noise = n.long_interval_noise
-                before = _speed_before(at - 1, stamps, twists, n.noise_interval)
+                over = USUAL if gap > n.max_gap else n.noise_interval
+                before = _speed_before(at - 1, stamps, twists, n.noise_interval, over)
                 fast, quick = max(fast, before[0]), max(quick, before[1])
                 # a constant twist leads along an arc, which is longer than its chord
                 half = 0.5 * turn * (cuts[k + 1] - cuts[k]) / SECOND
@@ -252,6 +255,10 @@ def _drive(
             sigma_v = (n.speed_noise + long_interval_noise) * fast + n.speed_noise_floor
             sigma_w = (n.turn_noise + long_interval_noise) * quick + n.turn_noise_floor
             sigma_v, sigma_w = math.sqrt(moved) * sigma_v, math.sqrt(moved) * sigma_w
+            if gap > n.max_gap:
+                # eq. 61: it went as far as at its speed before, wherever that led
+                way2 = ((moved * fast) ** 2 - speed**2 - sideways**2) * dt**2
+                beside2 += max(way2, 0.0) * sigma_w**2 * n.noise_interval * dt / 6.0
         # the wheels do not turn: so does the robot not, and the IMU shows its bias
         stands = known and speed == 0.0 and sideways == 0.0 and turn == 0.0
         if stands:
@@ -287,8 +294,8 @@ def _drive(
     out = integrate(
         rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6], rows[7]
     )  # fmt: skip
-    out[1, 0] += open2 * (n.max_speed / 5.0) ** 2
-    out[2, 1] += open2 * (n.max_speed / 5.0) ** 2
+    out[1, 0] += open2 * (n.max_speed / 5.0) ** 2 + beside2
+    out[2, 1] += open2 * (n.max_speed / 5.0) ** 2 + beside2
     out[3, 2] += turned2 * (n.max_turn_rate / 5.0) ** 2
     if weight > 0.0:
         return out, all_known, weighted / weight, 1.0 / weight, turned / weight, drove / weight
@@ -307,13 +314,15 @@ def _share_moved(speed: float, turn: float, n: _Noise) -> float:
 
 
 @part
-def _speed_before(at: int, stamps: Stamps, twists: Array, interval: float) -> tuple[float, float]:
-    """Speed and turn rate in the control interval until sample ``at``, without a jump in it.
+def _speed_before(
+    at: int, stamps: Stamps, twists: Array, interval: float, over: float
+) -> tuple[float, float]:
+    """Mean speed and turn rate ``over`` a time [s] until sample ``at``, without a jump in it.
 
-    Stamps of one burst are too close to divide by.
+    Stamps of one burst are too close to divide by: at least a control ``interval`` [s] counts.
     """
     far = turned = lasted = 0.0
-    while at > 0 and lasted < interval and not math.isnan(twists[at, 0]):
+    while at > 0 and lasted < over and not math.isnan(twists[at, 0]):
         dt = (stamps[at] - stamps[at - 1]) / SECOND
         far, turned = far + abs(twists[at, 0]) * dt, turned + abs(twists[at, 2]) * dt
         lasted += dt
@@ -483,6 +492,15 @@ class MotionBuffer:
         """Whether odometry before and after the stamp is there."""
         return bool(self._stamps) and self._stamps[0] <= stamp <= self._stamps[-1]
 
+    def gap_at(self, stamp: int) -> int:
+        """Length [ns] of the odometry's interval around a stamp, 0 within COAST of its ends."""
+        k = bisect_left(self._stamps, stamp)
+        if not 0 < k < len(self._stamps):
+            return 0
+        before, after = self._stamps[k - 1], self._stamps[k]
+        near = min(stamp - before, after - stamp) <= COAST * SECOND
+        return 0 if near else after - before
+
     def pose_at(self, stamp: int) -> Array | None:
         """Raw odometry pose (3,) at the stamp, None outside of what is known."""
         if not self.covers(stamp):
@@ -502,7 +520,9 @@ class MotionBuffer:
         """
         if end <= start:
             return STILL
-        odometry = _around(self._stamps, start, end, int(self._noise.noise_interval * SECOND))
+        long = end - start > self._noise.max_gap * SECOND
+        before = USUAL if long else self._noise.noise_interval
+        odometry = _around(self._stamps, start, end, int(before * SECOND))
         imu = _around(self._imu_stamps, start, end)
         out, known, bias, variance, turned, drove = _drive(
             start, end,

@@ -556,3 +556,32 @@ def test_old_samples_are_forgotten():
     m = buffer.motion(T0 + 18 * SECOND, T0 + 20 * SECOND)
     assert m.known
     np.testing.assert_allclose(m.delta, [2.0, 0.0, 0.0], atol=1e-9)
+
+
+# --- eq. 61 ------------------------------------------------------------------------------------
+
+
+def test_covariance_of_a_gap_is_that_of_ways_that_nobody_saw():
+    """Robots that turn now and then; odometry's error of the turn leads them aside (eq. 61)."""
+    rng, gap, dt = np.random.default_rng(3), 20.0, NOISE.noise_interval
+    n, distances = round(gap / dt), []
+    for _ in range(150):
+        v = np.full(n, 0.5)
+        w = np.repeat(rng.uniform(-0.8, 0.8, n // 20), 20)
+        errors = rng.normal(size=(2, n))
+        v_odom = v + (NOISE.speed_noise * v + NOISE.speed_noise_floor) * errors[0]
+        w_odom = w + (NOISE.turn_noise * np.abs(w) + NOISE.turn_noise_floor) * errors[1]
+        true, measured = (
+            chained(a, b, np.full(n, dt), np.zeros(n))[0] for a, b in ((v, w), (v_odom, w_odom))
+        )
+        before = line(0.5, 0.4)
+        buffer = filled(before, duration=2.0)
+        end = T0 + round((2.0 + gap) * SECOND)
+        buffer.add_odometry(Odometry(end, se2.compose(before(2.0), measured)))
+        m = buffer.motion(T0 + 2 * SECOND, end)
+        error, cov = se2.between(m.delta, true), m.cov[:2, :2]
+        place = error[:2] @ np.linalg.solve(cov, error[:2])
+        distances.append([place, error[2] ** 2 / m.cov[2, 2]])
+    place, heading = np.mean(distances, axis=0)
+    assert 0.3 < place < 3.0  # 2 is consistent, more is too sure
+    assert 0.2 < heading < 1.5

@@ -555,3 +555,19 @@ def test_scan_that_is_sent_again_while_the_robot_drives_is_left_out():
     for o in out[1:6]:
         way = se2.compose(way, o.motion.delta)
     np.testing.assert_allclose(way, moved, atol=1e-6)
+
+
+def test_scan_between_a_gap_of_all_messages_and_the_first_odometry_is_left_out():
+    """Where it was is not known; where the next one is, the odometry says across the gap."""
+    synchronizer, t = running()
+    assert len(feed(synchronizer, [scan(t)])) == 1
+    back = t + 30 * SECOND
+    early, later = scan(back - 500 * MS), scan(back + 100 * MS)
+    after = [odometry(back + k * 20 * MS) for k in range(20)]
+    out = feed(synchronizer, [early, *after[:8], later, *after[8:]])
+    assert [o.stamp for o in out] == [later.stamp]
+    assert synchronizer.inputs.totals()['scan']['in_gap'] == 1
+    assert out[0].motion.known
+    np.testing.assert_allclose(
+        out[0].motion.delta[:2], se2.between(pose_at(t), pose_at(later.stamp))[:2], atol=0.01
+    )

@@ -116,3 +116,18 @@ def test_flush_takes_everything():
     assert [w.stamp for w in waiting.pop(None, flush=True)] == [T]
     assert [w.stamp for w in waiting.pop(None, flush=True)] == [T + 100 * MS]
     assert waiting.pop(None, flush=True) == []
+
+
+def test_first_scan_after_a_gap_of_all_messages_waits_until_odometry_is_missing():
+    waiting, stamps = queue(T, odom_timeout=0.2)
+    waiting.add('scan', scan(T), 0)
+    assert len(waiting.pop(T)) == 1
+    after = T + 30 * SECOND
+    stamps.accept('scan', after + 900 * MS, None)
+    waiting.add('scan', scan(after), 0)
+    assert waiting.pop(T) == []
+    stamps.accept('scan', after + 1001 * MS, None)
+    assert len(waiting.pop(T)) == 1
+    # the odometry alone is missing: the next ones do not wait
+    waiting.add('scan', scan(after + 500 * MS), 0)
+    assert len(waiting.pop(T)) == 1

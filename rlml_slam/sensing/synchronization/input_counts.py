@@ -12,8 +12,8 @@ class InputCounts:
     """Inputs by stream: used, late, duplicate, future, invalid, waited_out.
 
     Of the used ones, ``no_returns`` are scans without a valid beam, and ``robot_parts`` those of
-    which beams were left out that see the robot itself. ``repeated`` ones are old scans of a robot
-    that has moved since; they are not used.
+    which beams were left out that see the robot itself. Not used are ``repeated`` ones, old
+    scans of a robot that has moved since, and those ``in_gap``, after a gap and before odometry.
     """
 
     counts: dict[str, Counter[str]] = field(default_factory=dict)

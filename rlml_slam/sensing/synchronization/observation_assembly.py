@@ -121,6 +121,15 @@ class ObservationAssembly:
         since = self._motion(newest, stamp)
         return se2.compose(self._transforms.last, since.delta) if since.known else None
 
+    def is_in_gap(self, stamp: int) -> bool:
+        """Whether all messages were missing until a stamp, and odometry comes only after it.
+
+        The motion until then is unknown. That until the odometry is not, so it has to be whole.
+        """
+        gap = self.buffer.gap_at(stamp)
+        since = min(gap, 0 if self.last is None else stamp - self.last)
+        return since > self._p.motion.max_gap * SECOND
+
     def carry(self, now: int) -> None:
         """Sum up the motion of a long time without observations before the buffer drops it."""
         if self.last is None or now - self.last < 2 * MAX_LATE:

@@ -197,6 +197,9 @@ class Synchronizer:
             out += self._add[stream](message)
         while group := self._queue.pop(self.odometry.newest(self.buffer.newest), flush):
             stamp = group[0].stamp
+            if self._assembly.is_in_gap(stamp):
+                self.inputs.count(group[0].stream, 'in_gap')
+                continue
             if self._assembly.last is not None:
                 stamp = max(stamp, self._assembly.last + 1)  # two lidars at the same instant
             clock = self._clock_of(group[0].item)

@@ -2,8 +2,8 @@
 """Scans and detections that wait: for odometry, for each other, and for other lidars.
 
 Nothing waits longer than ``odom_timeout``, measured by stamps, never by a clock: a replay
-decides in the same way. Without a lidar, a guess of the motion would decide what detections are
-of, so they wait for odometry until it counts as missing (``input_timeout``).
+decides in the same way. Without a lidar, and after a gap in all messages, a guess of the motion
+would decide what is seen, so odometry is awaited until it counts as missing (``input_timeout``).
 """
 
 from __future__ import annotations
@@ -44,6 +44,8 @@ class WaitingQueue:
         self._inputs = inputs
         self._timeout = int(params.node.odom_timeout * SECOND)
         self._longest_pause = int(params.health.input_timeout * SECOND)
+        self._max_gap = int(params.motion.max_gap * SECOND)
+        self._released = -(2**62)  # stamp of the last group
         self._items: list[Waiting] = []
         self._lidars: dict[str, tuple[int, int]] = {}  # by frame: newest stamp and period
         # stamp of the last observation that had, or should have had, scan and detections
@@ -93,6 +95,7 @@ class WaitingQueue:
         if not flush and not self._is_ready(stamp, group, newest_odometry):
             return []
         self._items = [w for w in self._items if not any(w is g for g in group)]
+        self._released = stamp
         return group
 
     def _is_ready(self, stamp: int, group: list[Waiting], newest_odometry: int | None) -> bool:
@@ -108,10 +111,17 @@ class WaitingQueue:
         return len(group) > 1 or not self._waits_for_pair(stamp, group[0].stream, waited)
 
     def _is_in_pause(self, group: list[Waiting], newest: int | None) -> bool:
-        """Whether odometry pauses, but is not missing yet, where there is no lidar."""
-        if newest is None or self._lidars or any(w.stream == 'scan' for w in group):
+        """Whether odometry pauses, but is not missing yet: without a lidar, or after a gap."""
+        if newest is None or not self._node.use_odom:
             return False
-        return self._node.use_odom and self._stamps.newest - newest <= self._longest_pause
+        begin = max(newest, self._released)
+        if group[0].stamp - begin > self._max_gap:
+            begin = group[0].stamp
+        elif self._lidars or any(w.stream == 'scan' for w in group):
+            return False
+        else:
+            begin = newest
+        return self._stamps.newest - begin <= self._longest_pause
 
     def _waits_for_odometry(self, end: int, newest: int | None) -> bool:
         """Whether odometry at ``end`` is still expected; none is, if none came in a second."""

@@ -100,7 +100,8 @@ class FrontEnd:
         self, observation: Observation, sweep: Sweep, matches: Matches
     ) -> ScanEvidence:
         """Update with the match in the submap, then in the grid of the saved map, if any."""
-        scan = self._scans.update(observation, sweep, matches.agree_with_map)
+        maps = self._map.saved is None
+        scan = self._scans.update(observation, sweep, matches.agree_with_map, maps)
         self._map.update(self.state, observation, sweep)
         return scan
 
@@ -216,10 +217,7 @@ class FrontEnd:
         self._jumped = True
 
     def correct(self, T_map_local: Array, reference: ReferencePose | None = None) -> None:
-        """Apply the newest correction of the local frame by the back end.
-
-        Without a ``reference``, that of the last correction stays in use.
-        """
+        """Apply the newest correction by the back end; without a ``reference``, the last stays."""
         reference = self._correction.reference if reference is None else reference
         self._correction = Correction(np.array(T_map_local, dtype=np.float64), reference)
 

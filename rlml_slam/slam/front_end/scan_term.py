@@ -25,7 +25,13 @@ from rlml_slam.slam.front_end.motion_hypotheses import Hypothesis
 from rlml_slam.slam.front_end.motion_term import MotionTerm
 from rlml_slam.slam.front_end.scan_update import fuse, prior_of, relative
 from rlml_slam.slam.front_end.submaps import Submaps
-from rlml_slam.slam.relocalization.local_recovery import AS_USUAL, TURN, recover_locally
+from rlml_slam.slam.relocalization.local_recovery import (
+    AS_USUAL,
+    TURN,
+    match_after_gap,
+    may_have_left,
+    recover_locally,
+)
 from rlml_slam.types import Observation
 
 FAR = 3.0  # [sigma] half width of a search without odometry
@@ -131,17 +137,26 @@ class ScanTerm:
         return float(np.mean(fits)) if fits else None
 
     def update(
-        self, observation: Observation, sweep: Sweep, reflectors_agree: bool
+        self, observation: Observation, sweep: Sweep, reflectors_agree: bool, maps: bool
     ) -> ScanEvidence:
-        """Match the scan with the submap and update the state (e_s of eq. 2)."""
+        """Match the scan with the submap and update the state (e_s of eq. 2).
+
+        Where a robot that ``maps`` drove on and saw nothing, a scan has to fit at one place only;
+        else submaps start there, with the covariance of the motion.
+        """
         p, submap = self._p.scan_match, self.submaps.target
         if observation.points is None:
             return ScanEvidence(has_scan=False)
         if submap is None or len(observation.points) < p.min_points:
             return ScanEvidence(has_scan=submap is None)
         points = voxel_filter.thin(observation.points, p.voxel_size, p.max_points)
-        prior, strength = self._prior(sweep)
-        found = self._match(submap, points, prior, strength)
+        (prior, strength), only = self._prior(sweep), None
+        if maps and not reflectors_agree and may_have_left(observation.motion):
+            only = match_after_gap(submap, points, prior, strength, self.kidnapping.usual, self._p)
+            if only is None:
+                self.submaps.start_again()
+                return ScanEvidence(has_scan=False)
+        found = only or self._match(submap, points, prior, strength)
         misfit = self._contradicts(submap, points, found)
         lost = self.kidnapping.has_lasted(observation.stamp, self._p.health.lost_time)
         if misfit and not reflectors_agree and not lost:

@@ -8,10 +8,12 @@ fits as usual, and nowhere else as far as that, is a scan of this submap and odo
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
+from rlml_slam.estimation.health import eigenvalues_2x2
 from rlml_slam.matching.scans.branch_and_bound import Criteria, Window, wide
 from rlml_slam.matching.scans.scan_match import ScanMatchResult, match
 from rlml_slam.matching.scans.search_pyramid import Pyramid
@@ -19,7 +21,10 @@ from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.relocalization.scan_relocalization import MAX_SECOND, SPREAD
+from rlml_slam.types import Motion
 
+FAR = 3.0  # [sigma] of the prior, that a search covers
+UNSEEN = 0.2  # [m] 1 sigma of a motion of which no scan shows the way
 REACH = 1.0  # [m] half width of the search: about a second of driving
 TURN = 1.0  # [rad] and of turning
 # Share of the usual score. Of scans in their place, one in fifty of a real log has less; in a
@@ -28,17 +33,43 @@ AS_USUAL = 0.9
 NEAR = np.diag(1.0 / SPREAD**2)  # a weak prior at the place found: odometry is no evidence here
 
 
+def may_have_left(motion: Motion) -> bool:
+    """Whether the robot drove so far in one motion, as in a gap, that it may be in a new place."""
+    return motion.known and eigenvalues_2x2(motion.cov[:2, :2])[1] > UNSEEN**2
+
+
+def match_after_gap(
+    submap: Submap, points: Array, prior: Array, strength: Array, usual: float, p: Parameters
+) -> ScanMatchResult | None:
+    """The only place within FAR sigmas of a ``prior`` (3,) with information ``strength`` (3, 3).
+
+    None if there is none, or if the submap shows too little to say that it is the only one.
+    """
+    cov: Array = np.asarray(np.linalg.inv(strength), dtype=np.float64)
+    reach = FAR * math.sqrt(eigenvalues_2x2(cov[:2, :2])[1])
+    if reach > p.submap.max_laser_range:
+        return None
+    turn = min(FAR * math.sqrt(cov[2, 2]), math.pi)
+    return recover_locally(submap, points, prior, usual, p, turn, max(reach, REACH))
+
+
 def recover_locally(
-    submap: Submap, points: Array, guess: Array, usual: float, p: Parameters, turn: float = TURN
+    submap: Submap,
+    points: Array,
+    guess: Array,
+    usual: float,
+    p: Parameters,
+    turn: float = TURN,
+    reach: float = REACH,
 ) -> ScanMatchResult | None:
     """The only place near ``guess`` (3,), submap frame, where a scan fits as it should.
 
     ``points`` (n, 2) are thinned end points in the base frame, ``usual`` is the score of scans
-    lately, ``turn`` [rad] how far off the heading may be. None where nothing fits, or a second
-    place about as well. The result leaves nothing of the prior: its weight is zero.
+    lately, ``turn`` [rad] and ``reach`` [m] how far off they may be. None where nothing fits, or a
+    second place about as well. The result leaves nothing of the prior: its weight is zero.
     """
     least = max(AS_USUAL * usual, p.loop_closure.min_score)
-    window = Window(guess, (REACH, REACH), turn)
+    window = Window(guess, (reach, reach), turn)
     found = wide(
         Pyramid(submap), points, window, Criteria(MAX_SECOND * least, second_share=MAX_SECOND)
     )

@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the front end makes of a time in which nothing was seen."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_worlds import OTHER_ROOM, ROOM, SECOND, TinyWorld, drive, observations
+
+from rlml_slam.motion import motion_of
+from rlml_slam.params import Parameters
+from rlml_slam.slam.front_end.front_end import FrontEnd
+from rlml_slam.types import Level, Motion
+
+
+@pytest.mark.parametrize('wheels_turned', [True, False])
+def test_robot_that_drove_on_unseen_maps_at_once_where_it_is(wheels_turned):
+    """Wheels that turned say that it left; those that stood, that it was carried."""
+    there = OTHER_ROOM.walls + np.tile([30.0, 4.0], 2)
+    world = TinyWorld(np.vstack([ROOM.walls, there]), np.zeros((0, 2)))
+    before, after = drive((0.3, 0.2, 3.0)), drive((0.2, 0.3, 2.0), start=(30.0, 4.0, 0.8))
+    seen = observations(world, np.vstack([before, after]), reflectors=False)
+    front_end, frames, noise = FrontEnd(Parameters()), [], Parameters().motion
+    for k, o in enumerate(seen):
+        if k >= len(before):
+            o = replace(o, stamp=o.stamp + 20 * SECOND)
+        if k == len(before):
+            stood = Motion(np.zeros(3), 1e-4 * np.eye(3))
+            o = replace(
+                o, motion=motion_of(o.motion.delta, 20.0, noise) if wheels_turned else stood
+            )
+        frames.append(front_end.process(o))
+    levels = [f.health.level for f in frames[len(before) :]]
+    assert (Level.LOST in levels) is not wheels_turned
+    assert [f.scan_used for f in frames[len(before) + 1 :]] == 20 * [wheels_turned]
+    if wheels_turned:
+        assert frames[-1].T_map_base == pytest.approx(after[-1], abs=0.05)
+        assert (np.sqrt(np.diag(frames[-1].cov_map))[:2] > 0.3).all()
