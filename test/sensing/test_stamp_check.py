@@ -79,6 +79,16 @@ def test_clock_that_was_set_back_is_an_error():
         stamps.wrong_after('odom', newest - 10 * SECOND, newest)
 
 
+def test_one_wrong_stamp_of_a_late_stream_is_no_clock_that_was_set_back():
+    """It arrives 2 s behind the others, and one of its messages has a stamp of long ago."""
+    stamps, newest = running(200)
+    behind = [newest - 2 * SECOND + k * STEP for k in range(2 * PERSISTENT)]
+    behind[PERSISTENT - 1] = 1
+    for stamp in behind:
+        assert stamps.wrong_after('imu', stamp, newest) is None
+        stamps.accept('imu', stamp, stamps.newest_of('imu'))
+
+
 def test_random_stamps_far_ahead_confirm_nothing_while_time_goes_on():
     stamps, newest = running()
     for k in range(4 * CONFIRM):
