@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -204,6 +206,20 @@ def test_sqlite_of_large_messages_cut_off_gives_what_came_before(tmp_path):
     assert 'malformed' in damage
     assert len(got) > 0.5 * len(whole)
     assert set(got) <= set(whole)
+
+
+@pytest.mark.parametrize('column', ['type', 'name'])
+def test_sqlite_topic_without_a_name_or_type_costs_itself_alone(tmp_path, column):
+    file = storage_file(write(tmp_path / 'bag', 'sqlite3'))
+    with closing(sqlite3.connect(file)) as base:
+        base.execute('PRAGMA writable_schema=ON')
+        base.execute("UPDATE sqlite_master SET sql = replace(sql, 'NOT NULL', '')")
+        base.commit()
+    with closing(sqlite3.connect(file)) as base:
+        base.execute(f"UPDATE topics SET {column} = NULL WHERE name = '/imu'")
+        base.commit()
+    with BagReader(file) as bag:
+        assert {t for _, t, _ in bag.messages()} == {'/odom', '/tf_static'}
 
 
 def test_scratched_sqlite_gives_what_comes_before_the_scratch(tmp_path):

@@ -6,6 +6,7 @@ Nothing here needs a ROS installation. A message that cannot be read never costs
 
 from __future__ import annotations
 
+import functools
 import os
 import shutil
 import tempfile
@@ -58,7 +59,6 @@ class BagReader:
         self.path = Path(path)
         self.skipped: Counter[str] = Counter()
         self.damage = ''
-        self._types: dict[str, Any] = {}
         self._todays: dict[str, bool] = {}
         if not self.path.exists():
             raise BagError(f'{path}: no such bag')
@@ -76,6 +76,7 @@ class BagReader:
         try:
             reader: Any = (Reader1 if self.is_ros1 else Reader2)(self.path)
             reader.open()
+            _ = reader.topics  # of a topic without a type it can be opened, but not listed
         except Exception as e:  # the library lets struct.error, KeyError and others through
             try:
                 reader = BagRecovery(self.path)
@@ -118,7 +119,7 @@ class BagReader:
         Raises BagError where the bag is damaged, after all that came before the damage.
         """
         for time, connection, raw in self._raw(topics):
-            types = self._typestore(connection)
+            types = _types_of(connection.msgdef, connection.msgtype, self.is_ros1)
             if types is None:
                 self.skipped[connection.topic] += 1
                 continue
@@ -156,7 +157,8 @@ class BagReader:
         """Whether the type in the bag has the fields of today's; a type of others is believed."""
         msgtype = connection.msgtype
         if msgtype not in self._todays:
-            types, today = self._typestore(connection), bag_types()
+            today = bag_types()
+            types = _types_of(connection.msgdef, msgtype, self.is_ros1)
             if msgtype in today.fielddefs:
                 same = types is not None and _layout(types, msgtype) == _layout(today, msgtype)
             else:
@@ -178,26 +180,23 @@ class BagReader:
         except Exception as e:
             raise BagError(f'{self.path}: damaged after {count} messages: {_line(e)}') from e
 
-    def _typestore(self, connection: Any) -> Any:
-        """Types of a connection's messages, None if they are unknown."""
-        if connection.msgtype not in self._types:
-            self._types[connection.msgtype] = self._learn(connection)
-        return self._types[connection.msgtype]
 
-    def _learn(self, connection: Any) -> Any:
-        if connection.msgdef.format == MessageDefinitionFormat.NONE:
-            standard = get_typestore(Stores.ROS1_NOETIC) if self.is_ros1 else bag_types()
-            return standard if connection.msgtype in standard.fielddefs else None
-        # a store of its own, so that one strange definition cannot clash with the others
-        types = get_typestore(Stores.EMPTY)
-        try:
-            if connection.msgdef.format == MessageDefinitionFormat.MSG:
-                types.register(get_types_from_msg(connection.msgdef.data, connection.msgtype))
-            else:
-                types.register(get_types_from_idl(connection.msgdef.data))
-        except Exception:
-            return None
-        return types
+@functools.lru_cache(maxsize=100)  # most bags have the same
+def _types_of(definition: Any, msgtype: str, is_ros1: bool) -> Any:
+    """Types of messages with a definition, None if they are unknown."""
+    if definition.format == MessageDefinitionFormat.NONE:
+        standard = get_typestore(Stores.ROS1_NOETIC) if is_ros1 else bag_types()
+        return standard if msgtype in standard.fielddefs else None
+    # a store of its own, so that one strange definition cannot clash with the others
+    types = get_typestore(Stores.EMPTY)
+    try:
+        if definition.format == MessageDefinitionFormat.MSG:
+            types.register(get_types_from_msg(definition.data, msgtype))
+        else:
+            types.register(get_types_from_idl(definition.data))
+    except Exception:
+        return None
+    return types
 
 
 def _layout(types: Any, msgtype: str) -> Any:
