@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import tempfile
 import time
+from collections import deque
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
 
 from rlml_lab.contact.good_messages import stream_of_room
 from rlml_lab.contact.mutation import mutated, random_bytes
@@ -33,35 +34,41 @@ QOS = QoSProfile(depth=1000)
 SENSOR = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 BYTES = 0.05  # share of random bytes
 TOPICS = ('scan', 'odom', 'imu', 'reflectors')
-GOOD = 'good'  # namespace of what the simulator publishes
+OWN = 2000  # messages that are remembered as the intruder's own
 BESIDE = -5_000_000, 5_000_000  # [ns] of a mutated message from the good one
 
 
 class Intruder(Node):
-    """Passes the simulator's messages on to the sensors' topics, with mutated ones in between."""
+    """Publishes mutated messages between those of the simulator, on the same topics.
+
+    What the simulator sends goes its own way: an intruder that is slow must not delay it.
+    """
 
     def __init__(self, seed: int) -> None:
         super().__init__('intruder')
         self._rng = np.random.default_rng(seed)
-        self._good = dict(stream_of_room(3.0))  # the newest, by topic
+        good = dict(stream_of_room(3.0))
+        self._kinds = {topic: type(good[topic]) for topic in TOPICS}
+        self._good = {topic: serialize_message(good[topic]) for topic in TOPICS}  # the newest
+        self._own: deque[bytes] = deque(maxlen=OWN)
         self.true: dict[int, Array] = {}
         self.poses: dict[int, Array] = {}
         self.refused: dict[str, str] = {}
         self.sent = 0
         self._out = {
-            topic: self.create_publisher(type(self._good[topic]), topic, QOS) for topic in TOPICS
+            topic: self.create_publisher(kind, topic, QOS) for topic, kind in self._kinds.items()
         }
-        for topic in TOPICS:
-            use = partial(self.pass_on, topic)
-            self.create_subscription(type(self._good[topic]), f'{GOOD}/{topic}', use, SENSOR)
+        for topic, kind in self._kinds.items():
+            use = partial(self.on_sensor, topic)
+            self.create_subscription(kind, topic, use, SENSOR, raw=True)
         self.create_subscription(PoseWithCovarianceStamped, 'pose', self.on_pose, QOS)
         self.create_subscription(Odometry, 'ground_truth', self.on_truth, QOS)
         self.create_subscription(DiagnosticArray, '/diagnostics', self.on_diagnostics, QOS)
 
-    def pass_on(self, topic: str, msg: Any) -> None:
-        """A good message, which the next mutated ones are made of."""
-        self._good[topic] = msg
-        self._out[topic].publish(msg)
+    def on_sensor(self, topic: str, data: bytes) -> None:
+        """A message of a sensor: a good one is what the next mutated ones are made of."""
+        if data not in self._own:
+            self._good[topic] = data
 
     def on_pose(self, msg: Any) -> None:
         """A pose of the front end."""
@@ -83,13 +90,15 @@ class Intruder(Node):
         """One message that nobody should send."""
         topic = str(self._rng.choice(TOPICS))
         if self._rng.random() < BYTES:
-            self._out[topic].publish(random_bytes(self._rng))
+            data = random_bytes(self._rng)
         else:
-            msg = copy.deepcopy(self._good[topic])
+            msg = deserialize_message(self._good[topic], self._kinds[topic])
             # a stamp of its own, or it would be refused as a duplicate
             stamp = decode.stamp(msg, topic) + int(self._rng.integers(*BESIDE))
             msg.header.stamp.sec, msg.header.stamp.nanosec = divmod(stamp, 1_000_000_000)
-            self._out[topic].publish(mutated(msg, self._rng))
+            data = serialize_message(mutated(msg, self._rng))
+        self._own.append(data)
+        self._out[topic].publish(data)
         self.sent += 1
 
 
@@ -104,9 +113,8 @@ def drive(messages: int, rate: float, seed: int, log: Path, seconds: float) -> I
     ):
         values = {'map_directory': maps, 'laser_pose': list(Simulator().laser_pose)}
         children.start('slam', node('slam', values))
-        remap = [word for t in TOPICS for word in ('-r', f'{t}:={GOOD}/{t}')]
-        words = node('simulator', {'repeat': 'true', 'wait_for_subscribers': 1})
-        children.start('simulator', words + remap)
+        words = node('simulator', {'repeat': 'true', 'wait_for_subscribers': 2})
+        children.start('simulator', words)
         intruder = Intruder(seed)
         executor = SingleThreadedExecutor()
         executor.add_node(intruder)
