@@ -31,7 +31,8 @@ from rlml_slam.se2 import Array, compose, inverse
 
 START = 400.0  # [s] for processes to start, and their kernels to be compiled
 QOS = QoSProfile(depth=1000)
-SENSOR = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+# shallow: where it is slow, the newest are wanted, and its own ones while they are remembered
+SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 BYTES = 0.05  # share of random bytes
 TOPICS = ('scan', 'odom', 'imu', 'reflectors')
 OWN = 2000  # messages that are remembered as the intruder's own

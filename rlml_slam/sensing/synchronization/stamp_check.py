@@ -11,7 +11,7 @@ Odometry or IMU ahead of its stream waits for the next one: if that is before it
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from rlml_slam.errors import InputError
 from rlml_slam.motion import SECOND
@@ -81,7 +81,7 @@ class StampCheck:
             self._num_passed += 1
         return False
 
-    def in_turn(self, stream: str, message: Message) -> tuple[Message, ...]:
+    def in_turn(self, stream: str, message: Any) -> tuple[Any, ...]:
         """What is to be used now that a message came: one that is early waits for the next."""
         early, stamp = self._early.pop(stream, None), message.stamp
         if early is not None and early.stamp < stamp:
