@@ -62,10 +62,12 @@ s3: env  ## install a server of S3 for tests into .venv
 	@lock=$$($(BIN)/python -c 'import sys; print("requirements/s3-python%d.%d.txt" % sys.version_info[:2])') && \
 	  $(BIN)/python -m pip --disable-pip-version-check --quiet install --no-compile -r $$lock
 
-config: env  ## write config/*.yaml from the declared parameters
+config: env  ## write config/ from the declared parameters and topics
 	@for name in default simulator deformable_slam ekf_slam reflector_detector; do \
 	  $(BIN)/python -m rlml_lab.support.config_file $$name.yaml >config/.new && \
 	  mv config/.new config/$$name.yaml; done
+	@$(BIN)/python -m rlml_lab.support.security_policy >config/.new && \
+	  mv config/.new config/security_policy.xml
 
 tf: env  ## build tf2_msgs, which the wheels lack, into .venv
 	@[ $(ROS) != wheels ] || .ci/tf2_msgs/install $(VENV)

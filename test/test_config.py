@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import pytest
 
 from rlml_lab.support.config_file import FILES, UNREAD, parameter_file
+from rlml_lab.support.security_policy import POLICY, policy
 from rlml_slam import __version__
 from rlml_slam.errors import FileFormatError, ParameterError
 from rlml_slam.params import (
@@ -33,6 +34,12 @@ KNOWN = {d.name for of in NODES for d in declarations(of)}
 @pytest.mark.parametrize('name', FILES)
 def test_parameter_files_are_what_is_declared(name):
     assert (ROOT / 'config' / name).read_text() == parameter_file(name), 'run `make config`'
+
+
+def test_policy_has_the_topics_of_the_nodes():
+    text = POLICY.read_text(encoding='utf-8')
+    assert policy(text) == text, 'run `make config`'
+    assert policy(text.replace('<topic>scan</topic>', '<topic>scanned</topic>')) == text
 
 
 @pytest.mark.parametrize('name', FILES)

@@ -16,6 +16,7 @@ from rlml_slam.params import (
     SimulatorParameters,
     declarations,
 )
+from rlml_slam.ros.sensor_input import STREAMS
 
 FILES: dict[str, tuple[type[Any], str]] = {
     'default.yaml': (Parameters, 'Every parameter of front_end, back_end, slam and `rlml replay`'),
@@ -38,8 +39,9 @@ UNREAD: dict[str, tuple[str, ...]] = {
     'reflector_detector.yaml': (
         'motion.scale_error_sigma', 'motion.scale_error_time', 'motion.drift_sigma',
         'local_frame', 'use_scan', 'use_reflectors',
-        'reflector_poses_topic', 'reflector_markers_topic', 'reflector_beams_topic',
-        'landmarks_topic', 'mode', 'map_directory', 'map_file_name', 'map_start_pose',
+        # the topics of all streams but those that it reads, and reflectors, which it publishes
+        *(row[0] for s, row in STREAMS.items() if s not in ('scan', 'odom', 'imu', 'reflectors')),
+        'mode', 'map_directory', 'map_file_name', 'map_start_pose',
         'restore_pose', 'continue_map', 'transform_publish_period', 'map_update_interval',
         'detect_reflectors', 'provide_odom_frame', 'tf_broadcast', 'transform_tolerance', 'shadow',
     ),

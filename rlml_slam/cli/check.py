@@ -60,7 +60,7 @@ def topics_of(node: Any, n: Node) -> dict[str, tuple[str, str]]:
     """Full name and type of the topic of each stream."""
     chosen = [('tf', '/tf', TF_MESSAGE), (STATIC, '/tf_static', TF_MESSAGE)]
     for stream in ('reflectors', 'imu', 'odom', 'scan'):
-        parameter, kind, _ = STREAMS[stream]
+        parameter, kind, *_ = STREAMS[stream]
         chosen.insert(0, (stream, getattr(n, parameter), kind))
     return {stream: (node.resolve_topic_name(name), kind) for stream, name, kind in chosen}
 

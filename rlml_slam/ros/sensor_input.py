@@ -21,18 +21,20 @@ from rlml_slam.types import Detections, Imu, Odometry, Scan
 
 Out = TypeVar('Out')
 # stream of the sequencer -> parameter with the topic's name, type, whether the only topic of the
-# type may stand in. Any PointCloud2 or PoseArray may be something else than reflectors.
-STREAMS: Mapping[str, tuple[str, str, bool]] = {
-    'scan': ('scan_topic', 'sensor_msgs/msg/LaserScan', True),
-    'odom': ('odom_topic', 'nav_msgs/msg/Odometry', True),
-    'imu': ('imu_topic', 'sensor_msgs/msg/Imu', True),
-    'reflectors': ('reflectors_topic', 'sensor_msgs/msg/PointCloud2', False),
-    'reflector_poses': ('reflector_poses_topic', 'geometry_msgs/msg/PoseArray', False),
+# type may stand in, bytes of a beam or reflector with whatever else a driver says of it (without,
+# only small messages are taken). Any PointCloud2 or PoseArray may be something else.
+STREAMS: Mapping[str, tuple[str, str, bool, int]] = {
+    'scan': ('scan_topic', 'sensor_msgs/msg/LaserScan', True, 8),
+    'odom': ('odom_topic', 'nav_msgs/msg/Odometry', True, 0),
+    'imu': ('imu_topic', 'sensor_msgs/msg/Imu', True, 0),
+    'reflectors': ('reflectors_topic', 'sensor_msgs/msg/PointCloud2', False, 256),
+    'reflector_poses': ('reflector_poses_topic', 'geometry_msgs/msg/PoseArray', False, 56),
     'reflector_markers': (
-        'reflector_markers_topic', 'visualization_msgs/msg/MarkerArray', False),
+        'reflector_markers_topic', 'visualization_msgs/msg/MarkerArray', False, 1024),
     'reflector_beams': (
-        'reflector_beams_topic', 'sick_safetyscanners2_interfaces/msg/ExtendedLaserScan', False),
-    'landmarks': ('landmarks_topic', 'cartographer_ros_msgs/msg/LandmarkList', False),
+        'reflector_beams_topic', 'sick_safetyscanners2_interfaces/msg/ExtendedLaserScan', False,
+        16),
+    'landmarks': ('landmarks_topic', 'cartographer_ros_msgs/msg/LandmarkList', False, 256),
 }  # fmt: skip
 # streams of reflectors
 DETECTIONS = ('reflectors', 'reflector_poses', 'reflector_markers', 'reflector_beams', 'landmarks')

@@ -48,11 +48,6 @@ PATIENCE = 5.0  # [s] of the wall clock, after which missing inputs are named in
 SILENCE = 1.0  # [s] of the wall clock without any message, after which nothing more is waited for
 MAX_SENSORS = 100  # whose frames are remembered
 REFUSED = ('',)  # in the place of what a message would have given
-# [bytes] of a beam or reflector in a message, with whatever else a driver says of it
-BYTES = {
-    'scan': 8, 'reflectors': 256, 'reflector_poses': 56, 'reflector_markers': 1024,
-    'reflector_beams': 16, 'landmarks': 256,
-}  # fmt: skip
 # the back end says with it that it runs, so that a front end notices where it does not
 LEASE = 1.0  # [s]
 ALIVE = QoSProfile(
@@ -118,7 +113,7 @@ class Sensors:
         if found is None:
             return  # of a package that is not installed
         self._topics[stream] += 1
-        qos = MOTION if stream in ('odom', 'imu', TF) else SENSOR
+        qos = SENSOR if stream in PLACED else MOTION
         listener = Listener(node, found, topic, use, qos, largest(self._p.node, stream))
         self._queues.append((stream, listener))
 
@@ -173,7 +168,7 @@ class Sensors:
         """Sensors of which there is one, and that several nodes publish."""
         out = []
         for stream, listener in self._queues:
-            if stream in ('odom', 'imu'):
+            if stream not in (*PLACED, TF):
                 found = self._node.publishers_of(listener.topic_name)
                 if len(found) > 1:
                     out.append(f'{stream} has {len(found)} publishers: {", ".join(found)}')
@@ -325,7 +320,7 @@ def largest(params: Node, stream: str) -> int:
     """Bytes that a message of a stream may have."""
     has_beams = stream in ('scan', 'reflector_beams')
     most = params.max_beams if has_beams else params.max_reflectors
-    return SMALL + most * BYTES.get(stream, 0)
+    return SMALL + most * (STREAMS[stream][3] if stream in STREAMS else 0)
 
 
 def input_figures(synchronizer: Synchronizer) -> dict[str, object]:

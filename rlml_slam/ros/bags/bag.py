@@ -229,7 +229,7 @@ def choose_topics(
     neither a scan nor a reflector stream.
     """
     chosen: dict[str, str] = {}
-    for stream, (parameter, msgtype, fallback) in STREAMS.items():
+    for stream, (parameter, msgtype, fallback, _) in STREAMS.items():
         if not getattr(node, USED_BY[stream]):
             continue
         name = topics_of(node, stream)[0].strip('/')
