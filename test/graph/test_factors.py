@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
+import dataclasses
+
 import numpy as np
 import pytest
 from differences import central_differences
 
 from rlml_slam import se2
 from rlml_slam.graph.model import factors
+from rlml_slam.graph.model.factors import FactorKind, Losses
 
 # angles near 0, near pi and on either side of the cut, and random ones
 ANGLES = [0.0, 1e-9, -1e-7, np.pi, np.pi - 1e-7, -np.pi + 1e-7, 1.3, -2.9]
@@ -102,3 +105,9 @@ def test_relative_information_is_that_of_the_residual():
     # 2 % is 6 sigma of the sampled covariance's relative error sqrt(2 / n)
     information = factors.relative_information(delta, cov)
     np.testing.assert_allclose(sampled @ information, np.eye(3), atol=0.03)
+
+
+def test_every_kind_has_its_rows_and_its_loss():
+    assert len(factors.COUNTED) == len(Losses().in_order()) == len(FactorKind)
+    names = [kind.name.lower() for kind in FactorKind]
+    assert [field.name for field in dataclasses.fields(Losses)] == names

@@ -10,6 +10,7 @@ from scipy import sparse
 from rlml_slam.errors import SolverError
 from rlml_slam.graph.batch.chordal_relaxation import relax
 from rlml_slam.graph.batch.landmark_start import place_landmarks
+from rlml_slam.graph.model.factors import NUM_RESIDUALS
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.graph.model.normal_equations import build_system
 from rlml_slam.se2 import Array, compose, inverse
@@ -30,7 +31,8 @@ def initialize(graph: Graph, method: str) -> None:
 def _roots(graph: Graph) -> NDArray[np.int64]:
     roots = np.flatnonzero(graph.fixed_poses)
     p = graph.pose_priors
-    return np.unique(np.concatenate([roots, p.nodes[p.enabled][:, 0], [0]]))
+    whole = p.enabled & (NUM_RESIDUALS[p.kinds] == 3)
+    return np.unique(np.concatenate([roots, p.nodes[whole][:, 0], [0]]))
 
 
 def spanning_tree(graph: Graph, consecutive_first: bool = False) -> None:

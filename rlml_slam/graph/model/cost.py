@@ -60,7 +60,7 @@ def _of_poses(table: Factors, losses: Array, poses: Array) -> tuple[float, int]:
         q0, q1, q2 = weighted(W, e0, e1, e2)
         squared = e0 * q0 + e1 * q1 + e2 * q2
         cost += loss(losses[kind, 0], losses[kind, 1], squared)[0]
-        num += 3
+        num += NUM_RESIDUALS[kind]
     return cost, num
 
 

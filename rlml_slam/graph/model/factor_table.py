@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rlml_slam.compiled import brief
 from rlml_slam.errors import SolverError
-from rlml_slam.graph.model.factors import NUM_RESIDUALS, FactorKind
+from rlml_slam.graph.model.factors import COUNTED, FactorKind
 from rlml_slam.graph.model.packed_system import Factors
 from rlml_slam.se2 import Array
 
@@ -65,7 +65,7 @@ class FactorTable:
     """Factors of one form: nodes (n, a), measured (n, d), information (n, d, d), kinds, enabled.
 
     A table is for the nodes that its factors join: ``node_names``, for messages ('pose',
-    'landmark'). Kinds with fewer residuals than ``dimension`` have no information on the rest.
+    'landmark'). Kinds have no information on the residuals that are not COUNTED.
     """
 
     def __init__(self, node_names: tuple[str, ...], dimension: int) -> None:
@@ -181,8 +181,8 @@ class FactorTable:
         same = np.zeros(len(nodes), dtype=np.bool_)
         if self.node_names == ('pose', 'pose'):
             same = nodes[:, 0] == nodes[:, 1]
-        # kinds with fewer residuals have no information on the rest: any will do for the test
-        unused = np.arange(self.dimension) >= NUM_RESIDUALS[codes][:, None]
+        # there is no information on residuals that do not count: any will do for the test
+        unused = ~COUNTED[codes, : self.dimension]
         filled = information + unused[:, :, None] * np.eye(self.dimension)
         regular = is_positive_definite(filled)
         bad = ~known.all(-1) | nonfinite | ~regular | same

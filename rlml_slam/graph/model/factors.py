@@ -60,8 +60,11 @@ class FactorKind(IntEnum):
     RANGE = 6
 
 
-# number of residuals that count, by FactorKind
-NUM_RESIDUALS = np.array([3, 3, 3, 2, 3, 2, 1])
+# residuals (x, y, theta) that count, by FactorKind; the others have no information
+COUNTED = np.array([
+    [1, 1, 1], [1, 1, 1], [1, 1, 1], [1, 1, 0], [1, 1, 1], [1, 1, 0], [1, 0, 0],
+], dtype=np.bool_)  # fmt: skip
+NUM_RESIDUALS = COUNTED.sum(-1)
 RANGE = int(FactorKind.RANGE)
 SQUARE = Loss()  # no robust loss: the squared norm itself
 # Below this distance [m] a range has no direction; that of the x axis stands in, so that its
@@ -74,7 +77,7 @@ LINEAR_SHARE = 1e-6
 
 @dataclass(frozen=True)
 class Losses:
-    """The loss of each kind of factor, in the order of FactorKind."""
+    """The loss of each kind of factor, by its name in lower case."""
 
     odometry: Loss = SQUARE
     scan: Loss = SQUARE
@@ -86,15 +89,12 @@ class Losses:
 
     @cached_property
     def codes(self) -> Array:
-        """(kind of loss, scale) by FactorKind (7, 2), as the kernels take them."""
+        """(kind of loss, scale) by FactorKind (k, 2), as the kernels take them."""
         return np.array([(one.kind, one.scale) for one in self.in_order()])
 
     def in_order(self) -> tuple[Loss, ...]:
         """The losses by FactorKind."""
-        return (
-            self.odometry, self.scan, self.closure,
-            self.reflector, self.pose_prior, self.landmark_prior, self.range,
-        )  # fmt: skip
+        return tuple(getattr(self, kind.name.lower()) for kind in FactorKind)
 
 
 # --- formulas: of scalars in kernels, of arrays in NumPy

@@ -315,10 +315,10 @@ def _unanchored_node(
         elif b < 0 and a >= 0:
             _anchor(anchors, known, of[a], n + sightings[f]['j'])
     for f in range(len(priors)):
-        i, a = priors[f]['i'], priors[f]['a']
-        if a >= 0 and i < n:
+        z, i, a = priors[f], priors[f]['i'], priors[f]['a']
+        if a >= 0 and i < n and z['I00'] > 0.0 and z['I11'] > 0.0 and z['I22'] > 0.0:
             anchors[of[a]] = 2
-        elif a >= 0:
+        elif a >= 0 and i >= n:
             _anchor(anchors, known, of[a], i)
     for a in range(num):
         if anchors[of[a]] < (2 if has_pose[of[a]] else 1):
