@@ -332,28 +332,6 @@ def test_one_stamp_ahead_costs_no_observation(ahead, stream):
         assert max(o.stamp for o in out) < late
 
 
-@pytest.mark.parametrize('ahead', [0.15, 0.5, 0.95])
-@pytest.mark.parametrize('stream', ['odom', 'imu'])
-def test_stamp_a_little_ahead_makes_no_other_late(ahead, stream):
-    """One of the next second: others of the stream, which are before it, are used."""
-    inputs, at = drive_inputs(imu=True), 200
-    late = inputs[at].stamp + int(ahead * SECOND)
-    bad = {'odom': odometry(T0), 'imu': Imu(T0, 0.5)}[stream]
-    synchronizer, clean = Synchronizer(Parameters()), Synchronizer(Parameters())
-    out = feed(synchronizer, [*inputs[:at], replace(bad, stamp=late), *inputs[at:]])
-    for a, b in zip(out, feed(clean, inputs), strict=True):
-        np.testing.assert_array_equal(a.motion.delta, b.motion.delta)
-    used = clean.inputs.counts[stream]['used']
-    assert synchronizer.inputs.counts[stream] == {'used': used, 'future': 1}
-
-
-def test_odometry_that_waits_for_the_next_is_used_at_the_end():
-    synchronizer, t = running()
-    assert feed(synchronizer, [scan(t + 300 * MS), odometry(t + 500 * MS)]) == []
-    (o,) = synchronizer.flush()
-    assert (o.stamp, o.motion.known) == (t + 300 * MS, True)
-
-
 def test_first_stamp_of_another_clock_is_found_out():
     """A message stamped by the wall clock before simulated time."""
     synchronizer = Synchronizer(Parameters())

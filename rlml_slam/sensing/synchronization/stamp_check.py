@@ -5,13 +5,12 @@ A message whose stamp is far ahead of all others is held back: if it were believ
 messages would be late. It is rejected if the other streams go on as before, and accepted if more
 messages follow it: then time really jumped ahead. Messages that are far behind are late if they
 are few; if all messages in a row are behind, the newest stamp was wrong or the clock was set back.
-Odometry or IMU ahead of its stream waits for the next one: if that is before it, it was wrong.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from rlml_slam.errors import InputError
 from rlml_slam.motion import SECOND
@@ -21,7 +20,7 @@ from rlml_slam.types import Detections, Imu, Odometry, Scan
 Message: TypeAlias = Odometry | Imu | Scan | Detections
 
 MAX_AHEAD = SECOND  # [ns] a stamp farther ahead of all others is suspicious; sensors lag by less
-EARLY = SECOND // 10  # [ns] a sample farther ahead of its stream waits for the next one
+BACK = SECOND // 10  # [ns] a message farther behind its stream is not of a stream that is late
 CONFIRM = 3  # messages that confirm, or refute, a suspicious stamp
 PERSISTENT = 10  # messages in a row that are behind: fewer are late, more are of a new clock
 
@@ -43,8 +42,6 @@ class StampCheck:
         self._num_behind = 0  # messages in a row that are far behind
         self._num_back = 0  # of these, the last ones in a row that are behind their stream
         self._held: list[tuple[str, Message]] = []  # messages that are far ahead
-        self._early: dict[str, Message] = {}  # by stream
-        self._released: Message | None = None
         self._held_after = self.newest  # when the last one was held
         self._num_passed = 0  # messages since the newest of these that were not
 
@@ -60,7 +57,7 @@ class StampCheck:
     @property
     def has_held(self) -> bool:
         """Whether messages are held back."""
-        return bool(self._held or self._early)
+        return bool(self._held)
 
     def holds(self, stream: str, message: Message) -> bool:
         """Hold a message back if its stamp is too far ahead; whether it is."""
@@ -81,37 +78,21 @@ class StampCheck:
             self._num_passed += 1
         return False
 
-    def in_turn(self, stream: str, message: Any) -> tuple[Any, ...]:
-        """What is to be used now that a message came: one that is early waits for the next."""
-        early, stamp = self._early.pop(stream, None), message.stamp
-        if early is not None and early.stamp < stamp:
-            return early, message
-        if early is not None:
-            self._count_future(stream, early.stamp)
-        ahead = stamp - self._newest_of.get(stream, stamp)
-        if message is self._released or ahead <= EARLY + 3 * self._step.get(stream, 0):
-            return (message,)
-        self._early[stream] = message
-        return ()
-
     def release_held(self, least: int) -> Iterator[tuple[str, Message]]:
         """Held messages to accept now, once ``least`` of them or the other streams decide.
 
         If the other streams went on, those are accepted that these have caught up with, each one
         after the one before was added; the rest is rejected.
         """
-        early, self._early = (self._early, {}) if least == 1 else ({}, self._early)
-        for stream, self._released in early.items():
-            yield stream, self._released
         others_went_on = self._num_passed >= CONFIRM
         if not self._held or (len(self._held) < least and not others_went_on):
             return
         held, self._held, self._num_passed = self._held, [], 0
         if not others_went_on:
             self.newest = max(self.newest, held[0][1].stamp)
-        for stream, self._released in held:
-            if not others_went_on or self._is_reached(stream, self._released):
-                yield stream, self._released
+        for stream, message in held:
+            if not others_went_on or self._is_reached(stream, message):
+                yield stream, message
 
     def _is_reached(self, stream: str, message: Message) -> bool:
         if message.stamp - self.newest <= MAX_AHEAD:
@@ -157,7 +138,7 @@ class StampCheck:
             self._num_behind = 0
             return None
         self._num_behind += 1
-        went_back = self._newest_of.get(stream, stamp) - stamp > EARLY
+        went_back = self._newest_of.get(stream, stamp) - stamp > BACK
         self._num_back = self._num_back + 1 if went_back else 0
         if self._num_behind < PERSISTENT:
             return None

@@ -81,45 +81,37 @@ class Synchronizer:
         return self._add_pose(TF, sample)
 
     def _add_pose(self, source: str, sample: Odometry) -> list[Observation]:
-        if np.shape(sample.pose) != (3,) or not all(map(math.isfinite, sample.pose)):
-            self._accept(source, sample.stamp, False, 'pose is not finite')
-        elif not self._stamps.holds(source, sample):
-            for one in self._stamps.in_turn(source, sample):
-                self._use_pose(source, one)
-        return self._release()
-
-    def _use_pose(self, source: str, sample: Odometry) -> None:
+        if self._stamps.holds(source, sample):
+            return self._release()
         stamp = self._jitter.filtered(source, sample.stamp)
         # others compute with the stamps that are on /tf: only the motion has the filtered one
         if source == TOPIC and stamp != sample.stamp:
             sample = Odometry(stamp, sample.pose)
-        if not self._accept(source, sample.stamp):
-            return
+        valid = np.shape(sample.pose) == (3,) and all(map(math.isfinite, sample.pose))
+        if not self._accept(source, sample.stamp, valid, 'pose is not finite'):
+            return self._release()
         used = self.odometry.use(source, sample)
         if used is None or not self._node.use_odom:
             self.inputs.count(TOPIC, 'compared')
-            return
+            return self._release()
         self.buffer.add_odometry(used if stamp == used.stamp else Odometry(stamp, used.pose))
         if not len(self._queue):
             self._assembly.carry(stamp)
         self.inputs.count(TOPIC, 'used')
+        return self._release()
 
     def add_imu(self, sample: Imu) -> list[Observation]:
         """Add one sample of the IMU."""
         if not self._node.use_imu:
             return []
-        if not math.isfinite(sample.yaw_rate):
-            self._accept('imu', sample.stamp, False, 'yaw rate is not finite')
-        elif not self._stamps.holds('imu', sample):
-            for one in self._stamps.in_turn('imu', sample):
-                self._use_rate(one)
-        return self._release()
-
-    def _use_rate(self, sample: Imu) -> None:
-        sample = Imu(self._jitter.filtered('imu', sample.stamp), sample.yaw_rate)
-        if self._accept('imu', sample.stamp):
+        if self._stamps.holds('imu', sample):
+            return self._release()
+        stamp = self._jitter.filtered('imu', sample.stamp)
+        sample = sample if stamp == sample.stamp else Imu(stamp, sample.yaw_rate)
+        if self._accept('imu', stamp, math.isfinite(sample.yaw_rate), 'yaw rate is not finite'):
             self.buffer.add_imu(sample)
             self.inputs.count('imu', 'used')
+        return self._release()
 
     def add_scan(self, scan: Scan) -> list[Observation]:
         """Add one sweep; without ``use_scan`` only its stamp is used."""

@@ -141,8 +141,8 @@ class ScanTerm:
     ) -> ScanEvidence:
         """Match the scan with the submap and update the state (e_s of eq. 2).
 
-        Where a robot that ``maps`` drove on and saw nothing, a scan has to fit at one place only;
-        else submaps start there, with the covariance of the motion.
+        Where a robot that ``maps`` drove on and saw nothing, a scan has to fit as usual, where
+        odometry led or at one place only; else submaps start there, with the motion's covariance.
         """
         p, submap = self._p.scan_match, self.submaps.target
         if observation.points is None:
@@ -150,18 +150,19 @@ class ScanTerm:
         if submap is None or len(observation.points) < p.min_points:
             return ScanEvidence(has_scan=submap is None)
         points = voxel_filter.thin(observation.points, p.voxel_size, p.max_points)
-        (prior, strength), only = self._prior(sweep), None
-        if maps and not reflectors_agree and may_have_left(observation.motion):
-            only = match_after_gap(submap, points, prior, strength, self.kidnapping.usual, self._p)
+        prior, strength = self._prior(sweep)
+        found, usual = self._match(submap, points, prior, strength), self.kidnapping.usual
+        as_expected = found.score >= AS_USUAL * usual and found.prior_weight >= 0.5
+        if maps and not (as_expected or reflectors_agree) and may_have_left(observation.motion):
+            only = match_after_gap(submap, points, prior, strength, usual, self._p)
             if only is None:
                 self.submaps.start_again()
                 return ScanEvidence(has_scan=False)
-        found = only or self._match(submap, points, prior, strength)
+            found = only
         misfit = self._contradicts(submap, points, found)
         lost = self.kidnapping.has_lasted(observation.stamp, self._p.health.lost_time)
         if misfit and not reflectors_agree and not lost:
             turn = TURN if self._motion.has_odometry else math.pi
-            usual = self.kidnapping.usual
             found = recover_locally(submap, points, prior, usual, self._p, turn) or found
             misfit = self._contradicts(submap, points, found)
         if found.score < p.min_score or (misfit and not reflectors_agree):

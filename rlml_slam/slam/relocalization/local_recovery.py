@@ -27,6 +27,7 @@ FAR = 3.0  # [sigma] of the prior, that a search covers
 UNSEEN = 0.2  # [m] 1 sigma of a motion of which no scan shows the way
 REACH = 1.0  # [m] half width of the search: about a second of driving
 TURN = 1.0  # [rad] and of turning
+LOOKUPS = 50_000_000  # of a search, which takes 50 ms then; 2 million are usual
 # Share of the usual score. Of scans in their place, one in fifty of a real log has less; in a
 # wrong place of the same room, with some of its walls where others are, three quarters are common.
 AS_USUAL = 0.9
@@ -70,10 +71,9 @@ def recover_locally(
     """
     least = max(AS_USUAL * usual, p.loop_closure.min_score)
     window = Window(guess, (reach, reach), turn)
-    found = wide(
-        Pyramid(submap), points, window, Criteria(MAX_SECOND * least, second_share=MAX_SECOND)
-    )
-    if found.best is None or found.second is not None:
+    criteria = Criteria(MAX_SECOND * least, second_share=MAX_SECOND, budget=LOOKUPS)
+    found = wide(Pyramid(submap), points, window, criteria)
+    if found.best is None or found.second is not None or not found.complete:
         return None
     result = match(submap, points, found.best.pose, NEAR, p.scan_match, searched=False)
     return replace(result, prior_weight=0.0) if result.score >= least else None
