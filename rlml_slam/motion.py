@@ -30,7 +30,7 @@ Stamps = NDArray[np.int64]
 BATCH = 256
 # of the speed at which floor and slope of the noise are equal: no robot drives slower for long
 CREEP = 0.25
-USUAL = 30.0  # [s] whose mean speed is that at which a robot goes on in a gap
+ZERO = 0.05  # [m], [rad] from the pose at which odometry begins
 COAST = 0.2  # [s] for which a robot is taken to go on as it went before its odometry ended
 # Share of the noise of a slow motion that is left where the wheels do not turn: what they miss is
 # less than a tick in all, and adds up to no walk. A larger one lets the noise of the first scan
@@ -245,8 +245,7 @@ def _drive(
                 # when inside a long interval the motion happened is uncertain; what is left of it
                 # at the end is less than what was driven: at least as fast as before, and no arc
                 long_interval_noise = n.long_interval_noise
-                over = USUAL if gap > n.max_gap else n.noise_interval
-                before = _speed_before(at - 1, stamps, twists, n.noise_interval, over)
+                before = _speed_before(at - 1, stamps, twists, n.noise_interval)
                 fast, quick = max(fast, before[0]), max(quick, before[1])
                 # a constant twist leads along an arc, which is longer than its chord
                 half = 0.5 * turn * (cuts[k + 1] - cuts[k]) / SECOND
@@ -314,15 +313,13 @@ def _share_moved(speed: float, turn: float, n: _Noise) -> float:
 
 
 @part
-def _speed_before(
-    at: int, stamps: Stamps, twists: Array, interval: float, over: float
-) -> tuple[float, float]:
-    """Mean speed and turn rate ``over`` a time [s] until sample ``at``, without a jump in it.
+def _speed_before(at: int, stamps: Stamps, twists: Array, interval: float) -> tuple[float, float]:
+    """Speed and turn rate in the control interval until sample ``at``, without a jump in it.
 
-    Stamps of one burst are too close to divide by: at least a control ``interval`` [s] counts.
+    Stamps of one burst are too close to divide by.
     """
     far = turned = lasted = 0.0
-    while at > 0 and lasted < over and not math.isnan(twists[at, 0]):
+    while at > 0 and lasted < interval and not math.isnan(twists[at, 0]):
         dt = (stamps[at] - stamps[at - 1]) / SECOND
         far, turned = far + abs(twists[at, 0]) * dt, turned + abs(twists[at, 2]) * dt
         lasted += dt
@@ -416,6 +413,8 @@ class MotionBuffer:
                 if self._step(parked.stamp, parked.pose, sample) is None:
                     return
                 step = np.full(3, np.nan)
+            elif self._has_restarted(sample):
+                step = np.full(3, np.nan)
             self._twists.append(step)
         self._parked = None
         self._stamps.append(sample.stamp)
@@ -429,6 +428,11 @@ class MotionBuffer:
         if not is_possible(step, dt, self._noise):
             return None
         return step / dt
+
+    def _has_restarted(self, sample: Odometry) -> bool:
+        """Whether odometry is at zero after a long gap and was not before it: it began again."""
+        long = sample.stamp - self._stamps[-1] > self._noise.max_gap * SECOND
+        return long and _is_zero(sample.pose) and not _is_zero(self._poses[-1])
 
     def add_imu(self, sample: Imu) -> None:
         """Append a sample, unless it is no later than the newest one."""
@@ -520,9 +524,7 @@ class MotionBuffer:
         """
         if end <= start:
             return STILL
-        long = end - start > self._noise.max_gap * SECOND
-        before = USUAL if long else self._noise.noise_interval
-        odometry = _around(self._stamps, start, end, int(before * SECOND))
+        odometry = _around(self._stamps, start, end, int(self._noise.noise_interval * SECOND))
         imu = _around(self._imu_stamps, start, end)
         out, known, bias, variance, turned, drove = _drive(
             start, end,
@@ -536,6 +538,10 @@ class MotionBuffer:
         return Motion(
             out[0], out[1:4], known, out[4], bias, variance, out[5], turned, out[6], drove
         )
+
+
+def _is_zero(pose: Array) -> bool:
+    return bool((np.abs(pose) < ZERO).all())
 
 
 def warm_up() -> None:

@@ -359,6 +359,16 @@ def with_gap(gap):
     return buffer
 
 
+@pytest.mark.parametrize(('gap', 'known'), [(20.0, False), (1.0, True)])
+def test_odometry_that_is_at_zero_after_a_long_gap_began_again(gap, known):
+    """The driver was started again; in a short time, no robot is back at zero by chance."""
+    buffer = filled(line(0.5, 0.1), duration=4.0)
+    end = T0 + round((4.0 + gap) * SECOND)
+    for k in range(5):
+        buffer.add_odometry(Odometry(end + k * 20 * MS, line(0.5)(k / 50)))
+    assert buffer.motion(T0 + 3 * SECOND, end).known is known
+
+
 def test_short_gap_is_interpolated_with_a_guess_of_when():
     m = with_gap(1.0).motion(T0 + SECOND, T0 + round(3.5 * SECOND))
     assert m.known

@@ -89,6 +89,25 @@ def test_one_wrong_stamp_of_a_late_stream_is_no_clock_that_was_set_back():
         stamps.accept('imu', stamp, stamps.newest_of('imu'))
 
 
+def test_clock_that_was_set_back_is_an_error_beside_a_stream_that_is_always_late():
+    """Detections that are refused as late have no accepted stamp to be compared with."""
+    stamps, newest = running(200)
+    first = [('reflectors', newest - SECOND), ('odom', newest)]
+    later = [
+        (stream, newest - 10 * SECOND + k * STEP - late)
+        for k in range(PERSISTENT)
+        for stream, late in (('odom', 0), ('reflectors', SECOND))
+    ]
+
+    def play(messages):
+        for stream, stamp in messages:
+            stamps.wrong_after(stream, stamp, newest)
+
+    play(first)
+    with pytest.raises(InputError, match='jumped back'):
+        play(later)
+
+
 def test_random_stamps_far_ahead_confirm_nothing_while_time_goes_on():
     stamps, newest = running()
     for k in range(4 * CONFIRM):

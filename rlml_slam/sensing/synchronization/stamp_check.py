@@ -40,6 +40,7 @@ class StampCheck:
         self._newest_of_source: dict[tuple[str, str], int] = {}
         self._step: dict[str, int] = {}  # by stream: between its last two stamps
         self._num_behind = 0  # messages in a row that are far behind
+        self._seen: dict[str, int] = {}  # by stream: the newest stamp, of late messages too
         self._num_back = 0  # of these, the last ones in a row that are behind their stream
         self._held: list[tuple[str, Message]] = []  # messages that are far ahead
         self._held_after = self.newest  # when the last one was held
@@ -134,11 +135,13 @@ class StampCheck:
         clock was set back. A stream that goes on, but behind the others, is merely late.
         """
         behind = self.newest - stamp
+        seen = max(self._newest_of.get(stream, stamp), self._seen.get(stream, stamp))
+        self._seen[stream] = max(seen, stamp)
         if self.first is None or behind <= MAX_AHEAD:
             self._num_behind = 0
             return None
         self._num_behind += 1
-        went_back = self._newest_of.get(stream, stamp) - stamp > BACK
+        went_back = seen - stamp > BACK
         self._num_back = self._num_back + 1 if went_back else 0
         if self._num_behind < PERSISTENT:
             return None
@@ -155,4 +158,5 @@ class StampCheck:
             error = f'{stream} at {self._newest_of.pop(stream)} ns is far ahead of all other '
             self._inputs.count(stream, 'future', error + 'stamps: rejected')
         self._newest_of_source = {k: s for k, s in self._newest_of_source.items() if s <= stamp}
+        self._seen = {k: s for k, s in self._seen.items() if s <= stamp}
         self.newest = max(self._newest_of.values(), default=stamp)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scans and detections that wait: for odometry, for each other, and for other lidars.
 
-Nothing waits longer than ``odom_timeout``, measured by stamps, never by a clock: a replay
-decides in the same way. Without a lidar, and after a gap in all messages, a guess of the motion
-would decide what is seen, so odometry is awaited until it counts as missing (``input_timeout``).
+Nothing waits longer than ``odom_timeout``, but for odometry in two cases, measured by stamps,
+never by a clock: a replay decides in the same way. Without a lidar, and after a gap in all
+messages, a guess of the motion would decide what is seen, so odometry is awaited until it counts
+as missing (``input_timeout``).
 """
 
 from __future__ import annotations

@@ -38,7 +38,8 @@ WHOLE = 0.9  # share of a sweep from which on the next stamp counts as its end, 
 class MotionTerm:
     """Moves the joint state from one observation to the next; has the newest velocity.
 
-    ``stamp`` [ns] is that of the newest observation, None before the first. ``has_odometry``: at
+    ``stamp`` [ns] is that of the newest observation, None before the first, and ``interval`` [s]
+    the time between it and the one before. ``has_odometry``: at
     least one observation had odometry. ``is_constant_velocity``: the last prediction was made
     by the constant-velocity model. ``velocity`` (3,) [m/s, m/s, rad/s] is that of the base.
     """
@@ -51,6 +52,7 @@ class MotionTerm:
         self._predicted: tuple[Array, Array] | None = None  # pose in the submap, covariance
         self._odometry = STANDING  # the newest motion that it measured
         self.stamp: int | None = None
+        self.interval = 0.0
         self.has_odometry = self.is_constant_velocity = False
         self.forget_velocity()
 
@@ -77,7 +79,7 @@ class MotionTerm:
         last, self.stamp = self.stamp, observation.stamp
         self.has_odometry |= observation.odom_pose is not None
         self.is_constant_velocity = not self.has_odometry and last is not None
-        dt = 0.0 if last is None else (observation.stamp - last) * 1e-9
+        self.interval = dt = 0.0 if last is None else (observation.stamp - last) * 1e-9
         p, motion = self._p, observation.motion
         if self.is_constant_velocity:
             self._constant_velocity.predict(state, dt, motion)

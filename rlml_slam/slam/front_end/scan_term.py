@@ -153,7 +153,8 @@ class ScanTerm:
         prior, strength = self._prior(sweep)
         found, usual = self._match(submap, points, prior, strength), self.kidnapping.usual
         as_expected = found.score >= AS_USUAL * usual and found.prior_weight >= 0.5
-        if maps and not (as_expected or reflectors_agree) and may_have_left(observation.motion):
+        left = may_have_left(observation.motion, self._motion.interval, self._p)
+        if maps and left and not (as_expected or reflectors_agree):
             only = match_after_gap(submap, points, prior, strength, usual, self._p)
             if only is None:
                 self.submaps.start_again()

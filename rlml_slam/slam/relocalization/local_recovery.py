@@ -34,9 +34,10 @@ AS_USUAL = 0.9
 NEAR = np.diag(1.0 / SPREAD**2)  # a weak prior at the place found: odometry is no evidence here
 
 
-def may_have_left(motion: Motion) -> bool:
-    """Whether the robot drove so far in one motion, as in a gap, that it may be in a new place."""
-    return motion.known and eigenvalues_2x2(motion.cov[:2, :2])[1] > UNSEEN**2
+def may_have_left(motion: Motion, lasted: float, p: Parameters) -> bool:
+    """Whether the robot drove so far in a gap of ``lasted`` [s] that it may be in a new place."""
+    is_gap = motion.known and lasted > p.motion.max_gap
+    return is_gap and eigenvalues_2x2(motion.cov[:2, :2])[1] > UNSEEN**2
 
 
 def match_after_gap(

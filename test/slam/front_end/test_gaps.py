@@ -10,6 +10,7 @@ from made_worlds import OTHER_ROOM, ROOM, SECOND, TinyWorld, drive, observations
 from rlml_slam.motion import motion_of
 from rlml_slam.params import Parameters
 from rlml_slam.slam.front_end.front_end import FrontEnd
+from rlml_slam.slam.relocalization.local_recovery import may_have_left
 from rlml_slam.types import Level, Motion
 
 
@@ -36,3 +37,12 @@ def test_robot_that_drove_on_unseen_maps_at_once_where_it_is(wheels_turned):
     if wheels_turned:
         assert frames[-1].T_map_base == pytest.approx(after[-1], abs=0.05)
         assert (np.sqrt(np.diag(frames[-1].cov_map))[:2] > 0.3).all()
+
+
+@pytest.mark.parametrize(('lasted', 'left'), [(1.0, False), (20.0, True)])
+def test_only_a_gap_takes_a_robot_elsewhere(lasted, left):
+    """A slow laser on a fast robot shows too little as well, but each second."""
+    wide = Motion(np.array([3.0, 0.0, 0.0]), np.diag([0.1, 0.1, 0.01]))
+    assert may_have_left(wide, lasted, Parameters()) is left
+    assert not may_have_left(replace(wide, known=False), lasted, Parameters())
+    assert not may_have_left(replace(wide, cov=1e-4 * np.eye(3)), lasted, Parameters())
