@@ -30,6 +30,7 @@ Stamps = NDArray[np.int64]
 BATCH = 256
 # of the speed at which floor and slope of the noise are equal: no robot drives slower for long
 CREEP = 0.25
+RECENT = 3.0  # [s] whose mean speed is that at which a robot goes on in a long gap
 ZERO = 0.05  # [m], [rad] from the pose at which odometry begins
 COAST = 0.2  # [s] for which a robot is taken to go on as it went before its odometry ended
 # Share of the noise of a slow motion that is left where the wheels do not turn: what they miss is
@@ -256,7 +257,8 @@ def _drive(
             sigma_v, sigma_w = math.sqrt(moved) * sigma_v, math.sqrt(moved) * sigma_w
             if gap > n.max_gap:
                 # eq. 61: it went as far as at its speed before, wherever that led
-                way2 = ((moved * fast) ** 2 - speed**2 - sideways**2) * dt**2
+                usual = min(fast, _speed_before(at - 1, stamps, twists, RECENT)[0])
+                way2 = ((moved * usual) ** 2 - speed**2 - sideways**2) * dt**2
                 beside2 += max(way2, 0.0) * sigma_w**2 * n.noise_interval * dt / 6.0
         # the wheels do not turn: so does the robot not, and the IMU shows its bias
         stands = known and speed == 0.0 and sideways == 0.0 and turn == 0.0
@@ -314,7 +316,7 @@ def _share_moved(speed: float, turn: float, n: _Noise) -> float:
 
 @part
 def _speed_before(at: int, stamps: Stamps, twists: Array, interval: float) -> tuple[float, float]:
-    """Speed and turn rate in the control interval until sample ``at``, without a jump in it.
+    """Speed and turn rate in an ``interval`` [s] until sample ``at``, without a jump in it.
 
     Stamps of one burst are too close to divide by.
     """
@@ -324,7 +326,7 @@ def _speed_before(at: int, stamps: Stamps, twists: Array, interval: float) -> tu
         far, turned = far + abs(twists[at, 0]) * dt, turned + abs(twists[at, 2]) * dt
         lasted += dt
         at -= 1
-    lasted = max(lasted, interval)
+    lasted = max(lasted, min(interval, COAST))
     return far / lasted, turned / lasted
 
 
@@ -524,7 +526,9 @@ class MotionBuffer:
         """
         if end <= start:
             return STILL
-        odometry = _around(self._stamps, start, end, int(self._noise.noise_interval * SECOND))
+        is_long = end - start > self._noise.max_gap * SECOND
+        before = RECENT if is_long else self._noise.noise_interval
+        odometry = _around(self._stamps, start, end, int(before * SECOND))
         imu = _around(self._imu_stamps, start, end)
         out, known, bias, variance, turned, drove = _drive(
             start, end,

@@ -24,7 +24,7 @@ from rlml_slam.slam.relocalization.scan_relocalization import MAX_SECOND, SPREAD
 from rlml_slam.types import Motion
 
 FAR = 3.0  # [sigma] of the prior, that a search covers
-UNSEEN = 0.2  # [m] 1 sigma of a motion of which no scan shows the way
+UNSEEN = 0.35  # [m] 1 sigma of a motion of which no scan shows the way
 REACH = 1.0  # [m] half width of the search: about a second of driving
 TURN = 1.0  # [rad] and of turning
 LOOKUPS = 50_000_000  # of a search, which takes 50 ms then; 2 million are usual

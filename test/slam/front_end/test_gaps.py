@@ -42,7 +42,7 @@ def test_robot_that_drove_on_unseen_maps_at_once_where_it_is(wheels_turned):
 @pytest.mark.parametrize(('lasted', 'left'), [(1.0, False), (20.0, True)])
 def test_only_a_gap_takes_a_robot_elsewhere(lasted, left):
     """A slow laser on a fast robot shows too little as well, but each second."""
-    wide = Motion(np.array([3.0, 0.0, 0.0]), np.diag([0.1, 0.1, 0.01]))
+    wide = Motion(np.array([3.0, 0.0, 0.0]), np.diag([0.2, 0.2, 0.01]))
     assert may_have_left(wide, lasted, Parameters()) is left
     assert not may_have_left(replace(wide, known=False), lasted, Parameters())
     assert not may_have_left(replace(wide, cov=1e-4 * np.eye(3)), lasted, Parameters())
