@@ -115,13 +115,10 @@ class WaitingQueue:
         """Whether odometry pauses, but is not missing yet: without a lidar, or after a gap."""
         if newest is None or not self._node.use_odom:
             return False
-        begin = max(newest, self._released)
-        if group[0].stamp - begin > self._max_gap:
-            begin = group[0].stamp
-        elif self._lidars or any(w.stream == 'scan' for w in group):
+        is_after_gap = group[0].stamp - max(newest, self._released) > self._max_gap
+        if not is_after_gap and (self._lidars or any(w.stream == 'scan' for w in group)):
             return False
-        else:
-            begin = newest
+        begin = group[0].stamp if is_after_gap else newest
         return self._stamps.newest - begin <= self._longest_pause
 
     def _waits_for_odometry(self, end: int, newest: int | None) -> bool:
