@@ -130,7 +130,7 @@ def _maps(folder: Path) -> list[Format]:
     params = slam.parameters
     back_end, log = BackEnd(params), Journal(params)
     for measurement in bag:
-        if measurement.stamp > bag.start + 6 * SECOND:
+        if measurement.stamp > bag.start + 2 * SECOND:
             break
         for frame in slam.add(measurement):
             log.add(frame, back_end.add(frame) is not None)
