@@ -24,6 +24,7 @@ from rlml_lab.contact.good_messages import stream_of_room
 from rlml_lab.contact.mutation import mutated, random_bytes
 from rlml_slam.cli.support.live_session import node, own_domain
 from rlml_slam.cli.support.processes import Processes, free_domain
+from rlml_slam.cli.support.usage import Usage
 from rlml_slam.errors import RlmlError
 from rlml_slam.params import Simulator
 from rlml_slam.ros.codecs import decode
@@ -35,6 +36,7 @@ QOS = QoSProfile(depth=1000)
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 BYTES = 0.05  # share of random bytes
 TOPICS = ('scan', 'odom', 'imu', 'reflectors')
+FILLED = 10.0  # [s] until the black box is full
 OWN = 2000  # messages that are remembered as the intruder's own
 BESIDE = -5_000_000, 5_000_000  # [ns] of a mutated message from the good one
 
@@ -56,6 +58,7 @@ class Intruder(Node):
         self.poses: dict[int, Array] = {}
         self.refused: dict[str, str] = {}
         self.sent = 0
+        self.growth = math.nan  # [MB] of the node's memory
         self._out = {
             topic: self.create_publisher(kind, topic, QOS) for topic, kind in self._kinds.items()
         }
@@ -112,7 +115,10 @@ def drive(messages: int, rate: float, seed: int, log: Path, seconds: float) -> I
         own_domain(domain, environment),
         Processes(log, environment) as children,
     ):
-        values = {'map_directory': maps, 'laser_pose': list(Simulator().laser_pose)}
+        values = {
+            'map_directory': maps, 'laser_pose': list(Simulator().laser_pose),
+            'incident.before': FILLED, 'incident.min_period': 1e4,
+        }  # fmt: skip
         children.start('slam', node('slam', values))
         words = node('simulator', {'repeat': 'true', 'wait_for_subscribers': 2})
         children.start('simulator', words)
@@ -138,12 +144,17 @@ def _run(
             raise RlmlError('no pose came')
         executor.spin_once(timeout_sec=0.1)
         children.check('slam', 'simulator')
-    began = time.monotonic()
+    began, memory = time.monotonic(), list[Usage]()
     while intruder.sent < messages or time.monotonic() - began < seconds:
         executor.spin_once(timeout_sec=0.5 / rate)
         while intruder.sent < min(messages, rate * (time.monotonic() - began)):
             intruder.send()
         children.check('slam', 'simulator')
+        used = children.usage('slam')
+        if used is not None:
+            memory.append(used)
+    half = [u.rss_mb for u in memory if u.time - began > 0.5 * (time.monotonic() - began)]
+    intruder.growth = half[-1] - half[0] if half else math.nan
 
 
 def figures(of: Intruder) -> tuple[float, float]:
