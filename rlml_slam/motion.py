@@ -385,7 +385,6 @@ class MotionBuffer:
         self._imu_stamps: list[int] = []
         self._rates: list[float] = []
         self._parked: Odometry | None = None
-        self.jumps = 0
 
     @property
     def newest(self) -> int | None:
@@ -397,23 +396,22 @@ class MotionBuffer:
         k = bisect_right(self._stamps, stamp)
         return self._stamps[k - 1] if k else None
 
-    def add_odometry(self, sample: Odometry) -> None:
-        """Append a sample, unless it is no later than the newest one.
+    def add_odometry(self, sample: Odometry) -> bool:
+        """Append a sample, unless it is no later than the newest one; False if it jumps.
 
         One sample that jumps away and is not followed by another there is a fault and dropped;
         two that agree are odometry that was reset, across which the motion is unknown.
         """
         if self._stamps and sample.stamp <= self._stamps[-1]:
-            return
+            return True
         if self._stamps:
             step = self._step(self._stamps[-1], self._poses[-1], sample)
             if step is None:
-                self.jumps += 1
                 parked, self._parked = self._parked, sample
                 if parked is None or parked.stamp >= sample.stamp:
-                    return
+                    return False
                 if self._step(parked.stamp, parked.pose, sample) is None:
-                    return
+                    return False
                 step = np.full(3, np.nan)
             elif self._has_restarted(sample):
                 step = np.full(3, np.nan)
@@ -422,6 +420,7 @@ class MotionBuffer:
         self._stamps.append(sample.stamp)
         self._poses.append(np.array(sample.pose, dtype=np.float64))
         self._forget(self._stamps, sample.stamp, self._poses, self._twists)
+        return True
 
     def _step(self, stamp: int, pose: Array, sample: Odometry) -> Array | None:
         """Velocity (3,) since an earlier sample, None where no robot moves like that."""
@@ -487,10 +486,18 @@ class MotionBuffer:
 
     def forget_after(self, stamp: int) -> None:
         """Drop all samples later than a stamp: their clock was wrong."""
+        self.forget_odometry_after(stamp)
+        self.forget_imu_after(stamp)
+
+    def forget_odometry_after(self, stamp: int) -> None:
+        """Drop the odometry later than a stamp."""
         k = bisect_right(self._stamps, stamp)
         del self._stamps[k:], self._poses[k:], self._twists[k:]
         if not self._twists:
             self._twists.append(np.zeros(3))
+
+    def forget_imu_after(self, stamp: int) -> None:
+        """Drop the IMU's samples later than a stamp."""
         k = bisect_right(self._imu_stamps, stamp)
         del self._imu_stamps[k:], self._rates[k:]
 

@@ -487,11 +487,10 @@ def test_parts_of_a_gap_add_up_to_the_whole():
 
 def test_one_sample_that_jumps_away_is_dropped():
     buffer = filled(line(1.0), duration=1.0)
-    buffer.add_odometry(Odometry(T0 + 1020 * MS, np.array([500.0, 3.0, 1.0])))
+    assert not buffer.add_odometry(Odometry(T0 + 1020 * MS, np.array([500.0, 3.0, 1.0])))
     for k in range(2, 50):
         buffer.add_odometry(Odometry(T0 + 1000 * MS + k * 20 * MS, line(1.0)(1.0 + k / 50)))
     m = buffer.motion(T0 + 500 * MS, T0 + 1500 * MS)
-    assert buffer.jumps == 1
     assert m.known
     np.testing.assert_allclose(m.delta, [1.0, 0.0, 0.0], atol=1e-9)
 
@@ -513,8 +512,7 @@ def test_reset_odometry_is_followed_and_the_motion_across_unknown():
 def test_burst_of_stamps_is_no_jump():
     buffer = filled(line(1.0), duration=1.0)
     # 2 cm later by path, 50 us by stamp: a driver that sends what it held back
-    buffer.add_odometry(Odometry(T0 + SECOND + MS // 20, line(1.0)(1.02)))
-    assert buffer.jumps == 0
+    assert buffer.add_odometry(Odometry(T0 + SECOND + MS // 20, line(1.0)(1.02)))
     m = buffer.motion(T0 + 500 * MS, T0 + SECOND + MS // 20)
     assert m.delta[0] == pytest.approx(0.52)
     assert math.sqrt(m.cov[0, 0]) < 0.2

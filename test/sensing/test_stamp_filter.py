@@ -160,3 +160,13 @@ def test_motion_between_jittered_stamps_is_less_sure():
     shift = motion.delta / 0.1 * 0.02
     np.testing.assert_allclose(wider.cov - motion.cov, np.outer(shift, shift))
     assert widened(motion, 100 * MS, 0.0) is motion
+
+
+def test_stamps_far_in_the_past_do_not_move_later_ones():
+    true = ticks(20, 600)
+    clock, rng = StampFilter(), np.random.default_rng(5)
+    for stamp in true:
+        clock.filtered(int(stamp))
+        assert clock.filtered(int(stamp) + 5 * MS) == stamp + 5 * MS
+        clock.filtered(int(stamp) - int(rng.integers(SECOND // 5, 20 * SECOND)))
+        assert abs(clock.filtered(int(stamp) + 6 * MS) - stamp - 6 * MS) < 10 * MS

@@ -332,6 +332,54 @@ def test_one_stamp_ahead_costs_no_observation(ahead, stream):
         assert max(o.stamp for o in out) < late
 
 
+@pytest.mark.parametrize('stream', ['odom', 'imu', 'scan'])
+def test_stamp_less_than_a_second_ahead_costs_no_later_message(stream):
+    inputs, late = drive_inputs(imu=True), T0 + 2 * SECOND + 711 * MS
+    bad = {'odom': Odometry(late, pose_at(T0)), 'imu': Imu(late, 9.0), 'scan': scan(late)}[stream]
+    clean, synchronizer = Synchronizer(Parameters()), Synchronizer(Parameters())
+    feed(clean, inputs)
+    at = 2 * len(inputs) // 3
+    out = feed(synchronizer, [*inputs[:at], bad, *inputs[at:]])
+    counts, before = synchronizer.inputs.counts[stream], clean.inputs.counts[stream]
+    assert counts['future'] == 1
+    assert counts['used'] == before['used']
+    assert counts['late'] == (stream != 'scan')  # the first of the two that show it
+    assert late not in [o.stamp for o in out]
+
+
+def test_late_odometry_costs_no_newer_one():
+    inputs = drive_inputs()
+    old = [odometry(T0 + k * MS) for k in (3, 4, 1503, 1504)]
+    synchronizer = Synchronizer(Parameters())
+    feed(synchronizer, [*inputs[:150], *old, *inputs[150:]])
+    assert synchronizer.inputs.counts['odom'] == {'used': 150, 'late': 4}
+
+
+def test_turn_rate_of_no_robot_and_jump_of_odometry_are_counted():
+    synchronizer, now = running()
+    synchronizer.add_imu(Imu(now, 50.0))
+    synchronizer.add_odometry(Odometry(now + 10 * MS, np.array([1e4, 0.0, 0.0])))
+    synchronizer.add_odometry(odometry(now + 20 * MS))
+    assert synchronizer.inputs.counts['imu'] == {'invalid': 1}
+    assert '50 rad/s' in synchronizer.inputs.first_errors['imu']
+    assert synchronizer.inputs.counts['odom'] == {'used': 152, 'jump': 1}
+
+
+@pytest.mark.parametrize('wrong', [{'frame_id': 'base_link'}, {'angle_min': 0.0}])
+def test_single_scans_of_another_sensor_are_refused_and_named(wrong):
+    inputs = [
+        replace(m, stamp=m.stamp + MS, **wrong) if isinstance(m, Scan) and k % 12 == 1 else m
+        for k, m in enumerate(drive_inputs(seconds=6.0), start=1)
+    ]
+    scans = [m for m in inputs if isinstance(m, Scan)]
+    bad = [m for m in scans[6:] if m.frame_id == 'base_link' or m.angle_min == 0.0]
+    synchronizer = Synchronizer(Parameters())
+    used = {o.stamp for o in feed(synchronizer, inputs) if o.scan is not None}
+    assert bad
+    assert not used & {m.stamp for m in bad}
+    assert synchronizer.inputs.counts['scan']['invalid'] == len(bad)
+
+
 def test_first_stamp_of_another_clock_is_found_out():
     """A message stamped by the wall clock before simulated time."""
     synchronizer = Synchronizer(Parameters())

@@ -116,6 +116,14 @@ class OdometrySources:
         if self._last is not None and self._last.stamp > stamp:
             self.source, self._last, self._offset = '', None, None
 
+    def forget_early(self, source: str, stamp: int) -> None:
+        """Drop the poses of a source later than a stamp; the ones before it go on."""
+        history = self._of[source]
+        history.forget_after(stamp)
+        if source == self.source and history.newest is not None:
+            offset = np.zeros(3) if self._offset is None else self._offset
+            self._last = Odometry(history.newest, se2.compose(offset, history.last))
+
     def newest(self, of_motion: int | None) -> int | None:
         """Stamp [ns] up to which the motion, and the transform where /tf has it, are known."""
         known = self.transforms.newest

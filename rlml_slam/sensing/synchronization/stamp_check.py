@@ -5,10 +5,12 @@ A message whose stamp is far ahead of all others is held back: if it were believ
 messages would be late. It is rejected if the other streams go on as before, and accepted if more
 messages follow it: then time really jumped ahead. Messages that are far behind are late if they
 are few; if all messages in a row are behind, the newest stamp was wrong or the clock was set back.
+A stamp nearer ahead is accepted at once; it was wrong if two in a row of its source are before it.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator
 from typing import TypeAlias
 
@@ -22,6 +24,7 @@ Message: TypeAlias = Odometry | Imu | Scan | Detections
 MAX_AHEAD = SECOND  # [ns] a stamp farther ahead of all others is suspicious; sensors lag by less
 BACK = SECOND // 10  # [ns] a message farther behind its stream is not of a stream that is late
 CONFIRM = 3  # messages that confirm, or refute, a suspicious stamp
+RECENT = 5  # stamps of a source that are remembered
 PERSISTENT = 10  # messages in a row that are behind: fewer are late, more are of a new clock
 
 
@@ -37,7 +40,9 @@ class StampCheck:
         self.newest = -(2**62)
         self.first: int | None = None
         self._newest_of: dict[str, int] = {}  # by stream
-        self._newest_of_source: dict[tuple[str, str], int] = {}
+        # newest accepted stamps by stream and source, and the last one that was before them
+        self._recent: defaultdict[tuple[str, str], list[int]] = defaultdict(list)
+        self._overtaken: dict[tuple[str, str], int] = {}
         self._step: dict[str, int] = {}  # by stream: between its last two stamps
         self._num_behind = 0  # messages in a row that are far behind
         self._seen: dict[str, int] = {}  # by stream: the newest stamp, of late messages too
@@ -112,10 +117,9 @@ class StampCheck:
         if limit is not None and stamp <= limit:
             self._inputs.count(stream, 'late', f'{stream} at {stamp} ns is late')
             return False
-        newest_of_source = self._newest_of_source.get((stream, source), stamp)
         self._step[stream] = 0 if newest is None else max(stamp - newest, 0)
         self._newest_of[stream] = stamp if newest is None else max(newest, stamp)
-        self._newest_of_source[stream, source] = max(newest_of_source, stamp)
+        self._recent[stream, source] = sorted([*self._recent[stream, source], stamp])[-RECENT:]
         self.newest = max(self.newest, stamp)
         if self.first is None:
             self.first = stamp
@@ -123,7 +127,7 @@ class StampCheck:
 
     def is_duplicate(self, stream: str, stamp: int, source: str) -> bool:
         """Whether the stamp is the newest of its source already; counts it."""
-        if stamp != self._newest_of_source.get((stream, source)):
+        if stamp not in self._recent[stream, source][-1:]:
             return False
         self._inputs.count(stream, 'duplicate')
         return True
@@ -152,11 +156,38 @@ class StampCheck:
             raise InputError(f'the clock of {stream} jumped back by {behind / SECOND:.1f} s')
         return stamp + MAX_AHEAD
 
+    def early_after(self, stream: str, stamp: int, source: str) -> int | None:
+        """Time [ns] after which the newest stamps of a source were wrong, or None.
+
+        They were if the last two, one after the other, lie BACK before them, and after older ones.
+        """
+        key, recent = (stream, source), self._recent[stream, source]
+        first = self._overtaken.pop(key, None)
+        if not recent or not recent[0] < stamp < recent[-1] - BACK:
+            return None
+        if first is not None and recent[0] < first < stamp:
+            return first
+        self._overtaken[key] = stamp
+        return None
+
+    def forget_early(self, stream: str, stamp: int, source: str) -> None:
+        """Drop the stamps of a source after ``stamp`` [ns], which were wrong."""
+        recent = self._recent[stream, source]
+        for wrong in (s for s in recent if s > stamp):
+            error = f'{stream} at {wrong} ns was ahead of the next ones of its stream: dropped'
+            self._inputs.count(stream, 'future', error)
+        self._recent[stream, source] = [s for s in recent if s <= stamp]
+        of = [s[-1] for (other, _), s in self._recent.items() if other == stream and s]
+        self._newest_of[stream] = max(of)
+        self._seen.pop(stream, None)
+        self.newest = max(self._newest_of.values())
+
     def forget_after(self, stamp: int) -> None:
         """Drop the stamps after ``stamp`` [ns], which were wrong."""
         for stream in [s for s, newest in self._newest_of.items() if newest > stamp]:
             error = f'{stream} at {self._newest_of.pop(stream)} ns is far ahead of all other '
             self._inputs.count(stream, 'future', error + 'stamps: rejected')
-        self._newest_of_source = {k: s for k, s in self._newest_of_source.items() if s <= stamp}
+        for key, recent in self._recent.items():
+            self._recent[key] = [s for s in recent if s <= stamp]
         self._seen = {k: s for k, s in self._seen.items() if s <= stamp}
         self.newest = max(self._newest_of.values(), default=stamp)

@@ -33,6 +33,7 @@ OVERTAKES = 0.5  # of the expected number of stamps earlier than the one before
 EVEN, MOST = 0.1, 0.8  # of stamps that jitter by a period, a fifth would be so even
 OUTLIER = 5.0  # sigmas of the jitter: a stamp farther from the line is not on it
 RESOLVED = 4.0  # sigmas of the jitter in a period: then a lost message shows
+BACK = 100_000_000  # [ns] a stamp farther before the last one is of no jitter
 LOST = 0.7  # periods that a stamp is late by at least where one is lost
 
 
@@ -73,6 +74,8 @@ class StampFilter:
         """The stamp [ns] without jitter, if the rate is constant; may be repeated for a stamp."""
         if self._newest is not None and stamp == self._newest[0]:
             return self._newest[1]
+        if self._newest is not None and stamp < self._newest[0] - BACK:
+            return stamp
         number = 0
         if self._stamps:
             number = self._stamps[-1][0] + 1

@@ -25,11 +25,13 @@ from rlml_slam.sensing.reflectors.scan_reflectors import ScanReflectors
 from rlml_slam.sensing.synchronization.input_counts import InputCounts
 from rlml_slam.sensing.synchronization.observation_assembly import ObservationAssembly
 from rlml_slam.sensing.synchronization.odometry_sources import TF, TOPIC, OdometrySources
+from rlml_slam.sensing.synchronization.sensor_kinds import SensorKinds
 from rlml_slam.sensing.synchronization.stamp_check import CONFIRM, StampCheck
 from rlml_slam.sensing.synchronization.stamp_jitter import StampJitter
 from rlml_slam.sensing.synchronization.waiting_queue import WaitingQueue
 from rlml_slam.types import Detections, Imu, Observation, Odometry, Scan
 
+MEASURED = ('scan', 'reflectors')  # streams that give observations
 MAX_SWEEP = 1.0  # [s] of one scan; all later inputs would wait for the odometry at its end
 
 
@@ -46,10 +48,12 @@ class Synchronizer:
         self._stamps = StampCheck(self.inputs)
         self._jitter = StampJitter(self._node.filter_stamps)
         self._queue = WaitingQueue(params, self._stamps, self.inputs)
+        self._fastest_turn = params.motion.max_turn_rate
         n = self._node
         self.odometry = OdometrySources(n.odom_source, n.tf_buffer_duration)
         self._assembly = ObservationAssembly(params, self.inputs, self.odometry.transforms)
         self._no_returns = NoReturnRanges()
+        self._kinds = {stream: SensorKinds() for stream in MEASURED}
         self._add: dict[str, Callable[[Any], list[Observation]]] = {
             TOPIC: self.add_odometry,
             TF: self.add_transform,
@@ -94,10 +98,10 @@ class Synchronizer:
         if used is None or not self._node.use_odom:
             self.inputs.count(TOPIC, 'compared')
             return self._release()
-        self.buffer.add_odometry(used if stamp == used.stamp else Odometry(stamp, used.pose))
+        sample = used if stamp == used.stamp else Odometry(stamp, used.pose)
+        self.inputs.count(TOPIC, 'used' if self.buffer.add_odometry(sample) else 'jump')
         if not len(self._queue):
             self._assembly.carry(stamp)
-        self.inputs.count(TOPIC, 'used')
         return self._release()
 
     def add_imu(self, sample: Imu) -> list[Observation]:
@@ -108,7 +112,8 @@ class Synchronizer:
             return self._release()
         stamp = self._jitter.filtered('imu', sample.stamp)
         sample = sample if stamp == sample.stamp else Imu(stamp, sample.yaw_rate)
-        if self._accept('imu', stamp, math.isfinite(sample.yaw_rate), 'yaw rate is not finite'):
+        possible = abs(sample.yaw_rate) <= self._fastest_turn
+        if self._accept('imu', stamp, possible, f'no robot turns at {sample.yaw_rate:g} rad/s'):
             self.buffer.add_imu(sample)
             self.inputs.count('imu', 'used')
         return self._release()
@@ -120,7 +125,7 @@ class Synchronizer:
         error = _invalid_geometry(scan)
         if error:
             self.inputs.count('scan', 'invalid', f'scan at {scan.stamp} ns: {error}')
-        elif self._has_frame('scan', scan.frame_id) and self._accept(
+        elif self._is_of_sensor('scan', scan, scan.angle_min) and self._accept(
             'scan', scan.stamp, source=scan.frame_id
         ):
             self._queue.note_lidar(scan)
@@ -135,7 +140,7 @@ class Synchronizer:
             return self._release()
         d = detections
         finite = np.isfinite(d.points).all() and np.isfinite(d.cov).all()
-        if self._has_frame('reflectors', d.frame_id) and self._accept(
+        if self._is_of_sensor('reflectors', d) and self._accept(
             'reflectors', d.stamp, bool(finite), 'a point or covariance is not finite'
         ):
             self._assembly.leave_detection()
@@ -146,13 +151,16 @@ class Synchronizer:
         """Observations of all that still waits, at the end of the data."""
         return self._release(flush=True)
 
-    def _has_frame(self, stream: str, frame_id: str) -> bool:
-        """Whether the pose of the sensor is known; counts the input as invalid if not."""
-        if self._assembly.has_frame(stream, frame_id):
+    def _is_of_sensor(self, stream: str, item: Scan | Detections, angle: float = 0.0) -> bool:
+        """Whether it is of a sensor whose pose is known; counts the input as invalid if not."""
+        base, error = self._node.base_frame, f'{stream} in frame {item.frame_id[:100]!r}'
+        if not self._assembly.has_frame(stream, item.frame_id):
+            error += f', whose pose in {base} is unknown: publish it on /tf_static'
+        elif self._kinds[stream].is_foreign(item.frame_id, angle):
+            error += f' from {angle:g} rad: almost all others are of another sensor'
+        else:
             return True
-        base = self._node.base_frame
-        error = f'{stream} in frame {frame_id!r}, whose pose in {base} is unknown: publish it on '
-        self.inputs.count(stream, 'invalid', error + '/tf_static')
+        self.inputs.count(stream, 'invalid', error)
         return False
 
     def _accept(
@@ -172,13 +180,30 @@ class Synchronizer:
             self._queue.drop_after(wrong_after)
             self.buffer.forget_after(wrong_after)
             self.odometry.forget_after(wrong_after)
-        is_measured = stream in ('scan', 'reflectors')
+        early_after = self._stamps.early_after(stream, stamp, source)
+        if early_after is not None:
+            self._forget_early(stream, early_after, source)
+        is_measured = stream in MEASURED
         limit = last if is_measured else self._stamps.newest_of(stream)
         if self._stamps.accept(stream, stamp, limit, source):
             return True
         if is_measured and stamp == last:
             self._queue.note_pair(stamp)  # the other half of the next one will be waited for
         return False
+
+    def _forget_early(self, stream: str, stamp: int, source: str) -> None:
+        """Drop what a source sent with stamps ahead of those that followed."""
+        self._stamps.forget_early(stream, stamp, source)
+        clock = source if self._queue.has_several_lidars else ''
+        self._jitter.restart('instant' if stream in MEASURED else stream, clock)
+        if stream in MEASURED:
+            self._queue.drop_after(stamp, stream, source)
+        elif stream == 'imu':
+            self.buffer.forget_imu_after(stamp)
+        else:
+            self.odometry.forget_early(stream, stamp)
+            if stream == self.odometry.source:
+                self.buffer.forget_odometry_after(stamp)
 
     def _wait(self, stream: str, item: Scan | Detections) -> None:
         delay = self._jitter.delay(item.stamp, self._clock_of(item))

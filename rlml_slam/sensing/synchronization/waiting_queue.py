@@ -76,9 +76,14 @@ class WaitingQueue:
         self._items.append(Waiting(item.stamp, stream, item, delay))
         self._items.sort(key=lambda w: (w.stamp, w.stream))
 
-    def drop_after(self, stamp: int) -> None:
-        """Drop what is after a stamp [ns]."""
-        self._items = [w for w in self._items if w.stamp <= stamp]
+    def drop_after(self, stamp: int, stream: str = '', frame_id: str = '') -> None:
+        """Drop what is after a stamp [ns], of all streams or of a sensor of one."""
+        self._items = [
+            w for w in self._items
+            if w.stamp <= stamp
+            or w.stream != (stream or w.stream)
+            or w.item.frame_id != (frame_id or w.item.frame_id)
+        ]  # fmt: skip
 
     def pop(self, newest_odometry: int | None, flush: bool = False) -> list[Waiting]:
         """Items of the first instant, if they are ready, or if all are flushed; else none.

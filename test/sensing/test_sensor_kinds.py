@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+
+from rlml_slam.sensing.synchronization.sensor_kinds import MEMORY, REPEATED, SensorKinds
+
+
+def refused(messages):
+    kinds = SensorKinds()
+    return [k for k, message in enumerate(messages) if kinds.is_foreign(*message)]
+
+
+@pytest.mark.parametrize('rare', [('base_link', -1.0), ('laser', 0.0)])
+def test_rare_kind_is_refused(rare):
+    messages = [('laser', -1.0)] * 10 * MEMORY
+    at = list(range(30, len(messages), 11))
+    for k in at:
+        messages[k] = rare
+    assert refused(messages) == at
+
+
+@pytest.mark.parametrize('share', [2, 3, 5])
+def test_lidars_in_turn_are_all_used(share):
+    assert not refused([('front', -1.0), *[('rear', -1.0)] * (share - 1)] * MEMORY)
+
+
+def test_first_angles_that_alternate_or_vary_are_used():
+    rng = np.random.default_rng(0)
+    assert not refused([('laser', -1.0 + 0.25 * k) for k in range(8)] * MEMORY)
+    assert not refused([('laser', angle) for angle in rng.uniform(-3.0, 3.0, 3 * MEMORY)])
+    assert not refused([('laser', -1.0 + e) for e in rng.uniform(0.0, 0.01, 3 * MEMORY)])
+
+
+def test_sensor_that_was_set_up_in_another_way_is_followed():
+    before = [('laser', -1.0)] * 2 * MEMORY
+    assert refused(before + [('laser', -1.5)] * 50) == list(
+        range(len(before), len(before) + REPEATED - 1)
+    )
