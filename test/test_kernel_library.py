@@ -242,6 +242,18 @@ def test_without_a_compiler_it_says_what_to_install(monkeypatch):
         build._compiler()
 
 
+def end_of_process():
+    """In a process that compiles: what the system does where memory is short."""
+    os._exit(9)
+
+
+def test_process_that_ends_while_it_compiles_is_an_error(monkeypatch, tmp_path):
+    monkeypatch.setattr(build, '_folders', end_of_process)
+    monkeypatch.setattr(build.os, 'environ', dict(os.environ))
+    with pytest.raises(build.BuildError, match='has ended'):
+        build._compile(tmp_path, 'generic', lambda *_: None)
+
+
 @pytest.fixture
 def compilations(monkeypatch, tmp_path):
     """How often the library is compiled: a stand-in whose content is the count."""

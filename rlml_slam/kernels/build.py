@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import functools
 import multiprocessing
 import os
 import pickle
@@ -13,6 +12,8 @@ import subprocess
 import sysconfig
 import tempfile
 from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -78,22 +79,22 @@ def _compile(work: Path, processor: str, progress: Progress) -> Compiled:
     workers = max(1, min(len(os.sched_getaffinity(0)), int(free / MEMORY)))
     found: dict[str, list[Entry]] = {}
     constants: dict[str, bytes] = {}
-    with multiprocessing.get_context('spawn').Pool(workers) as pool:
-        folders = pool.apply(_folders)
-        one = functools.partial(_compile_folder, work, processor)
-        results, folder, done = pool.imap_unordered(one, folders), [''], 0
-        for _ in folders:
-            while True:
-                progress(done, sum(map(len, folders)), folder[-1])
-                try:
-                    folder, entries, of_folder = results.next(timeout=TICK)
-                    break
-                except multiprocessing.TimeoutError:
-                    pass
-            done += len(folder)
-            # two processes may have compiled the same kernel; either will do
-            found = entries | found
-            constants |= of_folder
+    context = multiprocessing.get_context('spawn')
+    try:
+        with ProcessPoolExecutor(workers, mp_context=context) as pool:
+            folders = pool.submit(_folders).result()
+            waiting = {pool.submit(_compile_folder, work, processor, f) for f in folders}
+            last, done = '', 0
+            while waiting:
+                progress(done, sum(map(len, folders)), last)
+                ready, waiting = wait(waiting, TICK, FIRST_COMPLETED)
+                for folder, entries, of_folder in (future.result() for future in ready):
+                    last, done = folder[-1], done + len(folder)
+                    # two processes may have compiled the same kernel; either will do
+                    found = entries | found
+                    constants |= of_folder
+    except BrokenProcessPool as e:
+        raise BuildError('a process that compiles kernels has ended: is memory short?') from e
     return [entry for name in sorted(found) for entry in found[name]], constants
 
 
