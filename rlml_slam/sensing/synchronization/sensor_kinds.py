@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import Counter, deque
 
 MEMORY = 100  # messages that are compared
-RARE = 5  # times as frequent is another kind
+RARE = 20  # times as frequent is another kind: lidars that share a topic differ by less
 REPEATED = 5  # messages in a row of one kind: the sensor is another one now
 SAME = 0.02  # [rad] between first angles of one kind
 
