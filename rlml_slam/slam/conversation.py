@@ -14,6 +14,7 @@ from enum import IntEnum
 
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.se2 import Array
+from rlml_slam.slam.keyframes import FoundPose
 from rlml_slam.slam.search_area import SearchArea
 from rlml_slam.types import Belief, Frame, Observation
 
@@ -108,6 +109,13 @@ class MapFrame:
 
 
 @dataclass(frozen=True)
+class CloseLoop:
+    """Close a loop where a search has found the robot, which only drove where nothing was seen."""
+
+    found: FoundPose
+
+
+@dataclass(frozen=True)
 class Search:
     """Find the pose of an observation in a map; ``on_search_result`` is the answer.
 
@@ -184,8 +192,8 @@ class Answer:
 
 
 Command = (
-    FrontEndCommand | MapFrame | Search | DrawMap | KeepMap | ForgetMap | TakeMap | PublishMap
-    | RememberPose | Log | Answer
+    FrontEndCommand | MapFrame | CloseLoop | Search | DrawMap | KeepMap | ForgetMap | TakeMap
+    | PublishMap | RememberPose | Log | Answer
 )  # fmt: skip
 
 

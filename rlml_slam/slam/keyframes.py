@@ -47,6 +47,15 @@ class Keyframe:
             self.scan_stamp = other.scan_stamp
 
 
+@dataclass(frozen=True)
+class FoundPose:
+    """A search of ``area`` [m²] has found that ``T_local`` (3,) is at ``T_map`` (3,)."""
+
+    T_local: Array
+    T_map: Array
+    area: float
+
+
 @dataclass
 class Sighting:
     """Detections of one reflector near one keyframe, fused in information form."""

@@ -23,6 +23,11 @@ class SearchArea:
     distance: float
     turn: float
 
+    @property
+    def size(self) -> float:
+        """Area [m²] at all headings that has the volume of the poses."""
+        return (2.0 * self.distance) ** 2 * min(self.turn / math.pi, 1.0)
+
     def contains(self, pose: Array) -> bool:
         """Whether a pose (3,) is in it."""
         x, y, turn = se2.between(self.pose, pose).tolist()

@@ -9,7 +9,7 @@ from enum import Enum
 
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.slam.conversation import Answer, Command, DrawMap, Search, SessionFrame
-from rlml_slam.slam.search_area import search_area
+from rlml_slam.slam.search_area import SearchArea, search_area
 
 
 class Purpose(Enum):
@@ -24,10 +24,14 @@ class Purpose(Enum):
 
 @dataclass(frozen=True)
 class Pending:
-    """A search under way: of which frame, None where there was none yet."""
+    """A search under way: of which frame, None where there was none yet, and where.
+
+    In a map in the making, what fits outside of the ``area`` may be a twin of what is not mapped.
+    """
 
     purpose: Purpose
     record: SessionFrame | None
+    area: SearchArea | None
 
 
 class Searches:
@@ -49,8 +53,11 @@ class Searches:
         complete: bool = True,
     ) -> Search | DrawMap:
         """The command for a search in a map; without one, to draw the map in the making first."""
-        number = next(self._numbers)
-        self._pending[number] = Pending(purpose, record)
+        number, area = next(self._numbers), None
+        is_unfinished = saved is None or not complete
+        if purpose is Purpose.RECOVER and is_unfinished and record is not None:
+            area = search_area(record.frame)
+        self._pending[number] = Pending(purpose, record, area)
         if saved is None:
             return DrawMap(number)
         return self._search(number, saved, complete)
@@ -66,10 +73,7 @@ class Searches:
         if frame is None:
             return Search(number, None, saved, complete)
         given = frame if pending.purpose is Purpose.CONFIRM else None
-        # in a map in the making, what fits may be a twin of what is not mapped yet
-        recovers = pending.purpose is Purpose.RECOVER and not complete
-        area = search_area(frame) if recovers else None
-        return Search(number, frame.observation, saved, complete, given, area)
+        return Search(number, frame.observation, saved, complete, given, pending.area)
 
     def take(self, number: int) -> Pending | None:
         """What is under way with this number, and no longer from now on; None if superseded."""

@@ -21,6 +21,7 @@ from rlml_slam.slam.conversation import (
     ANY,
     FIRST_REQUEST,
     Answer,
+    CloseLoop,
     Command,
     Correct,
     ForgetMap,
@@ -35,6 +36,7 @@ from rlml_slam.slam.conversation import (
     info,
     warning,
 )
+from rlml_slam.slam.keyframes import FoundPose
 from rlml_slam.slam.map_entry import MapEntry
 from rlml_slam.slam.mapped_frames import MappedFrames, corrections
 from rlml_slam.slam.relocalization.pose_test import verified
@@ -42,7 +44,6 @@ from rlml_slam.slam.relocalization.recovery import Recovery
 from rlml_slam.slam.relocalization.relocalize_answer import relocalize_answer
 from rlml_slam.slam.relocalization.scan_relocalization import Relocation
 from rlml_slam.slam.requests import Requests
-from rlml_slam.slam.search_area import search_area
 from rlml_slam.slam.searches import Pending, Purpose, Searches
 from rlml_slam.types import Belief, Verdict
 
@@ -277,9 +278,9 @@ class System:
             self.entry.why = found.why
         if found.verdict is not Verdict.UNIQUE or pose is None or cov is None:
             return []
-        recovers = pending.purpose is Purpose.RECOVER and self.map is None
-        area = search_area(record.frame) if recovers else None
-        if area is not None and not area.contains(pose):
+        if pending.area is not None:
+            if pending.area.contains(pose):
+                return [CloseLoop(FoundPose(record.frame.T_local_base, pose, pending.area.size))]
             self.recovery.why = f'{found.why}, but it is too far from where odometry led'
             return []
         if self.entry is not None:

@@ -83,6 +83,7 @@ class Mapper:
             say.LocalizeIn: self._command,
             say.Correct: self._correct,
             say.MapFrame: self._map_frame,
+            say.CloseLoop: self._close_loop,
             say.Search: self.searcher.submit,
             say.DrawMap: lambda c: self.execute(
                 self.system.on_map_drawn(c.number, self.current())
@@ -144,6 +145,9 @@ class Mapper:
             self._report_survey()
             belief = self.back_end.belief()
         self.execute(self.system.on_update(command.session, frame.stamp, update, belief))
+
+    def _close_loop(self, command: say.CloseLoop) -> None:
+        self.back_end.loop_closer.found = command.found
 
     def _correct(self, command: say.Correct) -> None:
         self._command(command)

@@ -123,7 +123,7 @@ class BackEnd:
                 self.interval.jump(frame)
         update = None
         last = self.keyframes[-1] if self.keyframes else None
-        if is_keyframe(last, frame, self._p.back_end):
+        if self.loop_closer.is_due(frame) or is_keyframe(last, frame, self._p.back_end):
             update = self._add_keyframe(frame, start)
         assert self.interval is not None
         if not frame.unconfirmed:

@@ -17,6 +17,8 @@ from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap
 from rlml_slam.slam.keyframes import Keyframe
 
 SIGMAS = 3.0  # half width of the search window, in standard deviations of the drift
+PROPOSED = 1.0, 0.2  # [m], [rad] half width around a pose that was proposed
+NEAREST = 3  # submaps that are tried there
 
 
 @dataclass(frozen=True)
@@ -50,10 +52,7 @@ def candidates(
     pose = graph.poses[key.index]
     if not among:
         return []
-    bases = graph.poses[[m.anchor.index for m in among]]
-    grids = se2.compose(bases, np.array([m.T_anchor_grid for m in among]))
-    centres = se2.transform(grids, np.array([m.centre for m in among])[:, None])[:, 0]
-    gaps = np.hypot(*(centres - pose[:2]).T).tolist()
+    gaps = _distances(graph, among, pose)
     order = np.argsort(gaps, kind='stable').tolist()
     order = [k for k in order if gaps[k] < p.max_distance + p.max_search_window - p.search_window]
     if not order:
@@ -76,3 +75,25 @@ def candidates(
         Candidate(m, se2.between(m.grid_pose(graph.poses), pose), window, angle)
         for m, window, angle in chosen
     ]
+
+
+def candidates_at(
+    graph: Graph, among: Sequence[KeyframeSubmap], T_map_key: Array, p: LoopClosure
+) -> list[Candidate]:
+    """Submaps ``among`` which a keyframe proposed at a pose (3,) may be, the nearest first."""
+    if not among:
+        return []
+    gaps = _distances(graph, among, T_map_key)
+    order = [k for k in np.argsort(gaps, kind='stable').tolist() if gaps[k] < p.max_distance]
+    return [
+        Candidate(among[k], se2.between(among[k].grid_pose(graph.poses), T_map_key), *PROPOSED)
+        for k in order[:NEAREST]
+    ]
+
+
+def _distances(graph: Graph, among: Sequence[KeyframeSubmap], pose: Array) -> list[float]:
+    """Of the centres of submaps from a pose (3,) [m]."""
+    bases = graph.poses[[m.anchor.index for m in among]]
+    grids = se2.compose(bases, np.array([m.T_anchor_grid for m in among]))
+    centres = se2.transform(grids, np.array([m.centre for m in among])[:, None])[:, 0]
+    return [float(gap) for gap in np.hypot(*(centres - pose[:2]).T)]

@@ -50,7 +50,7 @@ def is_consistent(
     i, j = nodes.T
     e = relative_pose(graph.poses[i], graph.poses[j], deltas)[0]
     alone = evidence(e, between.covs(i, j) + covs, 1.0, wrong)
-    # a weak match may not enter alone, wherever the graph expects it
+    # a weak or wide match may not enter alone, wherever the graph expects it
     alone = np.where(weak, np.minimum(alone, 0.0), alone)
     agree = _agreement(graph, between, nodes, deltas, covs, wrong)
     ranges, positions = np.broadcast_to(view_range, len(nodes)), graph.poses[:, :2]

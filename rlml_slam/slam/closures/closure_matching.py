@@ -48,7 +48,8 @@ class Match:
     ``search_area`` [m²] of its candidate; ``log_odds`` of being correct from what proposed it,
     the ``source``; ``reflector_pairs`` are keys of reflectors that the closure joins;
     ``view_range`` [m] is the median range of the scan; a ``weak`` match has a score below the
-    usual least one; the others as in Closure.
+    usual least one, a ``wide`` one is of a search for a robot whose place is uncertain. The others
+    as in Closure.
     """
 
     m: KeyframeSubmap
@@ -64,6 +65,7 @@ class Match:
     reflector_pairs: tuple[tuple[int, int], ...] = ()
     view_range: float = 0.0
     weak: bool = False
+    wide: bool = False
 
     def closure(self, why: str, edge: int = -1, number: int = -1) -> Closure:
         """Record of the match, accepted with an ``edge``."""
@@ -138,9 +140,10 @@ class ClosureMatcher:
         assert key.origin is not None
         view_range = float(np.median(np.hypot(*(points - key.origin).T)))
         log_odds = self._log_odds(min(result.best.score, found.score))
+        wide = candidate.search_area > p.searched
         fit = Match(
             m, key, found.pose, information, found.score, overlap, second, candidate.search_area,
-            log_odds, view_range=view_range, weak=log_odds < 0.0,
+            log_odds, view_range=view_range, weak=log_odds < 0.0, wide=wide,
         )  # fmt: skip
         return SearchResult(candidate, fit, found.pose[None])
 

@@ -29,7 +29,7 @@ from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.closure_ambiguity import reject_ambiguous
-from rlml_slam.slam.closures.closure_candidates import Candidate, candidates
+from rlml_slam.slam.closures.closure_candidates import Candidate, candidates, candidates_at
 from rlml_slam.slam.closures.closure_consistency import is_consistent
 from rlml_slam.slam.closures.closure_matching import UNDECIDED, ClosureMatcher, Match
 from rlml_slam.slam.closures.closure_monitor import ClosureMonitor
@@ -39,14 +39,16 @@ from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap, edge_of_matc
 from rlml_slam.slam.closures.local_map import Surroundings
 from rlml_slam.slam.closures.loop_closure import Closure
 from rlml_slam.slam.closures.weak_match import keep_best
-from rlml_slam.slam.keyframes import Keyframe
-from rlml_slam.types import EdgeKind
+from rlml_slam.slam.keyframes import FoundPose, Keyframe
+from rlml_slam.types import EdgeKind, Frame
+
+Submaps = Sequence[KeyframeSubmap]
 
 MAX_PENDING = 60  # pending closures, the newest
 PENDING = 'pending: needs consistent closures from other viewpoints'
 BY_REFLECTORS = 'proposed by reflectors: '
+BY_SEARCH = 'found in the map: '
 SAME_POSE_GATE = 16.3  # 99.9 % of chi-square with 3 degrees of freedom
-CONFIRMATION_WINDOW = 1.0, 0.2  # [m], [rad] around a pose proposed by reflectors
 
 
 class LoopCloser:
@@ -54,6 +56,7 @@ class LoopCloser:
 
     ``records`` has the closures between keyframes of the graph; ``tried`` counts all accepted
     (True) and rejected (False) ones; ``changed`` if one was added since the last solve.
+    ``found``: where a search has found the robot, until its next keyframe.
     """
 
     def __init__(self, params: Parameters, solver: OnlineSolver) -> None:
@@ -68,40 +71,38 @@ class LoopCloser:
         self._num_scans = 0
         self._num_accepted = 0
         self._num_solved = 0  # closures below this number are in the estimate
+        self.found: FoundPose | None = None
         self.records = ClosureRecords()
         self.tried = {True: 0, False: 0}
         self.changed = False
 
     # --- proposals -----------------------------------------------------------------------------
 
-    def search(
-        self, key: Keyframe, points: Array, submaps: Sequence[KeyframeSubmap]
-    ) -> tuple[Closure, ...]:
+    def is_due(self, frame: Frame) -> bool:
+        """Whether a frame has to be a keyframe, for a search has found the robot."""
+        return self.found is not None and frame.scan_used
+
+    def search(self, key: Keyframe, points: Array, submaps: Submaps) -> tuple[Closure, ...]:
         """Closures of every n-th keyframe with ``points`` (n, 2), n the keyframe interval.
 
-        After a large drift, weak matches with the local map count as well.
+        After a large drift, weak matches with the local map count as well. Where a search has
+        ``found`` the robot, the closure of this keyframe there.
         """
         p = self._p.loop_closure
+        if self.found is not None:
+            return self._close_at(self.found, key, points, submaps)
         self._num_scans += 1
         if not p.enabled or self._num_scans % p.keyframe_interval:
             return ()
-        # the newest submaps surround the robot wherever it is
-        newest = 2 * self._p.back_end.submap_size
-        old = [m for m in submaps if m.anchor.index + newest <= key.index]
-        return self._match(key, points, submaps, Surroundings(self._graph, old))
+        around = Surroundings(self._graph, self._old(key, submaps))
+        return self._match(key, points, submaps, around)
 
-    def match(
-        self, key: Keyframe, points: Array, submaps: Sequence[KeyframeSubmap]
-    ) -> tuple[Closure, ...]:
+    def match(self, key: Keyframe, points: Array, submaps: Submaps) -> tuple[Closure, ...]:
         """Closures of a keyframe with ``points`` (n, 2) and the finished ``submaps`` near it."""
         return self._match(key, points, submaps, None)
 
     def _match(
-        self,
-        key: Keyframe,
-        points: Array,
-        submaps: Sequence[KeyframeSubmap],
-        around: Surroundings | None,
+        self, key: Keyframe, points: Array, submaps: Submaps, around: Surroundings | None
     ) -> tuple[Closure, ...]:
         near = candidates(self._graph, key, submaps, self._p.loop_closure)
         results = [self._matcher.match(candidate, key, points, around) for candidate in near]
@@ -109,7 +110,7 @@ class LoopCloser:
         return self._add(keep_best(reject_ambiguous(self._graph, key, points, results, ratio)))
 
     def confirm(
-        self, proposed: ConstellationMatch, points: Array | None, submaps: Sequence[KeyframeSubmap]
+        self, proposed: ConstellationMatch, points: Array | None, submaps: Submaps
     ) -> tuple[Closure, ...]:
         """Closure proposed by reflectors, unless the scan ``points`` (n, 2) contradicts it."""
         key = proposed.key
@@ -133,27 +134,19 @@ class LoopCloser:
         proposed: ConstellationMatch,
         result: Match | Closure,
         points: Array,
-        submaps: Sequence[KeyframeSubmap],
+        submaps: Submaps,
     ) -> Match | Closure:
         """Scan match at the proposed pose, or a rejection; ``result`` where none is possible."""
-        key, T_map_key, poses = proposed.key, proposed.T_map_key, self._graph.poses
-        # the newest submaps surround the robot wherever it is
-        newest = 2 * self._p.back_end.submap_size
-        old = [m for m in submaps if m.anchor.index + newest <= key.index]
-        gaps = [
-            math.dist(se2.transform(m.grid_pose(poses), m.centre[None])[0], T_map_key[:2])
-            for m in old
-        ]
-        if not gaps or min(gaps) >= self._p.loop_closure.max_distance:
+        key, T_map_key = proposed.key, proposed.T_map_key
+        near = self._candidates_at(T_map_key, key, submaps)
+        if not near:
             return result
-        m = old[int(np.argmin(gaps))]
-        grid = m.grid_pose(poses)
-        candidate = Candidate(m, se2.between(grid, T_map_key), *CONFIRMATION_WINDOW)
-        found = self._matcher.match(candidate, key, points).result
+        found = self._matcher.match(near[0], key, points).result
         if isinstance(found, Closure):
             if found.why in UNDECIDED:
                 return result
             return replace(found, why=BY_REFLECTORS + found.why)
+        grid = found.m.grid_pose(self._graph.poses)
         off = se2.between(T_map_key, se2.compose(grid, found.T_grid_key))
         cov = se2.rotate_cov(proposed.cov, -proposed.T_anchor_key[2])
         if off @ np.linalg.solve(cov, off) > SAME_POSE_GATE:
@@ -162,6 +155,28 @@ class LoopCloser:
             found, search_area=proposed.search_area, log_odds=proposed.log_odds,
             source=BY_REFLECTORS, reflector_pairs=proposed.reflector_pairs,
         )  # fmt: skip
+
+    def _close_at(
+        self, found: FoundPose, key: Keyframe, points: Array, submaps: Submaps
+    ) -> tuple[Closure, ...]:
+        """The scan has to match one of the nearest submaps there, else there is none."""
+        self.found = None
+        T_map_key = se2.compose(found.T_map, se2.between(found.T_local, key.T_local))
+        near = self._candidates_at(T_map_key, key, submaps)
+        results = (self._matcher.match(candidate, key, points).result for candidate in near)
+        fits = next((r for r in results if isinstance(r, Match)), None)
+        if fits is None:
+            return ()
+        return self._add([replace(fits, search_area=found.area, source=BY_SEARCH)])
+
+    def _candidates_at(self, T_map_key: Array, key: Keyframe, submaps: Submaps) -> list[Candidate]:
+        old = self._old(key, submaps)
+        return candidates_at(self._graph, old, T_map_key, self._p.loop_closure)
+
+    def _old(self, key: Keyframe, submaps: Submaps) -> list[KeyframeSubmap]:
+        """Without the newest ones, which surround the robot wherever it is."""
+        newest = 2 * self._p.back_end.submap_size
+        return [m for m in submaps if m.anchor.index + newest <= key.index]
 
     # --- verification --------------------------------------------------------------------------
 
@@ -194,7 +209,7 @@ class LoopCloser:
             uniform(np.array([c.search_area for c in matches])),
             np.array([c.log_odds for c in matches]),
             np.array([c.view_range for c in matches]),
-            np.array([c.weak for c in matches]),
+            np.array([c.weak or c.wide for c in matches]),
         )
         out = []
         for n, (c, is_added) in enumerate(zip(matches, consistent.tolist(), strict=True)):
@@ -259,7 +274,7 @@ class LoopCloser:
         new: Renumbering,
         edges: Mapping[int, int],
         poses: Mapping[int, int],
-        submaps: Sequence[KeyframeSubmap],
+        submaps: Submaps,
     ) -> None:
         """Follow the removal of keyframes, as ClosureRecords.renumber."""
         self._pending = [

@@ -63,6 +63,7 @@ class Slam(SynchronizedSystem):
             say.Correct: self._command,
             say.LocalizeIn: self._command,
             say.MapFrame: self._map_frame,
+            say.CloseLoop: self._close_loop,
             say.Search: self._search,
             say.DrawMap: lambda c: self.execute(self.system.on_map_drawn(c.number, self.map())),
             say.TakeMap: self._take_map,
@@ -156,6 +157,9 @@ class Slam(SynchronizedSystem):
             self.execute(
                 self.system.on_update(command.session, command.frame.stamp, update, belief)
             )
+
+    def _close_loop(self, command: say.CloseLoop) -> None:
+        self.back_end.loop_closer.found = command.found
 
     def _timed_add(self, frame: Frame) -> Update | None:
         """One frame to the back end; with the time of the processor."""

@@ -29,7 +29,7 @@ from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.closures.closure_candidates import candidates
 from rlml_slam.slam.closures.closure_matching import ClosureMatcher
 from rlml_slam.slam.closures.keyframe_submap import TURN, KeyframeSubmap, edge_of_match
-from rlml_slam.slam.keyframes import Interval, Keyframe, Sighting
+from rlml_slam.slam.keyframes import FoundPose, Interval, Keyframe, Sighting
 from rlml_slam.types import ANONYMOUS, EdgeKind, Frame, Motion, Observation, Status
 
 CURVE = drive((0.6, 0.0, 3.0), (0.6, 0.6, 4.0), (0.5, -0.7, 2.0))
@@ -530,3 +530,84 @@ def test_robot_that_is_found_again_has_the_error_of_what_is_mapped_there():
     assert error[1, 1] > 0.01**2
     assert updates[-1].optimized
     np.testing.assert_allclose(updates[-1].known.cov_map, error + 1e-4 * EYE, rtol=0.2)
+
+
+# --- a robot that was found by a search --------------------------------------------------------
+
+
+def led_astray(off, sigma):
+    """A lap with a gap on its way, where odometry errs by ``off`` and says ``sigma``."""
+    frames, gap = frames_along(LAP, BLOCK), len(LAP) // 2
+    astray = se2.compose(se2.compose(LAP[gap], np.array(off)), se2.between(LAP[gap], LAP[gap:]))
+    wide = np.diag(np.square(sigma))
+    for k, T in enumerate(astray, gap):
+        o = frames[k].observation
+        if k == gap:
+            delta = se2.between(LAP[k - 1], T)
+            o = replace(o, motion=Motion(delta, wide))
+        cov = frames[k].cov_local + wide
+        frames[k] = replace(frames[k], observation=o, T_local_base=T, cov_local=cov)
+    return frames, gap
+
+
+def off_the_path(back_end):
+    return np.linalg.norm(back_end.trajectory()[1][: len(LAP), :2] - LAP[:, :2], axis=1)
+
+
+def found_at(back_end, frame, pose):
+    """Closures of a frame that a search has found at a pose."""
+    back_end.loop_closer.found = FoundPose(frame.T_local_base, pose, 100.0)
+    update = back_end.add(replace(frame, stamp=frame.stamp + STEP))
+    back_end.optimize()
+    return update.closures
+
+
+@pytest.mark.parametrize(
+    ('off', 'sigma', 'enters'),
+    [((1.5, -1.0, 0.4), (1.5, 1.5, 0.4), True), ((4.0, 3.0, 1.0), (0.3, 0.3, 0.1), False)],
+)
+def test_way_since_a_gap_is_bent_to_where_the_robot_was_found(off, sigma, enters):
+    """What was mapped since the gap moves with it; odometry that is far more certain stays."""
+    p = Parameters(loop_closure=LoopClosure(enabled=False))
+    frames, gap = led_astray(off, sigma)
+    back_end = BackEnd(p)
+    for frame in frames:
+        back_end.add(frame)
+    back_end.optimize()
+    before = off_the_path(back_end)
+    assert before[gap:].min() > 0.5
+    closures = found_at(back_end, frames[-1], LAP[-1])
+    assert [c.accepted for c in closures] == [enters]
+    after = off_the_path(back_end)
+    if enters:
+        assert after.max() < 0.1
+        found = se2.compose(back_end.T_map_local, frames[-1].T_local_base)
+        np.testing.assert_allclose(found, LAP[-1], atol=0.05)
+    else:
+        np.testing.assert_allclose(after, before, atol=1e-3)
+        assert 'pending' in closures[0].why
+
+
+def test_robot_is_not_found_at_a_pose_where_its_scan_does_not_fit():
+    frames, _ = led_astray((1.5, -1.0, 0.4), (1.5, 1.5, 0.4))
+    back_end = BackEnd(Parameters(loop_closure=LoopClosure(enabled=False)))
+    for frame in frames:
+        back_end.add(frame)
+    back_end.optimize()
+    before = off_the_path(back_end)
+    turned = se2.compose(LAP[-1], np.array([0.0, 0.0, np.pi]))
+    assert found_at(back_end, frames[-1], turned) == ()
+    np.testing.assert_allclose(off_the_path(back_end), before, atol=0.05)
+
+
+def test_robot_that_was_found_becomes_a_keyframe_as_soon_as_a_scan_matches():
+    frames, _ = led_astray((1.5, -1.0, 0.4), (1.5, 1.5, 0.4))
+    back_end = BackEnd(Parameters())
+    for frame in frames:
+        back_end.add(frame)
+    back_end.loop_closer.found = FoundPose(frames[-1].T_local_base, LAP[-1], 100.0)
+    later = replace(frames[-1], stamp=frames[-1].stamp + STEP, scan_used=False)
+    assert back_end.add(later) is None
+    assert back_end.loop_closer.found is not None
+    assert back_end.add(replace(later, stamp=later.stamp + STEP, scan_used=True)) is not None
+    assert back_end.loop_closer.found is None

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from made_laps import COV, LAP, SIGMA, true, two_laps
@@ -225,3 +227,31 @@ def test_weak_matches_push_no_strong_one_out():
         closer._add([matched(graph, k, k + LAP, rng, shift)])
     assert len(closer._pending) == MAX_PENDING
     assert [c.key.index for c in closer._pending if not c.weak] == [5 + LAP]
+
+
+@pytest.mark.parametrize(
+    ('window', 'is_wide'), [(P.loop_closure.search_window, False), (WINDOW, True)]
+)
+def test_match_of_a_search_wider_than_the_smallest_one_is_wide(window, is_wide):
+    world, place = hall(0), np.array([0.2, 0.1, 0.1])
+    _, _, submaps = mapped(world, (0.0,))
+    key = Keyframe(9, 9, place, np.eye(3), None, np.zeros(2), 9)
+    candidate = Candidate(submaps[0], place, window, P.loop_closure.search_angle)
+    found = ClosureMatcher(P).match(candidate, key, seen(world, place, 360)).result
+    assert isinstance(found, Match)
+    assert found.wide is is_wide
+    assert not found.weak
+
+
+def test_wide_match_waits_as_a_weak_one_does():
+    """Where the place is uncertain, one room fits as well as the next one."""
+    for wide in (False, True):
+        rng = np.random.default_rng(0)
+        graph = two_laps(rng)
+        closer = LoopCloser(P, OnlineSolver(graph))
+        first = replace(matched(graph, 5, 5 + LAP, rng, weak=False), wide=wide)
+        assert [c.accepted for c in closer._add([first])] == [not wide]
+        later = [replace(matched(graph, k, k + LAP, rng, weak=False), wide=True) for k in (30, 55)]
+        assert 5 + LAP in {c.j for c in closer.records if c.accepted} | {
+            c.j for match in later for c in closer._add([match]) if c.accepted
+        }

@@ -4,9 +4,10 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from rlml_slam.params import Parameters
-from rlml_slam.slam.conversation import Relocate, SessionFrame
+from rlml_slam.slam.conversation import CloseLoop, Relocate, SessionFrame
 from rlml_slam.slam.relocalization.recovery import Recovery
 from rlml_slam.slam.relocalization.scan_relocalization import Relocation
 from rlml_slam.slam.search_area import search_area
@@ -43,8 +44,9 @@ def test_robot_that_stands_is_looked_for_rarely_and_at_once_where_it_comes():
 
 def drove_unseen(there=(0.0, 0.0, 0.0), cov=UNSURE, **changes):
     given = {
-        'stamp': SECOND, 'T_map_base': np.array(there), 'cov_map': cov, 'unconfirmed': False,
-        'scan_used': False, 'scan_score': float('nan'), 'statuses': np.zeros(0, dtype=int),
+        'stamp': SECOND, 'T_map_base': np.array(there), 'T_local_base': np.ones(3),
+        'cov_map': cov, 'unconfirmed': False, 'scan_used': False,
+        'scan_score': float('nan'), 'statuses': np.zeros(0, dtype=int),
     }  # fmt: skip
     return SimpleNamespace(**{**given, **changes})
 
@@ -67,11 +69,28 @@ def test_robot_that_matches_its_map_is_where_odometry_led_and_others_anywhere():
 
 def test_robot_that_only_drove_unseen_does_not_jump_through_the_building():
     """After a gap a scan fits one place of the unfinished map, which may be a twin."""
-    for x, moves in ((1.0, True), (30.0, False)):
+    for x, fits in ((1.0, True), (30.0, False)):
         system = System(Parameters())
         record = SessionFrame(1, drove_unseen())
         command = system.searches.begin(Purpose.RECOVER, record, None)
-        found = Relocation(Verdict.UNIQUE, 'fits', np.array([x, 0.0, 0.0]), 1e-4 * np.eye(3), 0.7)
+        there = np.array([x, 0.0, 0.0])
+        found = Relocation(Verdict.UNIQUE, 'fits', there, 1e-4 * np.eye(3), 0.7)
         out = system.on_search_result(command.number, found)
-        assert any(isinstance(c, Relocate) for c in out) is moves
-        assert ('too far' in system.recovery.why) is not moves
+        if fits:  # a loop closure, which the graph has to agree with: the robot does not jump
+            (closes,) = out
+            assert isinstance(closes, CloseLoop)
+            np.testing.assert_array_equal(closes.found.T_map, there)
+            np.testing.assert_array_equal(closes.found.T_local, record.frame.T_local_base)
+            assert closes.found.area == pytest.approx(8.0**2)  # at all headings
+        else:
+            assert out == []
+        assert ('too far' in system.recovery.why) is not fits
+
+
+def test_robot_that_may_have_been_carried_jumps_to_where_it_was_found():
+    system = System(Parameters())
+    record = SessionFrame(1, drove_unseen(unconfirmed=True))
+    command = system.searches.begin(Purpose.RECOVER, record, None)
+    found = Relocation(Verdict.UNIQUE, 'fits', np.array([30.0, 0.0, 0.0]), 1e-4 * np.eye(3), 0.7)
+    out = system.on_search_result(command.number, found)
+    assert any(isinstance(c, Relocate) for c in out)
