@@ -96,8 +96,7 @@ class BackEnd:
         self.known: ReferencePose | None = None
         self.interval: Interval | None = None
         self._keyframes_since_solve = 0
-        # of the newest keyframe, for its update
-        self._optimized = False
+        self._optimized = False  # as below: of the newest keyframe, for its update
         self._changed: tuple[Closure, ...] = ()
         self._removed: tuple[int, ...] = ()
         self.maintenance = GraphMaintenance(
@@ -121,6 +120,7 @@ class BackEnd:
             self.interval.add_motion(frame)
             if frame.jumped:
                 self.interval.jump(frame)
+                self.loop_closer.found = None  # in the local frame of before
         update = None
         last = self.keyframes[-1] if self.keyframes else None
         if self.loop_closer.is_due(frame) or is_keyframe(last, frame, self._p.back_end):

@@ -611,3 +611,16 @@ def test_robot_that_was_found_becomes_a_keyframe_as_soon_as_a_scan_matches():
     assert back_end.loop_closer.found is not None
     assert back_end.add(replace(later, stamp=later.stamp + STEP, scan_used=True)) is not None
     assert back_end.loop_closer.found is None
+
+
+def test_where_a_robot_was_found_is_forgotten_once_it_jumps():
+    frames, _ = led_astray((1.5, -1.0, 0.4), (1.5, 1.5, 0.4))
+    back_end = BackEnd(Parameters())
+    for frame in frames:
+        back_end.add(frame)
+    back_end.loop_closer.found = FoundPose(frames[-1].T_local_base, LAP[-1], 100.0)
+    jumped = replace(frames[-1], stamp=frames[-1].stamp + STEP, scan_used=False, jumped=True)
+    update = back_end.add(jumped)
+    assert update is not None
+    assert back_end.loop_closer.found is None
+    assert not any('found in the map' in c.why for c in update.closures)
