@@ -158,15 +158,14 @@ def _run(
 
 
 def figures(of: Intruder) -> tuple[float, float]:
-    """Poses per second of the simulator, and their root mean square error [m].
+    """Poses of the simulator's scans per second, and their root mean square error [m].
 
     The map begins where the first scan came, which may be later than the truth.
     """
     stamps = sorted(of.poses.keys() & of.true.keys())
     start = compose(of.true[stamps[0]], inverse(of.poses[stamps[0]])) if stamps else np.zeros(3)
     steps = [math.hypot(*(compose(start, of.poses[t]) - of.true[t])[:2]) for t in stamps]
-    known = sorted(of.poses)
-    if len(known) < 2:
+    if len(stamps) < 2:
         return 0.0, math.nan
-    rate = (len(known) - 1) / ((known[-1] - known[0]) * 1e-9)
-    return rate, float(np.sqrt(np.mean(np.square(steps)))) if steps else math.nan
+    rate = (len(stamps) - 1) / ((stamps[-1] - stamps[0]) * 1e-9)
+    return rate, float(np.sqrt(np.mean(np.square(steps))))

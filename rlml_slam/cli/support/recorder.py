@@ -254,7 +254,7 @@ class Recorder(Node):
         """One line for the progress."""
         error = self.error()
         parts = [
-            f'error {100 * error:.1f} cm' if error is not None else 'no pose yet',
+            f'{len(self.frames.stamps)} poses' if error is None else f'error {100 * error:.1f} cm',
             f'{len(self._reflectors)} reflectors',
             f'{len(self._updates)} keyframes',
             f'{sum(u.accepted for u in self._updates)} closures',
