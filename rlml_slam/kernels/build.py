@@ -79,22 +79,25 @@ def _compile(work: Path, processor: str, progress: Progress) -> Compiled:
     workers = max(1, min(len(os.sched_getaffinity(0)), int(free / MEMORY)))
     found: dict[str, list[Entry]] = {}
     constants: dict[str, bytes] = {}
-    context = multiprocessing.get_context('spawn')
+    pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context('spawn'))
     try:
-        with ProcessPoolExecutor(workers, mp_context=context) as pool:
-            folders = pool.submit(_folders).result()
-            waiting = {pool.submit(_compile_folder, work, processor, f) for f in folders}
-            last, done = '', 0
-            while waiting:
-                progress(done, sum(map(len, folders)), last)
-                ready, waiting = wait(waiting, TICK, FIRST_COMPLETED)
-                for folder, entries, of_folder in (future.result() for future in ready):
-                    last, done = folder[-1], done + len(folder)
-                    # two processes may have compiled the same kernel; either will do
-                    found = entries | found
-                    constants |= of_folder
+        folders = pool.submit(_folders).result()
+        waiting = {pool.submit(_compile_folder, work, processor, f) for f in folders}
+        last, done = '', 0
+        while waiting:
+            progress(done, sum(map(len, folders)), last)
+            ready, waiting = wait(waiting, TICK, FIRST_COMPLETED)
+            for folder, entries, of_folder in (future.result() for future in ready):
+                last, done = folder[-1], done + len(folder)
+                # two processes may have compiled the same kernel; either will do
+                found = entries | found
+                constants |= of_folder
     except BrokenProcessPool as e:
         raise BuildError('a process that compiles kernels has ended: is memory short?') from e
+    finally:
+        for worker in multiprocessing.active_children():  # interrupted, they have nothing to do
+            worker.terminate()
+        pool.shutdown(cancel_futures=True)
     return [entry for name in sorted(found) for entry in found[name]], constants
 
 

@@ -102,17 +102,14 @@ FrontEndCommand = StartSession | Relocate | Correct | LocalizeIn
 
 @dataclass(frozen=True)
 class MapFrame:
-    """Add the frame to the graph; ``on_update`` is the answer where it became a keyframe."""
+    """Add the frame to the graph; ``on_update`` is the answer where it became a keyframe.
+
+    ``found``: where a search has found the robot since the last frame.
+    """
 
     session: int
     frame: Frame
-
-
-@dataclass(frozen=True)
-class CloseLoop:
-    """Close a loop where a search has found the robot, which only drove where nothing was seen."""
-
-    found: FoundPose
+    found: FoundPose | None = None
 
 
 @dataclass(frozen=True)
@@ -192,8 +189,8 @@ class Answer:
 
 
 Command = (
-    FrontEndCommand | MapFrame | CloseLoop | Search | DrawMap | KeepMap | ForgetMap | TakeMap
-    | PublishMap | RememberPose | Log | Answer
+    FrontEndCommand | MapFrame | Search | DrawMap | KeepMap | ForgetMap | TakeMap | PublishMap
+    | RememberPose | Log | Answer
 )  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from rlml_slam.motion import STILL, compose_motion
 from rlml_slam.slam.back_end.back_end import Update
 from rlml_slam.slam.closures.closure_table import describe
 from rlml_slam.slam.conversation import Command, Correct, MapFrame, SessionFrame, warning
+from rlml_slam.slam.keyframes import FoundPose
 from rlml_slam.types import Belief
 
 
@@ -16,7 +17,7 @@ class MappedFrames:
     """Frames on their way to the graph; ``session`` is that of those in it, None while empty.
 
     While ``is_paused``, frames are left out, and their motion is added to that of the next one.
-    ``jumps``: no motion leads to the next frame.
+    ``jumps``: no motion leads to the next frame. ``found``: where a search has found the robot.
     """
 
     def __init__(self) -> None:
@@ -27,6 +28,7 @@ class MappedFrames:
         """The graph is empty, or another one."""
         self.session: int | None = None
         self.jumps, self._skipped = False, STILL
+        self.found: FoundPose | None = None
 
     def add(self, record: SessionFrame) -> list[Command]:
         """The command to map a frame, none while paused."""
@@ -41,7 +43,8 @@ class MappedFrames:
         if self.jumps:
             frame, self.jumps = replace(frame, jumped=True), False
         self.session = record.session
-        return [MapFrame(record.session, frame)]
+        found, self.found = self.found, None
+        return [MapFrame(record.session, frame, found)]
 
 
 def corrections(session: int, stamp: int, update: Update, belief: Belief | None) -> list[Command]:

@@ -21,7 +21,6 @@ from rlml_slam.slam.conversation import (
     ANY,
     FIRST_REQUEST,
     Answer,
-    CloseLoop,
     Command,
     Correct,
     ForgetMap,
@@ -56,9 +55,8 @@ class System:
 
     ``map`` is what is localized in, None while a map is made. ``entry`` is there while a saved map
     is to be continued and the robot's place in it is not known: then nothing is mapped.
-    ``mode`` is the number of the newest LocalizeIn;
-    ``T_map_local`` (3,) is the graph's newest correction of the session, ``newest`` the newest
-    frame.
+    ``mode`` is the number of the newest LocalizeIn; ``T_map_local`` (3,) is the graph's newest
+    correction of the session, ``newest`` the newest frame.
     """
 
     def __init__(self, params: Parameters, first_request: int = FIRST_REQUEST) -> None:
@@ -269,8 +267,7 @@ class System:
         assert record is not None
         if pending.purpose is Purpose.RESTORE:
             assert self._last_pose is not None
-            start, why = verified(self._last_pose, found)
-            self._last_pose = None
+            (start, why), self._last_pose = verified(self._last_pose, found), None
             return [warning(why)] if start is None else [info(why), self._start(record, *start)]
         if pending.purpose is Purpose.RECOVER:
             self.recovery.why = found.why
@@ -278,14 +275,16 @@ class System:
             self.entry.why = found.why
         if found.verdict is not Verdict.UNIQUE or pose is None or cov is None:
             return []
-        if pending.area is not None:
-            if pending.area.contains(pose):
-                return [CloseLoop(FoundPose(record.frame.T_local_base, pose, pending.area.size))]
+        area, frame = pending.area, record.frame
+        if area is not None and not area.contains(pose):
             self.recovery.why = f'{found.why}, but it is too far from where odometry led'
             return []
+        if area is not None and frame.observation.points is not None and not self.frames.is_paused:
+            self.frames.found = FoundPose(frame.T_local_base, pose, area.size)
+            return []  # the graph closes a loop, and nothing jumps
         if self.entry is not None:
             return [self._start(record, pose, cov)]
-        go_on = Relocate(self.requests.new_number(), record.session, record.frame.stamp, pose, cov)
+        go_on = Relocate(self.requests.new_number(), record.session, frame.stamp, pose, cov)
         return [info(f'found again: {found.why}'), self.requests.ask(go_on)]
 
     def _answer(self, number: int, pending: Pending, found: Relocation) -> list[Command]:

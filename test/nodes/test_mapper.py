@@ -204,7 +204,7 @@ def test_transform_is_dated_ahead_and_repeated_for_a_second(make, ear, monkeypat
 def test_pause_stops_the_map_but_not_map_to_odom(mapper):
     used = []
     add = mapper.back_end.add
-    mapper.back_end.add = lambda frame: (used.append(frame.stamp), add(frame))[1]
+    mapper.back_end.add = lambda frame, found: (used.append(frame.stamp), add(frame, found))[1]
     first = give(mapper, 0)
     mapper.system.pause(True)
     moved = give(mapper, 1, pose=(1.0, 0.0, 0.0))

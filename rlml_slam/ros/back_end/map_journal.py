@@ -19,6 +19,7 @@ from rlml_slam.maps import map_container
 from rlml_slam.maps.map_container import Content
 from rlml_slam.params import Parameters
 from rlml_slam.ros.back_end.map_folder import AUTOSAVE, JOURNAL, MapFolder
+from rlml_slam.slam.keyframes import FoundPose
 from rlml_slam.slam.store import journal, map_file
 from rlml_slam.slam.store.journal import Journal
 
@@ -50,12 +51,12 @@ class MapJournal:
         self.close(keep)
         self._start(base)
 
-    def add(self, frame: Any, is_keyframe: bool) -> None:
-        """A frame that the graph was given."""
+    def add(self, frame: Any, is_keyframe: bool, found: FoundPose | None) -> None:
+        """A frame that the graph was given, and where a search has found the robot."""
         if self._p.node.journal_period == 0.0 or self.problem:
             return
         self._has_keyframes |= is_keyframe
-        self._journal.add(frame, is_keyframe)
+        self._journal.add(frame, is_keyframe, found)
         self.write()
 
     @property

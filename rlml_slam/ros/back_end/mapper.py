@@ -83,7 +83,6 @@ class Mapper:
             say.LocalizeIn: self._command,
             say.Correct: self._correct,
             say.MapFrame: self._map_frame,
-            say.CloseLoop: self._close_loop,
             say.Search: self.searcher.submit,
             say.DrawMap: lambda c: self.execute(
                 self.system.on_map_drawn(c.number, self.current())
@@ -135,8 +134,8 @@ class Mapper:
 
     def _map_frame(self, command: say.MapFrame) -> None:
         frame = command.frame
-        update = self.back_end.add(frame)
-        self.journal.add(frame, update is not None)
+        update = self.back_end.add(frame, command.found)
+        self.journal.add(frame, update is not None, command.found)
         if update is None:
             return
         self._topics.update(frame.stamp, self.back_end.graph.poses[update.keyframe, :2], update)
@@ -145,9 +144,6 @@ class Mapper:
             self._report_survey()
             belief = self.back_end.belief()
         self.execute(self.system.on_update(command.session, frame.stamp, update, belief))
-
-    def _close_loop(self, command: say.CloseLoop) -> None:
-        self.back_end.loop_closer.found = command.found
 
     def _correct(self, command: say.Correct) -> None:
         self._command(command)

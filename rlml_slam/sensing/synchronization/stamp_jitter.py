@@ -31,9 +31,12 @@ class StampJitter:
             clock = self._filters[stream, source] = StampFilter()
         return clock.filtered(stamp)
 
-    def restart(self, stream: str, source: str) -> None:
-        """Begin the filter of a clock again: stamps of it were wrong."""
-        self._filters.pop((stream, source), None)
+    def restart(self, clock: tuple[str, str] | None = None) -> None:
+        """Begin the filter of a clock (stream, source), or of all, again: stamps were wrong."""
+        if clock is None:
+            self._filters.clear()
+        else:
+            self._filters.pop(clock, None)
 
     def delay(self, stamp: int, source: str) -> int:
         """Time [ns] from the stamp of a scan, or set of detections, to its measurement.

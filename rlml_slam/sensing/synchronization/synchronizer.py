@@ -178,6 +178,7 @@ class Synchronizer:
         if wrong_after is not None:
             self._stamps.forget_after(wrong_after)
             self._queue.drop_after(wrong_after)
+            self._jitter.restart()
             self.buffer.forget_after(wrong_after)
             self.odometry.forget_after(wrong_after)
         early_after = self._stamps.early_after(stream, stamp, source)
@@ -195,7 +196,7 @@ class Synchronizer:
         """Drop what a source sent with stamps ahead of those that followed."""
         self._stamps.forget_early(stream, stamp, source)
         clock = source if self._queue.has_several_lidars else ''
-        self._jitter.restart('instant' if stream in MEASURED else stream, clock)
+        self._jitter.restart(('instant' if stream in MEASURED else stream, clock))
         if stream in MEASURED:
             self._queue.drop_after(stamp, stream, source)
         elif stream == 'imu':

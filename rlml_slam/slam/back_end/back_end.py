@@ -31,7 +31,7 @@ from rlml_slam.slam.back_end.trajectory import FrameTrajectory
 from rlml_slam.slam.closures.constellation_closure import ConstellationSearch
 from rlml_slam.slam.closures.loop_closer import LoopCloser
 from rlml_slam.slam.closures.loop_closure import Closure
-from rlml_slam.slam.keyframes import Interval, Keyframe
+from rlml_slam.slam.keyframes import FoundPose, Interval, Keyframe
 from rlml_slam.slam.landmarks.delayed_association import DelayedAssociation
 from rlml_slam.slam.landmarks.landmark_persistence import LandmarkPersistence
 from rlml_slam.slam.landmarks.reflector_graph import ReflectorGraph
@@ -113,17 +113,16 @@ class BackEnd:
         self.survey_frame = self._frame_of(survey)
         self.survey_frame.found = True
 
-    def add(self, frame: Frame) -> Update | None:
-        """Add a frame of the front end; an Update if it became a keyframe."""
+    def add(self, frame: Frame, found: FoundPose | None = None) -> Update | None:
+        """Add a frame, and where a search has found the robot; an Update if it is a keyframe."""
         start = time.perf_counter(), time.thread_time()
         if self.interval is not None:
             self.interval.add_motion(frame)
             if frame.jumped:
                 self.interval.jump(frame)
-                self.loop_closer.found = None  # in the local frame of before
-        update = None
-        last = self.keyframes[-1] if self.keyframes else None
-        if self.loop_closer.is_due(frame) or is_keyframe(last, frame, self._p.back_end):
+        self.loop_closer.follow(frame, found)
+        update, last = None, self.keyframes[-1] if self.keyframes else None
+        if self.loop_closer.is_due or is_keyframe(last, frame, self._p.back_end):
             update = self._add_keyframe(frame, start)
         assert self.interval is not None
         if not frame.unconfirmed:
@@ -135,11 +134,12 @@ class BackEnd:
     def _add_keyframe(self, frame: Frame, start: tuple[float, float]) -> Update:
         self._optimized, self._changed, self._removed = False, (), ()
         key = self._add_pose(frame)
+        at_once = frame.jumped or self.loop_closer.is_due
         closures = self._close_loops(key)
         self._join_reflectors()
         self._keyframes_since_solve += 1
         is_due = self._keyframes_since_solve >= self._p.back_end.optimize_every
-        if frame.jumped or (is_due and self._has_changed):
+        if frame.jumped or ((is_due or at_once) and self._has_changed):
             self.optimize()
             self.maintenance.after_solve(self.keyframes)
         elif not closures:

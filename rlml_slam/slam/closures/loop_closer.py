@@ -29,7 +29,7 @@ from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.closure_ambiguity import reject_ambiguous
-from rlml_slam.slam.closures.closure_candidates import Candidate, candidates, candidates_at
+from rlml_slam.slam.closures.closure_candidates import candidates, candidates_at
 from rlml_slam.slam.closures.closure_consistency import is_consistent
 from rlml_slam.slam.closures.closure_matching import UNDECIDED, ClosureMatcher, Match
 from rlml_slam.slam.closures.closure_monitor import ClosureMonitor
@@ -56,7 +56,7 @@ class LoopCloser:
 
     ``records`` has the closures between keyframes of the graph; ``tried`` counts all accepted
     (True) and rejected (False) ones; ``changed`` if one was added since the last solve.
-    ``found``: where a search has found the robot, until its next keyframe.
+    ``is_due``: the newest frame has to be a keyframe, for a search has found the robot.
     """
 
     def __init__(self, params: Parameters, solver: OnlineSolver) -> None:
@@ -71,16 +71,21 @@ class LoopCloser:
         self._num_scans = 0
         self._num_accepted = 0
         self._num_solved = 0  # closures below this number are in the estimate
-        self.found: FoundPose | None = None
+        self._found: FoundPose | None = None
+        self.is_due = False
         self.records = ClosureRecords()
         self.tried = {True: 0, False: 0}
         self.changed = False
 
     # --- proposals -----------------------------------------------------------------------------
 
-    def is_due(self, frame: Frame) -> bool:
-        """Whether a frame has to be a keyframe, for a search has found the robot."""
-        return self.found is not None and frame.scan_used
+    def follow(self, frame: Frame, found: FoundPose | None) -> None:
+        """The next frame, and where a search has ``found`` the robot before it.
+
+        Then the next frame that matches its submap is to be a keyframe, which closes a loop there.
+        """
+        self._found = None if frame.jumped else found or self._found
+        self.is_due = self._found is not None and frame.scan_used and not frame.unconfirmed
 
     def search(self, key: Keyframe, points: Array, submaps: Submaps) -> tuple[Closure, ...]:
         """Closures of every n-th keyframe with ``points`` (n, 2), n the keyframe interval.
@@ -89,8 +94,8 @@ class LoopCloser:
         ``found`` the robot, the closure of this keyframe there.
         """
         p = self._p.loop_closure
-        if self.found is not None:
-            return self._close_at(self.found, key, points, submaps)
+        if self._found is not None:
+            return self._close_at(self._found, key, points, submaps)
         self._num_scans += 1
         if not p.enabled or self._num_scans % p.keyframe_interval:
             return ()
@@ -138,7 +143,8 @@ class LoopCloser:
     ) -> Match | Closure:
         """Scan match at the proposed pose, or a rejection; ``result`` where none is possible."""
         key, T_map_key = proposed.key, proposed.T_map_key
-        near = self._candidates_at(T_map_key, key, submaps)
+        old = self._old(key, submaps)
+        near = candidates_at(self._graph, old, T_map_key, self._p.loop_closure)
         if not near:
             return result
         found = self._matcher.match(near[0], key, points).result
@@ -160,18 +166,14 @@ class LoopCloser:
         self, found: FoundPose, key: Keyframe, points: Array, submaps: Submaps
     ) -> tuple[Closure, ...]:
         """The scan has to match one of the nearest submaps there, else there is none."""
-        self.found = None
+        self._found = None
         T_map_key = se2.compose(found.T_map, se2.between(found.T_local, key.T_local))
-        near = self._candidates_at(T_map_key, key, submaps)
+        near = candidates_at(self._graph, submaps, T_map_key, self._p.loop_closure)
         results = (self._matcher.match(candidate, key, points).result for candidate in near)
         fits = next((r for r in results if isinstance(r, Match)), None)
         if fits is None:
             return ()
         return self._add([replace(fits, search_area=found.area, source=BY_SEARCH)])
-
-    def _candidates_at(self, T_map_key: Array, key: Keyframe, submaps: Submaps) -> list[Candidate]:
-        old = self._old(key, submaps)
-        return candidates_at(self._graph, old, T_map_key, self._p.loop_closure)
 
     def _old(self, key: Keyframe, submaps: Submaps) -> list[KeyframeSubmap]:
         """Without the newest ones, which surround the robot wherever it is."""

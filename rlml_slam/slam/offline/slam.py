@@ -63,7 +63,6 @@ class Slam(SynchronizedSystem):
             say.Correct: self._command,
             say.LocalizeIn: self._command,
             say.MapFrame: self._map_frame,
-            say.CloseLoop: self._close_loop,
             say.Search: self._search,
             say.DrawMap: lambda c: self.execute(self.system.on_map_drawn(c.number, self.map())),
             say.TakeMap: self._take_map,
@@ -150,7 +149,7 @@ class Slam(SynchronizedSystem):
             self._give(record)
 
     def _map_frame(self, command: say.MapFrame) -> None:
-        update = self._timed_add(command.frame)
+        update = self._timed_add(command)
         if update is not None:
             belief = self.back_end.belief() if update.optimized else None
             self.updates.append(update)
@@ -158,13 +157,10 @@ class Slam(SynchronizedSystem):
                 self.system.on_update(command.session, command.frame.stamp, update, belief)
             )
 
-    def _close_loop(self, command: say.CloseLoop) -> None:
-        self.back_end.loop_closer.found = command.found
-
-    def _timed_add(self, frame: Frame) -> Update | None:
+    def _timed_add(self, command: say.MapFrame) -> Update | None:
         """One frame to the back end; with the time of the processor."""
         began = time.thread_time()
-        update = self.back_end.add(frame)
+        update = self.back_end.add(command.frame, command.found)
         if update is None:
             return None
         return replace(update, wall_ms=1e3 * (time.thread_time() - began))

@@ -23,16 +23,20 @@ from rlml_slam.maps.map_container import Content, pack, read_pieces
 from rlml_slam.maps.survey import Survey
 from rlml_slam.params import Parameters
 from rlml_slam.slam.back_end.back_end import BackEnd
+from rlml_slam.slam.keyframes import FoundPose
 from rlml_slam.slam.store import map_file
 from rlml_slam.types import Detections, Frame, Motion, Observation
 
-FORMAT, VERSION = 'rlml_slam journal', 1
+Given = tuple[Frame, FoundPose | None]
+
+FORMAT, VERSION = 'rlml_slam journal', 2
 FRAME = np.dtype(
     [
         ('stamp', '<i8'), ('T_local', '<f8', 3), ('cov_local', '<f8', (3, 3)),
         ('delta', '<f8', 3), ('cov', '<f8', (3, 3)), ('known', '?'), ('scan_score', '<f8'),
         ('scan_used', '?'), ('unconfirmed', '?'), ('jumped', '?'), ('origin', '<f8', 2),
         ('points', '<i4'), ('detections', '<i4'),  # how many; -1: none
+        ('found', '<f8', 7),  # T_local, T_map and area of a FoundPose; NaN: none
     ]
 )  # fmt: skip
 DETECTION = np.dtype(
@@ -52,14 +56,14 @@ class Journal:
             'base': None if base is None else dict(base.description),
         }  # fmt: skip
         self._head: Content | None = Content({} if base is None else base.arrays, description)
-        self._frames: list[tuple[Frame, bool]] = []
+        self._frames: list[Given] = []
 
-    def add(self, frame: Frame, is_keyframe: bool) -> None:
+    def add(self, frame: Frame, is_keyframe: bool, found: FoundPose | None = None) -> None:
         """A frame that the graph was given; only keyframes need their scans."""
         observation = dataclasses.replace(frame.observation, scan=None)
         if not is_keyframe:
             observation = dataclasses.replace(observation, points=None)
-        self._frames.append((dataclasses.replace(frame, observation=observation), is_keyframe))
+        self._frames.append((dataclasses.replace(frame, observation=observation), found))
 
     def write(self, file: IO[bytes]) -> None:
         """Append what has come since the last call, and have it on the disk."""
@@ -67,17 +71,17 @@ class Journal:
             file.writelines(pack(self._head))
             self._head = None
         if self._frames:
-            file.writelines(pack(_piece([frame for frame, _ in self._frames])))
+            file.writelines(pack(_piece(self._frames)))
             self._frames.clear()
         file.flush()
         os.fsync(file.fileno())
 
 
-def _piece(frames: list[Frame]) -> Content:
+def _piece(frames: list[Given]) -> Content:
     rows = np.zeros(len(frames), dtype=FRAME)
     seen: list[NDArray[np.void]] = [np.zeros(0, dtype=DETECTION)]
     scans: list[NDArray[np.float32]] = [np.zeros((0, 2), dtype=np.float32)]
-    for row, frame in zip(rows, frames, strict=True):
+    for row, (frame, found) in zip(rows, frames, strict=True):
         o, motion, d = frame.observation, frame.observation.motion, frame.observation.detections
         row['stamp'], row['T_local'], row['cov_local'] = (
             frame.stamp, frame.T_local_base, frame.cov_local,
@@ -88,6 +92,9 @@ def _piece(frames: list[Frame]) -> Content:
         row['origin'] = np.nan if o.origin is None else o.origin
         row['points'] = -1 if o.points is None else len(o.points)
         row['detections'] = -1 if d is None else len(d)
+        row['found'] = np.nan
+        if found is not None:
+            row['found'] = *found.T_local, *found.T_map, found.area
         if o.points is not None:
             scans.append(o.points.astype(np.float32))
         if d is not None:
@@ -100,8 +107,8 @@ def _piece(frames: list[Frame]) -> Content:
     return Content(arrays, {'format': FORMAT})
 
 
-def frames_of(piece: Content) -> Iterator[Frame]:
-    """The frames of a piece, with what a graph needs of them."""
+def frames_of(piece: Content) -> Iterator[Given]:
+    """The frames of a piece, with what a graph needs of them, and where the robot was found."""
     rows, seen, points = (piece.arrays[name] for name in ('frames', 'detections', 'points'))
     none = np.zeros(0, dtype=np.int64)
     for r in rows:
@@ -115,12 +122,14 @@ def frames_of(piece: Content) -> Iterator[Frame]:
         origin = None if np.isnan(r['origin']).any() else r['origin'].copy()
         motion = Motion(r['delta'].copy(), r['cov'].copy(), bool(r['known']))
         T, cov = r['T_local'].copy(), r['cov_local'].copy()
+        pose = r['found'].copy()
+        found = None if np.isnan(pose).any() else FoundPose(pose[:3], pose[3:6], float(pose[6]))
         yield Frame(
             stamp, Observation(stamp, motion, scan, origin, d), T, cov, T, cov,
             table['landmark'] if len(table) else none, table['status'] if len(table) else none,
             scan_score=float(r['scan_score']), scan_used=bool(r['scan_used']),
             unconfirmed=bool(r['unconfirmed']), jumped=bool(r['jumped']),
-        )  # fmt: skip
+        ), found  # fmt: skip
 
 
 def recover(
@@ -144,7 +153,7 @@ def recover(
         map_file.restore(Content(head.arrays, base), back_end)
     for piece in pieces:
         with map_file.consistent():
-            for frame in frames_of(piece):
+            for frame, found in frames_of(piece):
                 check()
-                back_end.add(frame)
+                back_end.add(frame, found)
     return back_end, params

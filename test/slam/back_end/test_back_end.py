@@ -556,9 +556,9 @@ def off_the_path(back_end):
 
 def found_at(back_end, frame, pose):
     """Closures of a frame that a search has found at a pose."""
-    back_end.loop_closer.found = FoundPose(frame.T_local_base, pose, 100.0)
-    update = back_end.add(replace(frame, stamp=frame.stamp + STEP))
-    back_end.optimize()
+    found = FoundPose(frame.T_local_base, pose, 100.0)
+    update = back_end.add(replace(frame, stamp=frame.stamp + STEP), found)
+    assert update.optimized is any(c.accepted for c in update.closures)  # at once
     return update.closures
 
 
@@ -605,12 +605,13 @@ def test_robot_that_was_found_becomes_a_keyframe_as_soon_as_a_scan_matches():
     back_end = BackEnd(Parameters())
     for frame in frames:
         back_end.add(frame)
-    back_end.loop_closer.found = FoundPose(frames[-1].T_local_base, LAP[-1], 100.0)
+    found = FoundPose(frames[-1].T_local_base, LAP[-1], 100.0)
     later = replace(frames[-1], stamp=frames[-1].stamp + STEP, scan_used=False)
-    assert back_end.add(later) is None
-    assert back_end.loop_closer.found is not None
-    assert back_end.add(replace(later, stamp=later.stamp + STEP, scan_used=True)) is not None
-    assert back_end.loop_closer.found is None
+    assert back_end.add(later, found) is None
+    unsure = replace(later, stamp=later.stamp + STEP, scan_used=True, unconfirmed=True)
+    assert back_end.add(unsure) is None
+    assert back_end.add(replace(later, stamp=unsure.stamp + STEP, scan_used=True)) is not None
+    assert back_end.add(replace(later, stamp=unsure.stamp + 2 * STEP, scan_used=True)) is None
 
 
 def test_where_a_robot_was_found_is_forgotten_once_it_jumps():
@@ -618,9 +619,32 @@ def test_where_a_robot_was_found_is_forgotten_once_it_jumps():
     back_end = BackEnd(Parameters())
     for frame in frames:
         back_end.add(frame)
-    back_end.loop_closer.found = FoundPose(frames[-1].T_local_base, LAP[-1], 100.0)
-    jumped = replace(frames[-1], stamp=frames[-1].stamp + STEP, scan_used=False, jumped=True)
-    update = back_end.add(jumped)
-    assert update is not None
-    assert back_end.loop_closer.found is None
-    assert not any('found in the map' in c.why for c in update.closures)
+    found = FoundPose(frames[-1].T_local_base, LAP[-1], 100.0)
+    later = replace(frames[-1], stamp=frames[-1].stamp + STEP, scan_used=False)
+    assert back_end.add(later, found) is None
+    assert back_end.add(replace(later, stamp=later.stamp + STEP, jumped=True)) is not None
+    assert back_end.add(replace(later, stamp=later.stamp + 2 * STEP, scan_used=True)) is None
+
+
+def test_robot_is_found_beside_what_it_mapped_just_before_the_gap():
+    """The newest submaps are not around the robot: it left them in the gap."""
+    way = drive((0.5, 0.0, 8.0), (0.5, np.pi, 1.0), (0.5, 0.0, 8.0))
+    frames, gap = frames_along(way, BLOCK), len(way) // 2
+    wide = np.diag(np.square((1.0, 1.0, 0.3)))
+    astray = se2.compose(
+        se2.compose(way[gap], np.array([0.8, -0.5, 0.2])), se2.between(way[gap], way[gap:])
+    )
+    back_end = BackEnd(Parameters(loop_closure=LoopClosure(enabled=False)))
+    for frame in frames[:gap]:
+        back_end.add(frame)
+    for k, T in enumerate(astray, gap):
+        o = frames[k].observation
+        if k == gap:
+            o = replace(o, motion=Motion(se2.between(way[k - 1], T), wide))
+        cov = frames[k].cov_local + wide
+        back_end.add(replace(frames[k], observation=o, T_local_base=T, cov_local=cov))
+    last = replace(frames[-1], stamp=frames[-1].stamp + STEP, T_local_base=astray[-1])
+    update = back_end.add(last, FoundPose(astray[-1], way[-1], 64.0))
+    assert [c.accepted for c in update.closures] == [True]
+    off = back_end.trajectory()[1][-1, :2] - way[-1, :2]
+    assert np.hypot(*off) < 0.1

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rlml_slam.params import Parameters
-from rlml_slam.slam.conversation import CloseLoop, Relocate, SessionFrame
+from rlml_slam.slam.conversation import Relocate, SessionFrame
 from rlml_slam.slam.relocalization.recovery import Recovery
 from rlml_slam.slam.relocalization.scan_relocalization import Relocation
 from rlml_slam.slam.search_area import search_area
@@ -47,6 +47,7 @@ def drove_unseen(there=(0.0, 0.0, 0.0), cov=UNSURE, **changes):
         'stamp': SECOND, 'T_map_base': np.array(there), 'T_local_base': np.ones(3),
         'cov_map': cov, 'unconfirmed': False, 'scan_used': False,
         'scan_score': float('nan'), 'statuses': np.zeros(0, dtype=int),
+        'observation': SimpleNamespace(points=np.zeros((50, 2))),
     }  # fmt: skip
     return SimpleNamespace(**{**given, **changes})
 
@@ -77,20 +78,28 @@ def test_robot_that_only_drove_unseen_does_not_jump_through_the_building():
         found = Relocation(Verdict.UNIQUE, 'fits', there, 1e-4 * np.eye(3), 0.7)
         out = system.on_search_result(command.number, found)
         if fits:  # a loop closure, which the graph has to agree with: the robot does not jump
-            (closes,) = out
-            assert isinstance(closes, CloseLoop)
-            np.testing.assert_array_equal(closes.found.T_map, there)
-            np.testing.assert_array_equal(closes.found.T_local, record.frame.T_local_base)
-            assert closes.found.area == pytest.approx(8.0**2)  # at all headings
-        else:
-            assert out == []
+            np.testing.assert_array_equal(system.frames.found.T_map, there)
+            np.testing.assert_array_equal(system.frames.found.T_local, record.frame.T_local_base)
+            assert system.frames.found.area == pytest.approx(8.0**2)  # at all headings
+        assert out == []
+        assert (system.frames.found is not None) is fits
         assert ('too far' in system.recovery.why) is not fits
 
 
-def test_robot_that_may_have_been_carried_jumps_to_where_it_was_found():
+@pytest.mark.parametrize(
+    ('changes', 'paused', 'x'),
+    [
+        ({'unconfirmed': True}, False, 30.0),  # it may have been carried
+        ({'observation': SimpleNamespace(points=None)}, False, 1.0),  # no scan can close a loop
+        ({}, True, 1.0),  # nothing is mapped
+    ],
+)
+def test_robot_that_the_graph_cannot_find_jumps_to_where_it_was_found(changes, paused, x):
     system = System(Parameters())
-    record = SessionFrame(1, drove_unseen(unconfirmed=True))
+    system.pause(paused)
+    record = SessionFrame(1, drove_unseen(**changes))
     command = system.searches.begin(Purpose.RECOVER, record, None)
-    found = Relocation(Verdict.UNIQUE, 'fits', np.array([30.0, 0.0, 0.0]), 1e-4 * np.eye(3), 0.7)
+    found = Relocation(Verdict.UNIQUE, 'fits', np.array([x, 0.0, 0.0]), 1e-4 * np.eye(3), 0.7)
     out = system.on_search_result(command.number, found)
     assert any(isinstance(c, Relocate) for c in out)
+    assert system.frames.found is None

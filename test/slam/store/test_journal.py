@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A map is made again from its journal, to the last bit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from made_worlds import ROOM, drive, observations
@@ -11,6 +13,7 @@ from rlml_slam.maps.map_container import SIZE, Content
 from rlml_slam.params import Parameters
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.front_end.front_end import FrontEnd
+from rlml_slam.slam.keyframes import FoundPose
 from rlml_slam.slam.store import map_file
 from rlml_slam.slam.store.journal import Journal, recover
 
@@ -53,6 +56,25 @@ def test_recovered_map_is_that_of_the_process(frames, tmp_path):
     assert len(back_end.reflectors()) > 3
     assert params == PARAMS
     same(back_end, again)
+
+
+def test_recovered_map_has_the_loop_where_a_search_has_found_the_robot(frames, tmp_path):
+    """Two pieces that lie a metre apart in the local frame, and on each other in the map."""
+    back_end, journal, middle = BackEnd(PARAMS), Journal(PARAMS), len(frames) // 2
+    later, aside = frames[-1].stamp, np.array([1.0, 0.0, 0.0])
+    again = [
+        replace(f, stamp=f.stamp + later, T_local_base=f.T_local_base + aside) for f in frames
+    ]
+    with (tmp_path / 'journal').open('wb') as file:
+        for k, frame in enumerate([*frames, *again]):
+            is_found = k == len(frames) + middle
+            T = frame.T_local_base
+            found = FoundPose(T, T - aside, 400.0) if is_found else None
+            update = back_end.add(frame, found)
+            journal.add(frame, update is not None, found)
+            assert not is_found or update is not None  # it is a keyframe
+        journal.write(file)
+    same(back_end, recover(tmp_path / 'journal')[0])
 
 
 def test_continued_map_is_recovered_with_what_it_was_made_of(frames, tmp_path):
