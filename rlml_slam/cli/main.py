@@ -136,11 +136,11 @@ def main(
     description: str = '2D SLAM and localization with reflectors and a laser.',
 ) -> int:
     """Run one command line of the command ``prog``; the exit code."""
-    if '_ARGCOMPLETE' in os.environ:
-        complete(table, prog)
-    arguments = list(sys.argv[1:] if argv is None else argv)
     module: ModuleType | None = None
     try:
+        if '_ARGCOMPLETE' in os.environ:
+            complete(table, prog)
+        arguments = list(sys.argv[1:] if argv is None else argv)
         parser, module = build_parser(arguments, table, prog, description)
         args = parser.parse_args(arguments)
         if module is None:

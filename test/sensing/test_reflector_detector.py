@@ -391,15 +391,20 @@ def test_the_hall_is_seen_in_motion():
 
 
 def test_a_scan_takes_less_than_a_millisecond():
+    """Of a machine that sorts 30 000 numbers in .18 ms; both are timed in turn."""
     rng = np.random.default_rng(5)
     scans = [still(cylinders(rng, 0.08, 6.0)[0], seed) for seed in range(10)]
+    numbers = rng.standard_normal(30_000)
     detect(scans[0], Detector())
     spent = []
     for k in range(100):
-        began = time.thread_time()
+        times = [time.thread_time()]
         assert len(detect(scans[k % 10], Detector())) >= 10
-        spent.append(time.thread_time() - began)
-    assert np.median(spent) < 1e-3
+        times.append(time.thread_time())
+        np.sort(numbers)
+        spent.append(np.diff([*times, time.thread_time()]))
+    scan, sort = np.median(spent, axis=0)
+    assert scan / sort < 1.0 / 0.18
 
 
 def test_a_room_has_no_reflector_in_it():
