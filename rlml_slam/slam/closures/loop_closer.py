@@ -143,8 +143,7 @@ class LoopCloser:
     ) -> Match | Closure:
         """Scan match at the proposed pose, or a rejection; ``result`` where none is possible."""
         key, T_map_key = proposed.key, proposed.T_map_key
-        old = self._old(key, submaps)
-        near = candidates_at(self._graph, old, T_map_key, self._p.loop_closure)
+        near = candidates_at(self._graph, self._old(key, submaps), T_map_key, self._p.loop_closure)
         if not near:
             return result
         found = self._matcher.match(near[0], key, points).result
@@ -165,10 +164,10 @@ class LoopCloser:
     def _close_at(
         self, found: FoundPose, key: Keyframe, points: Array, submaps: Submaps
     ) -> tuple[Closure, ...]:
-        """The scan has to match one of the nearest submaps there, else there is none."""
+        """The scan has to match one of the nearest old submaps there, else there is none."""
         self._found = None
         T_map_key = se2.compose(found.T_map, se2.between(found.T_local, key.T_local))
-        near = candidates_at(self._graph, submaps, T_map_key, self._p.loop_closure)
+        near = candidates_at(self._graph, self._old(key, submaps), T_map_key, self._p.loop_closure)
         results = (self._matcher.match(candidate, key, points).result for candidate in near)
         fits = next((r for r in results if isinstance(r, Match)), None)
         if fits is None:

@@ -624,27 +624,3 @@ def test_where_a_robot_was_found_is_forgotten_once_it_jumps():
     assert back_end.add(later, found) is None
     assert back_end.add(replace(later, stamp=later.stamp + STEP, jumped=True)) is not None
     assert back_end.add(replace(later, stamp=later.stamp + 2 * STEP, scan_used=True)) is None
-
-
-def test_robot_is_found_beside_what_it_mapped_just_before_the_gap():
-    """The newest submaps are not around the robot: it left them in the gap."""
-    way = drive((0.5, 0.0, 8.0), (0.5, np.pi, 1.0), (0.5, 0.0, 8.0))
-    frames, gap = frames_along(way, BLOCK), len(way) // 2
-    wide = np.diag(np.square((1.0, 1.0, 0.3)))
-    astray = se2.compose(
-        se2.compose(way[gap], np.array([0.8, -0.5, 0.2])), se2.between(way[gap], way[gap:])
-    )
-    back_end = BackEnd(Parameters(loop_closure=LoopClosure(enabled=False)))
-    for frame in frames[:gap]:
-        back_end.add(frame)
-    for k, T in enumerate(astray, gap):
-        o = frames[k].observation
-        if k == gap:
-            o = replace(o, motion=Motion(se2.between(way[k - 1], T), wide))
-        cov = frames[k].cov_local + wide
-        back_end.add(replace(frames[k], observation=o, T_local_base=T, cov_local=cov))
-    last = replace(frames[-1], stamp=frames[-1].stamp + STEP, T_local_base=astray[-1])
-    update = back_end.add(last, FoundPose(astray[-1], way[-1], 64.0))
-    assert [c.accepted for c in update.closures] == [True]
-    off = back_end.trajectory()[1][-1, :2] - way[-1, :2]
-    assert np.hypot(*off) < 0.1
