@@ -134,7 +134,7 @@ class BackEnd:
     def _add_keyframe(self, frame: Frame, start: tuple[float, float]) -> Update:
         self._optimized, self._changed, self._removed = False, (), ()
         key = self._add_pose(frame)
-        at_once = frame.jumped or self.loop_closer.is_due
+        at_once = self.loop_closer.is_due
         closures = self._close_loops(key)
         self._join_reflectors()
         self._keyframes_since_solve += 1

@@ -600,7 +600,8 @@ def test_robot_is_not_found_at_a_pose_where_its_scan_does_not_fit():
     np.testing.assert_allclose(off_the_path(back_end), before, atol=0.05)
 
 
-def test_robot_that_was_found_becomes_a_keyframe_as_soon_as_a_scan_matches():
+def found_without_a_scan():
+    """A back end that waits for a scan where the robot was found, and its newest frame."""
     frames, _ = led_astray((1.5, -1.0, 0.4), (1.5, 1.5, 0.4))
     back_end = BackEnd(Parameters())
     for frame in frames:
@@ -608,6 +609,11 @@ def test_robot_that_was_found_becomes_a_keyframe_as_soon_as_a_scan_matches():
     found = FoundPose(frames[-1].T_local_base, LAP[-1], 100.0)
     later = replace(frames[-1], stamp=frames[-1].stamp + STEP, scan_used=False)
     assert back_end.add(later, found) is None
+    return back_end, later
+
+
+def test_robot_that_was_found_becomes_a_keyframe_as_soon_as_a_scan_matches():
+    back_end, later = found_without_a_scan()
     unsure = replace(later, stamp=later.stamp + STEP, scan_used=True, unconfirmed=True)
     assert back_end.add(unsure) is None
     assert back_end.add(replace(later, stamp=unsure.stamp + STEP, scan_used=True)) is not None
@@ -615,12 +621,6 @@ def test_robot_that_was_found_becomes_a_keyframe_as_soon_as_a_scan_matches():
 
 
 def test_where_a_robot_was_found_is_forgotten_once_it_jumps():
-    frames, _ = led_astray((1.5, -1.0, 0.4), (1.5, 1.5, 0.4))
-    back_end = BackEnd(Parameters())
-    for frame in frames:
-        back_end.add(frame)
-    found = FoundPose(frames[-1].T_local_base, LAP[-1], 100.0)
-    later = replace(frames[-1], stamp=frames[-1].stamp + STEP, scan_used=False)
-    assert back_end.add(later, found) is None
+    back_end, later = found_without_a_scan()
     assert back_end.add(replace(later, stamp=later.stamp + STEP, jumped=True)) is not None
     assert back_end.add(replace(later, stamp=later.stamp + 2 * STEP, scan_used=True)) is None
