@@ -21,6 +21,13 @@ Task = TypeVar('Task', bound=tuple[Any, ...])
 Result = TypeVar('Result')
 
 CONNECT_S = 30.0  # [s] within which a scheduler has to answer
+# The nanny of a local worker that ends starts it again. Dask looks for it this long [s] after its
+# first end, and takes it out for good where it has ended again at that moment. A worker holds no
+# task but the one that it does: Dask blames each that it holds for its end.
+LOCAL = {
+    'distributed.deploy.lost-worker-timeout': 1e7,
+    'distributed.scheduler.worker-saturation': 1.0,
+}
 
 
 def cores() -> int:
@@ -37,6 +44,7 @@ def open_client(cluster: str | None, jobs: int = 0) -> Iterator[Client]:
     packages of the extra ``fleet`` are missing.
     """
     try:
+        import dask
         from distributed import Client, LocalCluster
     except ModuleNotFoundError as e:
         raise ClusterError(
@@ -53,6 +61,7 @@ def open_client(cluster: str | None, jobs: int = 0) -> Iterator[Client]:
             yield client
         return
     with (
+        dask.config.set(LOCAL),
         LocalCluster(
             n_workers=jobs or cores(), threads_per_worker=1, host='127.0.0.1',
             dashboard_address='127.0.0.1:0', silence_logs=logging.CRITICAL,
