@@ -152,9 +152,11 @@ def test_misspelt_parameter_is_refused(tmp_path):
         ('submap.bias_variance', [-1.0, 0.0, 0.0], r'has a number outside \[0, 100\]'),
         ('loop_closure.variance_floor', [0.0, 0.0, -1e-9], r'has a number outside \[0, 100\]'),
         ('back_end.match_sigma', [0.0, 0.1, 0.1], r'has a number outside \[0.0001, 10\]'),
+        ('laser_pose', [0.0, 0.0, 10**400], 'is not a list of finite numbers'),
+        ('odom_timeout', 10**400, 'is not a finite number'),
     ],
 )
-def test_lists_are_checked_for_length_and_range(name, value, why):
+def test_numbers_are_checked_for_length_and_range(name, value, why):
     with pytest.raises(ParameterError, match=why):
         from_mapping({name: value})
 

@@ -21,9 +21,8 @@ Task = TypeVar('Task', bound=tuple[Any, ...])
 Result = TypeVar('Result')
 
 CONNECT_S = 30.0  # [s] within which a scheduler has to answer
-# The nanny of a local worker that ends starts it again. Dask looks for it this long [s] after its
-# first end, and takes it out for good where it has ended again at that moment. A worker holds no
-# task but the one that it does: Dask blames each that it holds for its end.
+# A nanny starts its worker again; Dask would take out one that is absent this [s] after its first
+# end. Dask blames each task that a worker holds for its end, so it holds only the one that it does.
 LOCAL = {
     'distributed.deploy.lost-worker-timeout': 1e7,
     'distributed.scheduler.worker-saturation': 1.0,

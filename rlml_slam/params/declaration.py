@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -99,14 +100,14 @@ def _checked(prefix: str, f: dataclasses.Field[Any], value: Any) -> Any:
             if not all(isinstance(v, str) for v in value):
                 raise refuse('is not a list of strings')
             return tuple(value)
-        if not all(_is_number(v) and math.isfinite(v) for v in value):
+        if not all(map(_is_finite, value)):
             raise refuse('is not a list of finite numbers')
         if len(value) != len(f.default):
             raise refuse(f'is not a list of {len(f.default)} numbers')
         if not all(m['low'] <= v <= m['high'] for v in value):
             raise refuse(f'has a number outside [{m["low"]:g}, {m["high"]:g}]')
         return tuple(float(v) for v in value)
-    if not _is_number(value) or not math.isfinite(value):
+    if not _is_finite(value):
         raise refuse('is not a finite number')
     if isinstance(f.default, int):
         if int(value) != value:
@@ -119,8 +120,10 @@ def _checked(prefix: str, f: dataclasses.Field[Any], value: Any) -> Any:
     return value
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+def _is_finite(value: Any) -> bool:
+    """Whether it is a number that a float can be; whole numbers have no end."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_number and abs(value) <= sys.float_info.max
 
 
 @dataclass(frozen=True)
