@@ -22,7 +22,7 @@ Result = TypeVar('Result')
 
 CONNECT_S = 30.0  # [s] within which a scheduler has to answer
 # A nanny starts its worker again; Dask would take out one that is absent this [s] after its first
-# end. Dask blames each task that a worker holds for its end, so it holds only the one that it does.
+# end. Dask blames each task that a worker holds for its end, so it holds only the one it does.
 LOCAL = {
     'distributed.deploy.lost-worker-timeout': 1e7,
     'distributed.scheduler.worker-saturation': 1.0,
