@@ -240,7 +240,7 @@ class System:
         return [self.searches.begin(Purpose.RESTORE, record, self.map)]
 
     def _recover(self, record: SessionFrame) -> list[Command]:
-        self.recovery.follow(record.frame)
+        self.recovery.follow(record.frame, self.map is None)
         if not self.recovery.is_active:
             self.searches.drop(Purpose.RECOVER)
             return []

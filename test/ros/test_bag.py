@@ -13,6 +13,7 @@ import pytest
 from rlml_slam.errors import BagError
 from rlml_slam.params import Node
 from rlml_slam.ros.bags.bag import BagReader, BagWriter, Topic, choose_topics
+from rlml_slam.ros.bags.bag_recovery import BagRecovery
 from rlml_slam.ros.codecs import decode, encode
 from rlml_slam.ros.codecs.message_types import make_bag
 from rlml_slam.types import Imu
@@ -220,6 +221,26 @@ def test_sqlite_topic_without_a_name_or_type_costs_itself_alone(tmp_path, column
         base.commit()
     with BagReader(file) as bag:
         assert {t for _, t, _ in bag.messages()} == {'/odom', '/tf_static'}
+
+
+@pytest.mark.parametrize(
+    'change',
+    [
+        "topics SET type = x'01' WHERE name = '/imu'",
+        "messages SET topic_id = 'two' WHERE topic_id = imu",
+        "messages SET timestamp = 'now' WHERE topic_id = imu",
+        'messages SET data = 7 WHERE topic_id = imu',
+    ],
+)
+def test_sqlite_row_with_values_of_other_types_costs_itself_alone(tmp_path, change):
+    file = storage_file(write(tmp_path / 'bag', 'sqlite3'))
+    with closing(sqlite3.connect(file)) as base:
+        (imu,) = base.execute("SELECT id FROM topics WHERE name = '/imu'").fetchone()
+        changed = base.execute(f'UPDATE {change.replace("= imu", f"= {imu}")}').rowcount
+        base.commit()
+    assert changed > 0
+    bag = BagRecovery(file)
+    assert {c.topic for c, _, _ in bag.messages(bag.connections)} == {'/odom', '/tf_static'}
 
 
 def test_scratched_sqlite_gives_what_comes_before_the_scratch(tmp_path):

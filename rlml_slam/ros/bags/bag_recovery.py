@@ -272,17 +272,19 @@ def _sqlite(file: Path, first: int, owner: Any) -> Iterator[Found]:
                     form = _FORMATS.get(encoding, MessageDefinitionFormat.NONE)
                     definitions[name] = MessageDefinition(form, text)
             none = MessageDefinition(MessageDefinitionFormat.NONE, '')
-            # the rows of a page that is cut off read as NULL
+            # the rows of a broken page read as NULL, or as values of any type
             for number, topic, kind in base.execute(
-                'SELECT id, name, type FROM topics WHERE name NOT NULL AND type NOT NULL'
+                'SELECT id, name, type FROM topics '
+                "WHERE typeof(id) = 'integer' AND typeof(name) = 'text' AND typeof(type) = 'text'"
             ):
                 ext = ConnectionExtRosbag2('cdr', [])
                 definition = definitions.get(kind, none)
                 yield Connection(first + number, topic, kind, definition, '', 0, ext, owner)
             for number, time, data in base.execute(
-                'SELECT topic_id, timestamp, data FROM messages NOT INDEXED '
-                'WHERE topic_id + timestamp NOT NULL AND data NOT NULL ORDER BY id'
+                'SELECT topic_id, timestamp, data FROM messages NOT INDEXED WHERE '
+                "typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' "
+                "AND typeof(data) = 'blob' ORDER BY id"
             ):
                 yield first + number, time, data
-        except sqlite3.DatabaseError as e:
-            yield f'{file.name} is broken: {e}'
+        except (sqlite3.DatabaseError, MemoryError) as e:
+            yield f'{file.name} is broken: {e or "a row longer than memory"}'

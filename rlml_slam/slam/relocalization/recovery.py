@@ -34,12 +34,12 @@ class Recovery:
         """The robot knows its place, or has another map."""
         self._schedule, self.map, self.why = None, None, ''
 
-    def follow(self, frame: Frame) -> None:
-        """Take the next frame."""
+    def follow(self, frame: Frame, drawn: bool = False) -> None:
+        """Take the next frame; ``drawn`` as in SearchSchedule."""
         if not (frame.health.level is Level.LOST or frame.unconfirmed):
             self.stop()
         elif self._schedule is None or frame.stamp < self._schedule.since:
-            self._schedule = SearchSchedule(frame.stamp)
+            self._schedule = SearchSchedule(frame.stamp, drawn)
 
     def is_due(self, frame: Frame) -> bool:
         """Whether to search this frame, the newest; the next search counts from this one."""

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rlml_slam.slam.relocalization.search_schedule import (
+    DRAWN,
     FARTHEST,
     LONGEST,
     MOVED,
@@ -21,9 +22,9 @@ from rlml_slam.slam.relocalization.search_schedule import (
 SECOND = 1_000_000_000
 
 
-def searched(lasts, pose=lambda _: np.zeros(3), period=SECOND // 10):
+def searched(lasts, pose=lambda _: np.zeros(3), period=SECOND // 10, drawn=False):
     """Seconds since the first frame without a place at which there is a search."""
-    pace, at = SearchSchedule(SECOND), []
+    pace, at = SearchSchedule(SECOND, drawn), []
     for stamp in range(0, lasts * SECOND, period):
         if pace.is_due(SimpleNamespace(stamp=SECOND + stamp, T_map_base=pose(stamp / SECOND))):
             at.append(stamp / SECOND)
@@ -32,6 +33,15 @@ def searched(lasts, pose=lambda _: np.zeros(3), period=SECOND // 10):
 
 def test_three_times_a_second_at_first():
     assert len(searched(3)) == math.ceil(3 * SECOND / PERIOD)
+
+
+def test_map_that_has_to_be_drawn_is_searched_once_a_second_and_not_for_a_scan_or_two():
+    wait = DRAWN / SECOND
+    at = searched(60, lambda seconds: np.array([2.0 * MOVED * seconds, 0.0, 0.0]), drawn=True)
+    assert at[0] == wait
+    assert np.diff(at[:5]) == pytest.approx(wait)
+    assert np.diff(at).min() >= wait - 1e-9
+    assert searched(2, period=1_600_000_000, drawn=True).tolist() == [1.6]  # a slow laser
 
 
 def test_where_it_stands_the_cost_is_bounded_and_so_is_the_wait():
