@@ -41,7 +41,7 @@ class HealthInputs:
     """What one step says about the health of the estimate.
 
     ``detections``: their number, None if no detector has run; ``matched`` of them updated the
-    estimate. ``cov_map`` (3, 3) is that of the pose. ``unconfirmed``: why the saved map does not
+    estimate. ``cov_map`` (3, 3) is that of the pose at ``position`` (2,). ``unconfirmed``: why the saved map does not
     confirm the pose, empty if it does; ``is_lost``: for too long. ``contradicted``: scan or
     reflectors have contradicted the map for too long. ``seen`` of the ``expected`` reflectors in
     view were detected. ``maps``: the map is in the making.
@@ -58,6 +58,7 @@ class HealthInputs:
     expected: int = 0
     seen: int = 0
     maps: bool = False
+    position: Array = field(default_factory=lambda: np.zeros(2))
 
 
 class HealthMonitor:
@@ -72,8 +73,10 @@ class HealthMonitor:
         self._held_by_reflectors = NEVER
         self._held_by_scan = NEVER
         self._first: int | None = None
-        self._variance = 0.0  # [m^2] of the position, at the last step
-        self._explored = 0.0  # [m^2] of that, what it has grown by while the map held the pose
+        # position and covariance when the map held the pose last, and the variance [m^2] of the
+        # position that it had grown by while the map did not; and since then
+        self._held = np.zeros(2), np.zeros((3, 3)), 0.0
+        self._since = 0.0
         self._submap: object = None  # of the last match, and the variance [m^2] relative to it
         self._drifted = 0.0
 
@@ -107,22 +110,31 @@ class HealthMonitor:
         """Whether the position is too uncertain to be known in the map.
 
         A map in the making grows away from its start, and the robot's place in it stays known
-        while scan or reflectors hold the pose. What the variance grows by then does not count. A
-        scan that leaves a direction open to odometry still holds the pose in its submap, but for
+        while scan or reflectors hold the pose. What counts is what the variance grows by while
+        they do not, beyond what the way since then turns by the heading that was uncertain before.
+        A scan that leaves a direction open to odometry still holds the pose in its submap, but for
         what the variance grows by relative to that.
         """
-        scan, grown = step.scan, sigma**2 - self._variance
-        self._variance = sigma**2
+        limit, scan = self._limits.sigma_lost**2, step.scan
+        if not step.maps:
+            return sigma**2 > limit
+        (at, P, adrift), since = self._held, self._since
+        x, y = (step.position - at).tolist()
+        J = np.array([[1.0, 0.0, -y], [0.0, 1.0, x]])
+        self._since = sigma**2 - eigenvalues_2x2(J @ P @ J.T)[1]
         drifted, submap = self._drifted, self._submap
         if scan.used:
             self._drifted = eigenvalues_2x2(scan.cov_submap[:2, :2])[1]
             self._submap = scan.submap
-        if step.maps and stamp in (self._held_by_scan, self._held_by_reflectors):
-            self._explored += max(grown, 0.0)
-        elif step.maps and scan.submap is not None and scan.submap is submap:
-            self._explored += grown - (self._drifted - drifted)
-        self._explored = min(max(self._explored, 0.0), self._variance)
-        return self._variance - self._explored > self._limits.sigma_lost**2
+        if stamp in (self._held_by_scan, self._held_by_reflectors):
+            adrift += min(since, self._since)
+        elif scan.submap is not None and scan.submap is submap:
+            adrift += since + self._drifted - drifted
+        elif adrift + self._since > 0.0:
+            return adrift + self._since > limit
+        adrift = min(max(adrift, 0.0), sigma**2)
+        self._held, self._since = (step.position, step.cov_map, adrift), 0.0
+        return adrift > limit
 
     def _note(self, stamp: int, step: HealthInputs) -> None:
         """Store the stamp of each input that is good in this step."""

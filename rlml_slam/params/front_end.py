@@ -293,5 +293,5 @@ class HealthLimits(Group, prefix='health.'):
         0.6, 'LOST when scans or reflectors contradict the map for this long', 's', 0.0, 60.0
     )
     new_session_time: float = param(
-        5.0, 'mapping: when LOST for this long, a new session starts', 's', 0.0, 1e6
+        5.0, 'mapping: when the map is contradicted for this long, new submaps start', 's', 0.0, 1e6
     )

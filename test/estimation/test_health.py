@@ -350,6 +350,32 @@ def test_what_odometry_alone_made_uncertain_stays_so_until_the_place_is_found():
     assert levels([*explored, *gap, (4.0, True, True), (4.5, True, True)])[-1] is Level.DEGRADED
 
 
+def levels_far_away(unseen, turn_noise):
+    """Levels of a robot 240 m from where its map begins, held for 20 m and not for the next."""
+    monitor, out = HealthMonitor(HealthLimits()), []
+    x, P = 220.0, np.diag([0.1, 220.0 * 0.08, 0.08]) ** 2
+    P[1, 2] = P[2, 1] = 220.0 * 0.08**2
+    for k in range(100 + unseen):
+        held = k < 100
+        P = (J := np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]])) @ P @ J.T
+        P = P + np.diag([1e-6, 1e-6, 0.0 if held else turn_noise**2])
+        x += 0.2
+        scan = ScanEvidence(has_scan=True, used=held, score=0.6)
+        at = np.array([x, 0.0])
+        step = HealthInputs(scan, True, None, 1, P, maps=True, position=at)
+        out.append(monitor.evaluate(FIRST + k * STEP, step).level)
+    return out
+
+
+def test_scans_missed_far_from_the_start_are_no_reason_to_be_lost():
+    """The heading of the whole map is uncertain there: each metre turns it by decimetres."""
+    assert Level.LOST not in levels_far_away(unseen=10, turn_noise=0.001)
+
+
+def test_way_that_only_odometry_saw_counts_with_the_heading_that_it_lost():
+    assert levels_far_away(unseen=400, turn_noise=0.01)[-1] is Level.LOST
+
+
 def levels_in_corridor(steps):
     """Levels while a scan holds all but one direction: sigma [m] in the map, and in the submap."""
     monitor, out = HealthMonitor(HealthLimits()), []

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
@@ -70,11 +71,13 @@ class FrontEnd:
         matches = self._reflectors.begin(observation, self._motion.velocity)
         scan = self._update_with_scan(observation, sweep, matches)
         matches = self._reflectors.update(observation, matches)
-        contradicted = self._contradicts_map(observation, matches, scan)
+        contradicted, moved = self._contradicts_map(observation, matches, scan)
         observation = self._reflectors.widen(
             self._motion.corrected(self.state, observation), matches
         )
         matches = self._grow_map(observation, matches, scan, contradicted)
+        if moved:
+            observation = self._begin_anywhere(observation)
         health = self._evaluate_health(observation, matches, scan)
         return self._frame(observation, matches, scan, health, contradicted, began)
 
@@ -107,10 +110,11 @@ class FrontEnd:
 
     def _contradicts_map(
         self, observation: Observation, matches: Matches, scan: ScanEvidence
-    ) -> bool:
-        """Whether scan and reflectors contradict the map, as after kidnapping.
+    ) -> tuple[bool, bool]:
+        """Whether scan and reflectors contradict the map, and the robot may be anywhere by now.
 
-        While mapping, a contradiction of ``new_session_time`` starts new submaps at this pose.
+        While mapping, a contradiction of ``new_session_time`` starts new submaps. Where nothing
+        hid the map from the scan, the robot was carried away.
         """
         # an unmatched detection with an id is no contradiction here: the back end resolves it
         resolved = matches.num_unmatched_ids(observation.detections)
@@ -121,9 +125,21 @@ class FrontEnd:
         )  # fmt: skip
         patience = self._p.health.new_session_time
         if self._map.saved is None and self.kidnapping.has_lasted(observation.stamp, patience):
+            if not (scan.misfit and self._scans.is_hidden(observation.points)):
+                return True, True
             self._scans.start_new_submaps()
-            return False
-        return contradicted
+            return False, False
+        return contradicted, False
+
+    def _begin_anywhere(self, observation: Observation) -> Observation:
+        """Map on from a pose that may be anywhere, until the graph finds out where that was."""
+        reach = self._p.submap.max_laser_range
+        anywhere = np.diag([reach, reach, math.pi / math.sqrt(3.0)]) ** 2
+        self.state.widen(anywhere)
+        self._scans.start_new_submaps()
+        self._reflectors.forget_anonymous()
+        motion = observation.motion
+        return replace(observation, motion=replace(motion, cov=motion.cov + anywhere))
 
     def _grow_map(
         self, observation: Observation, matches: Matches, scan: ScanEvidence, contradicted: bool
@@ -143,6 +159,7 @@ class FrontEnd:
         )  # fmt: skip
         expected, seen = self._reflectors.expected_and_seen(observation, matches)
         lasts = self.kidnapping.has_lasted(stamp, self._p.health.lost_time)
+        pose, cov = self.in_map(self.state.pose, self.state.pose_cov)
         return self.health.evaluate(
             stamp,
             HealthInputs(
@@ -150,13 +167,14 @@ class FrontEnd:
                 has_odometry=observation.motion.known or not self._p.node.use_odom,
                 detections=self._map.num_comparable(observation.detections),
                 matched=matches.num_used,
-                cov_map=self.in_map(self.state.pose, self.state.pose_cov)[1],
+                cov_map=cov,
                 unconfirmed=confirmation.reason,
                 is_lost=confirmation.is_lost,
                 contradicted=lasts and not confirmation.is_pending,
                 expected=expected,
                 seen=seen,
                 maps=self._map.saved is None,
+                position=pose[:2],
             ),
         )
 

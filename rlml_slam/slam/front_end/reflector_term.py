@@ -336,6 +336,11 @@ class ReflectorTerm:
             self._state.remove_landmarks(keep)
             self.tracks.keep(keep)
 
+    def forget_anonymous(self) -> None:
+        """Drop those without ids: a robot that may be anywhere sees any of them."""
+        self._inactive.restore(self._state, self.tracks)
+        self.forget(self.tracks.keys[self.tracks.ids == ANONYMOUS])
+
     def confirmed(self, T_map_local: Array) -> Reflectors:
         """The confirmed reflectors in the map frame."""
         # inactive reflectors come after those of the state, as in all_landmarks()

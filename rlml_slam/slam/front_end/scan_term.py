@@ -25,6 +25,7 @@ from rlml_slam.slam.front_end.motion_hypotheses import Hypothesis
 from rlml_slam.slam.front_end.motion_term import MotionTerm
 from rlml_slam.slam.front_end.scan_update import fuse, prior_of, relative
 from rlml_slam.slam.front_end.submaps import Submaps
+from rlml_slam.slam.relocalization.grid_submap import hidden_share
 from rlml_slam.slam.relocalization.local_recovery import (
     AS_USUAL,
     TURN,
@@ -41,6 +42,7 @@ NEAR = 0.3  # [m] of a reflector, a detection may be one of it
 PENALTY = 0.1  # share of a fit that a motion loses which no robot has
 DOUBT = 0.02  # by which motions other than the odometry's have to fit better
 OPEN = 0.03  # motions whose fits differ by less are both possible
+HIDDEN = 0.5  # hidden_share() where something hides the map: about .75, at other places up to .35
 MIN_KNOWN = 0.33  # share of end points in known cells below which a scan cannot contradict
 
 
@@ -62,6 +64,13 @@ class ScanTerm:
         self.kidnapping = KidnappingDetection(self._p.health)
         self._degeneracy = Degeneracy()
         self._last_fit = 0  # stamp of the last scan that was matched
+
+    def is_hidden(self, points: Array | None) -> bool:
+        """Whether something around the robot hides the map from a scan's end points (n, 2)."""
+        submap = self.submaps.target
+        if submap is None or points is None or len(points) < self._p.scan_match.min_points:
+            return False
+        return hidden_share(submap, points, self._prior(Sweep())[0]) > HIDDEN
 
     def deskew(self, observation: Observation) -> tuple[Observation, Sweep]:
         """Deskew a scan by the velocity of the state, if there is no odometry.

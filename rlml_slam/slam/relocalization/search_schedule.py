@@ -17,7 +17,7 @@ from rlml_slam import se2
 from rlml_slam.types import Frame
 
 PERIOD = 300_000_000  # [ns] of stamps between two searches at least
-DRAWN = 1_000_000_000  # [ns] of the same, and before the first, in a map that has to be drawn first
+DRAWN = 1_000_000_000  # [ns] of the same, and before the first, in a map to be drawn first
 RARER = 10  # part of the time since the first that is between two where the robot stands
 LONGEST = 30_000_000_000  # [ns] of stamps between two searches at most
 MOVED, TURNED = 1.0, 0.5  # [m], [rad] since the last search: from there, it may see more

@@ -41,3 +41,31 @@ def test_saved_map_overrules_the_submaps_of_the_drive(tmp_path, known, seed, at,
     assert wrong.sum() <= 15  # scans, of 10 Hz
     assert Level.LOST in levels
     assert error[-1] < 0.05
+
+
+def test_robot_carried_where_nothing_is_mapped_is_lost_until_it_comes_to_what_is(tmp_path):
+    """It was OK, 12 m from where it was, and the map had both places at one."""
+    bag = tmp_path / 'bag'
+    made = {
+        'kidnap_time': 25.0, 'kidnap_distance': 12.0, 'speed': 0.8, 'laser.beams': 360,
+        'laser.rate': 5.0, 'markers.enabled': 'false',
+    }  # fmt: skip
+    sets = [word for name, value in made.items() for word in ('--set', f'{name}={value}')]
+    assert main(['simulate', 'hall', str(bag), '--duration', '65', *sets]) == 0
+    run = replay(bag, replace(Parameters(), node=Node(laser_pose=Simulator().laser_pose)))
+    true = run.truth.trajectory
+    stamps, levels = np.array(run.frames.stamps), np.array(run.frames.levels)
+    x, y = (np.interp(stamps, true.stamps, true.poses[:, k]) for k in range(2))
+    error = np.hypot(*(np.array(run.frames.poses)[:, :2] - np.stack([x, y], axis=-1)).T)
+    carried = stamps - stamps[0] >= 25e9
+    wrong = carried & (error > 0.5)
+    assert wrong.mean() > 0.2
+    assert (wrong & (levels != Level.LOST)).sum() <= 4  # scans, of 5 Hz
+    # then all that it mapped meanwhile is where it belongs
+    assert levels[-1] == Level.OK
+    assert error[-1] < 0.1
+    path = run.trajectory
+    x, y = (np.interp(path.stamps, true.stamps, true.poses[:, k]) for k in range(2))
+    off = np.hypot(*(path.poses[:, :2] - np.stack([x, y], axis=-1)).T)
+    assert np.median(off) < 0.05
+    assert np.mean(off > 0.5) < 0.15  # the seconds in which it maps nothing
