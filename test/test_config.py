@@ -161,6 +161,11 @@ def test_numbers_are_checked_for_length_and_range(name, value, why):
         from_mapping({name: value})
 
 
+def test_whole_number_that_python_does_not_print_is_refused_by_its_name():
+    with pytest.raises(ParameterError, match='odom_timeout = a number that is too long to print'):
+        from_mapping({'odom_timeout': 1 << 20000})
+
+
 def test_versions_agree():
     described = ElementTree.parse(ROOT / 'package.xml').getroot().findtext('version')
     assert described == __version__

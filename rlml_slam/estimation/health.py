@@ -41,10 +41,10 @@ class HealthInputs:
     """What one step says about the health of the estimate.
 
     ``detections``: their number, None if no detector has run; ``matched`` of them updated the
-    estimate. ``cov_map`` (3, 3) is that of the pose at ``position`` (2,). ``unconfirmed``: why the saved map does not
-    confirm the pose, empty if it does; ``is_lost``: for too long. ``contradicted``: scan or
-    reflectors have contradicted the map for too long. ``seen`` of the ``expected`` reflectors in
-    view were detected. ``maps``: the map is in the making.
+    estimate. ``cov_map`` (3, 3) is that of the pose, ``position`` (2,) its place. ``unconfirmed``:
+    why the saved map does not confirm the pose, empty if it does; ``is_lost``: for too long.
+    ``contradicted``: scan or reflectors have contradicted the map for too long. ``seen`` of the
+    ``expected`` reflectors in view were detected. ``maps``: the map is in the making.
     """
 
     scan: ScanEvidence

@@ -22,7 +22,8 @@ Result = TypeVar('Result')
 
 CONNECT_S = 30.0  # [s] within which a scheduler has to answer
 # A nanny starts its worker again; Dask would take out one that is absent this [s] after its first
-# end. Dask blames each task that a worker holds for its end, so it holds only the one it does.
+# end. Dask blames each task that a worker holds for its end: of many bags it holds but the one
+# that it does, of fewer than three it may hold another one.
 LOCAL = {
     'distributed.deploy.lost-worker-timeout': 1e7,
     'distributed.scheduler.worker-saturation': 1.0,

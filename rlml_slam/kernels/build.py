@@ -79,6 +79,7 @@ def _compile(work: Path, processor: str, progress: Progress) -> Compiled:
     workers = max(1, min(len(os.sched_getaffinity(0)), int(free / MEMORY)))
     found: dict[str, list[Entry]] = {}
     constants: dict[str, bytes] = {}
+    others = {*multiprocessing.active_children()}
     pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context('spawn'))
     try:
         folders = pool.submit(_folders).result()
@@ -95,7 +96,7 @@ def _compile(work: Path, processor: str, progress: Progress) -> Compiled:
     except BrokenProcessPool as e:
         raise BuildError('a process that compiles kernels has ended: is memory short?') from e
     finally:
-        for worker in multiprocessing.active_children():  # interrupted, they have nothing to do
+        for worker in {*multiprocessing.active_children()} - others:  # interrupted, they are idle
             worker.terminate()
         pool.shutdown(cancel_futures=True)
     return [entry for name in sorted(found) for entry in found[name]], constants

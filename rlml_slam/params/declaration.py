@@ -76,12 +76,19 @@ class Group:
         object.__setattr__(self, name, _checked(self._prefix, f, value))
 
 
+def _text(value: Any) -> str:
+    try:
+        return repr(value)
+    except ValueError:  # Python prints no whole number of thousands of digits
+        return 'a number that is too long to print'
+
+
 def _checked(prefix: str, f: dataclasses.Field[Any], value: Any) -> Any:
     """The value converted to the type of the default; ParameterError if it is not allowed."""
     m = f.metadata
 
     def refuse(why: str) -> ParameterError:
-        return ParameterError(f'{prefix}{f.name} = {value!r} {why} ({m["meaning"]})')
+        return ParameterError(f'{prefix}{f.name} = {_text(value)} {why} ({m["meaning"]})')
 
     if isinstance(f.default, bool):
         if not isinstance(value, bool):

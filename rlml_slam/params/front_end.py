@@ -68,7 +68,7 @@ class MotionNoise(Group, prefix='motion.'):
         5.0, 'an odometry step faster than this is a jump and is not used', 'm/s', 0.01, 100.0
     )
     max_turn_rate: float = param(
-        15.0, 'an odometry turn faster than this is a jump and is not used', 'rad/s', 0.01, 100.0
+        15.0, 'a turn of odometry or IMU faster than this is not used', 'rad/s', 0.01, 100.0
     )
     constant_velocity_sigma: tuple[float, ...] = param(
         (1.0, 0.1, 2.0),
@@ -293,5 +293,5 @@ class HealthLimits(Group, prefix='health.'):
         0.6, 'LOST when scans or reflectors contradict the map for this long', 's', 0.0, 60.0
     )
     new_session_time: float = param(
-        5.0, 'mapping: when the map is contradicted for this long, new submaps start', 's', 0.0, 1e6
+        5.0, 'mapping: contradicted for this long, new submaps start', 's', 0.0, 1e6
     )

@@ -141,7 +141,7 @@ class Synchronizer:
         d = detections
         finite = np.isfinite(d.points).all() and np.isfinite(d.cov).all()
         if self._is_of_sensor('reflectors', d) and self._accept(
-            'reflectors', d.stamp, bool(finite), 'a point or covariance is not finite'
+            'reflectors', d.stamp, bool(finite), 'a point or covariance is not finite', d.frame_id
         ):
             self._assembly.leave_detection()
             self._wait('reflectors', d)

@@ -200,7 +200,8 @@ class BackEnd:
                 closures += self.loop_closer.confirm(proposed, points, self.scan_graph.finished)
         points = self.scan_graph.add(key)
         if points is not None:
-            closures += self.loop_closer.search(key, points, self.scan_graph.finished)
+            scans = self.scan_graph
+            closures += self.loop_closer.search(key, points, scans.finished, scans.began)
         return closures
 
     def _join_reflectors(self) -> None:
