@@ -200,8 +200,7 @@ class BackEnd:
                 closures += self.loop_closer.confirm(proposed, points, self.scan_graph.finished)
         points = self.scan_graph.add(key)
         if points is not None:
-            scans = self.scan_graph
-            closures += self.loop_closer.search(key, points, scans.finished, scans.began)
+            closures += self.loop_closer.search(key, points, self.scan_graph.finished)
         return closures
 
     def _join_reflectors(self) -> None:

@@ -35,7 +35,6 @@ class ScanGraph:
         self._graph = graph
         self._active: list[KeyframeSubmap] = []
         self.finished: list[KeyframeSubmap] = []
-        self.began = 0  # stamp [ns] from which on the way from the keyframes before is unknown
 
     def add(self, key: Keyframe) -> Array | None:
         """Match a keyframe with the active submaps and insert it; its thinned points (n, 2).
@@ -64,7 +63,6 @@ class ScanGraph:
         sigma = np.array(self._p.back_end.match_sigma)
         if frame.jumped or leaves_submap(last, frame, sigma):
             self.finish_active()
-            self.began = frame.stamp
 
     def finish_active(self) -> None:
         """Finish the submaps that are being built: the robot continues elsewhere."""

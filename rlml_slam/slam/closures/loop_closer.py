@@ -87,18 +87,15 @@ class LoopCloser:
         self._found = None if frame.jumped else found or self._found
         self.is_due = self._found is not None and frame.scan_used and not frame.unconfirmed
 
-    def search(
-        self, key: Keyframe, points: Array, submaps: Submaps, began: int = 0
-    ) -> tuple[Closure, ...]:
+    def search(self, key: Keyframe, points: Array, submaps: Submaps) -> tuple[Closure, ...]:
         """Closures of every n-th keyframe with ``points`` (n, 2), n the keyframe interval.
 
         After a large drift, weak matches with the local map count as well. Where a search has
-        ``found`` the robot, the closure of this keyframe there; the way from submaps before the
-        stamp ``began`` [ns] is unknown.
+        ``found`` the robot, the closure of this keyframe there.
         """
         p = self._p.loop_closure
         if self._found is not None:
-            return self._close_at(self._found, key, points, submaps, began)
+            return self._close_at(self._found, key, points, submaps)
         self._num_scans += 1
         if not p.enabled or self._num_scans % p.keyframe_interval:
             return ()
@@ -165,13 +162,12 @@ class LoopCloser:
         )  # fmt: skip
 
     def _close_at(
-        self, found: FoundPose, key: Keyframe, points: Array, submaps: Submaps, began: int
+        self, found: FoundPose, key: Keyframe, points: Array, submaps: Submaps
     ) -> tuple[Closure, ...]:
         """The scan has to match one of the nearest old submaps there, else there is none."""
-        self._found, old = None, self._old(key, submaps)
-        old += [m for m in submaps if m.anchor.stamp < began and m not in old]
+        self._found = None
         T_map_key = se2.compose(found.T_map, se2.between(found.T_local, key.T_local))
-        near = candidates_at(self._graph, old, T_map_key, self._p.loop_closure)
+        near = candidates_at(self._graph, self._old(key, submaps), T_map_key, self._p.loop_closure)
         results = (self._matcher.match(candidate, key, points).result for candidate in near)
         fits = next((r for r in results if isinstance(r, Match)), None)
         if fits is None:

@@ -55,6 +55,7 @@ class FrontEnd:
         self._correction = Correction(np.zeros(3))
         self.health = HealthMonitor(self._p.health)
         self._jumped, self._is_settled = False, True
+        self._leapt = False  # where a contradiction began
         self._settling = 0.0  # [s] spent in settle() since the last frame
 
     def process(self, observation: Observation) -> Frame:
@@ -113,8 +114,8 @@ class FrontEnd:
     ) -> tuple[bool, bool]:
         """Whether scan and reflectors contradict the map, and the robot may be anywhere by now.
 
-        While mapping, a contradiction of ``new_session_time`` starts new submaps. Where nothing
-        hid the map from the scan, the robot was carried away.
+        While mapping, a contradiction of ``new_session_time`` starts new submaps. Where it came
+        at once, and nothing hides the map from the scan, the robot was carried away.
         """
         # an unmatched detection with an id is no contradiction here: the back end resolves it
         resolved = matches.num_unmatched_ids(observation.detections)
@@ -123,9 +124,11 @@ class FrontEnd:
             observation.stamp, scan.misfit, fits,
             len(matches.status) - resolved, matches.num_used, bool(self.tracks.surveyed.any()),
         )  # fmt: skip
+        if self.kidnapping.since == observation.stamp:
+            self._leapt = not scan.misfit or self._scans.leaps(observation)
         patience = self._p.health.new_session_time
         if self._map.saved is None and self.kidnapping.has_lasted(observation.stamp, patience):
-            if not (scan.misfit and self._scans.is_hidden(observation.points)):
+            if self._leapt and not (scan.misfit and self._scans.is_hidden(observation.points)):
                 return True, True
             self._scans.start_new_submaps()
             return False, False
