@@ -39,6 +39,9 @@ COMMANDS: Table = {
                 'rlml_lab.fleet.study_fleet',
                 'many replays on a cluster: the same, faster, through kills, and what they find',
             ),
+            'sweep': Command(
+                'rlml_lab.fleet.study_sweep', 'what values of parameters change, over many bags'
+            ),
             'lifelong': Command(
                 'rlml_lab.studies.study_lifelong',
                 'hours in one hall: size of the map and cost of a keyframe',

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum, IntEnum
 
 import numpy as np
@@ -123,6 +123,10 @@ class Observation:
     sweep: Array | None = None
     stamp_sigma: float = 0.0
     sweep_cov: Array | None = None
+
+    def with_noise(self, cov: Array) -> Observation:
+        """The same after a motion whose covariance is larger by ``cov`` (3, 3)."""
+        return replace(self, motion=replace(self.motion, cov=self.motion.cov + cov))
 
 
 class Status(IntEnum):

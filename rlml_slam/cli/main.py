@@ -96,10 +96,6 @@ COMMANDS: Table = {
                 'rlml_slam.cli.fleet.fleet_replay',
                 'many bags through the system, against the run before',
             ),
-            'sweep': Command(
-                'rlml_slam.cli.fleet.fleet_sweep',
-                'what values of parameters change, over many bags',
-            ),
         },
     ),
     'audit': Command(

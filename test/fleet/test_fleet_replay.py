@@ -93,20 +93,6 @@ def test_worse_parameters_are_flagged(bags, workers, tmp_path, capsys):
     assert '2 got worse' in capsys.readouterr().out
 
 
-def test_sweep_prints_paired_effects(bags, workers, tmp_path, capsys):
-    out = tmp_path / 'sweep'
-    code = fleet('sweep', bags / 'r*/room', '--out', out, *workers, '--json',
-                 '--set', 'reflector.gate=0.99,0.999')  # fmt: skip
-    assert code == 0
-    found = json.loads(capsys.readouterr().out)
-    assert {e['variant'] for e in found['effects']} == {'reflector.gate=0.99',
-                                                        'reflector.gate=0.999'}  # fmt: skip
-    assert all(e['bags'] == 2 for e in found['effects'])
-    assert (out / 'effects.csv').exists()
-    assert fleet('sweep', bags, '--out', out, '--set', 'reflector.gate') == 1
-    assert 'is not NAME=VALUE' in capsys.readouterr().err
-
-
 def test_memory_store_gives_the_same_table(bags, tmp_path):
     from distributed import Client
 

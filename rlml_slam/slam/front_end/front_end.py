@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable
-from dataclasses import replace
 
 import numpy as np
 
@@ -25,11 +24,12 @@ from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.velocity_deskew import Sweep
 from rlml_slam.slam.front_end.joint_state import JointState
-from rlml_slam.slam.front_end.map_localization import MapConfirmation, MapLocalization
+from rlml_slam.slam.front_end.map_localization import MapLocalization
 from rlml_slam.slam.front_end.motion_term import MotionTerm
 from rlml_slam.slam.front_end.reflector_term import USED, Matches, ReflectorTerm
 from rlml_slam.slam.front_end.scan_term import ScanTerm
 from rlml_slam.slam.front_end.submaps import Submaps
+from rlml_slam.slam.relocalization.carried_robot import CarriedRobot, unknown_way
 from rlml_slam.types import Belief, Frame, Health, Observation, Reflectors
 
 
@@ -55,7 +55,7 @@ class FrontEnd:
         self._correction = Correction(np.zeros(3))
         self.health = HealthMonitor(self._p.health)
         self._jumped, self._is_settled = False, True
-        self._leapt = False  # where a contradiction began
+        self._carried = CarriedRobot()
         self._settling = 0.0  # [s] spent in settle() since the last frame
 
     def process(self, observation: Observation) -> Frame:
@@ -77,8 +77,11 @@ class FrontEnd:
             self._motion.corrected(self.state, observation), matches
         )
         matches = self._grow_map(observation, matches, scan, contradicted)
-        if moved:
-            observation = self._begin_anywhere(observation)
+        if moved:  # it maps on, and the graph is to find out where that was
+            self._scans.start_new_submaps()
+            self._reflectors.forget_anonymous()
+            self.state.widen(unknown_way(self._p.submap))
+            observation = observation.with_noise(unknown_way(self._p.submap))
         health = self._evaluate_health(observation, matches, scan)
         return self._frame(observation, matches, scan, health, contradicted, began)
 
@@ -112,10 +115,9 @@ class FrontEnd:
     def _contradicts_map(
         self, observation: Observation, matches: Matches, scan: ScanEvidence
     ) -> tuple[bool, bool]:
-        """Whether scan and reflectors contradict the map, and the robot may be anywhere by now.
+        """Whether scan and reflectors contradict the map, and whether the robot was carried.
 
-        While mapping, a contradiction of ``new_session_time`` starts new submaps. Where it came
-        at once, and nothing hides the map from the scan, the robot was carried away.
+        While mapping, a contradiction of ``new_session_time`` starts new submaps.
         """
         # an unmatched detection with an id is no contradiction here: the back end resolves it
         resolved = matches.num_unmatched_ids(observation.detections)
@@ -124,25 +126,13 @@ class FrontEnd:
             observation.stamp, scan.misfit, fits,
             len(matches.status) - resolved, matches.num_used, bool(self.tracks.surveyed.any()),
         )  # fmt: skip
-        if self.kidnapping.since == observation.stamp:
-            self._leapt = not scan.misfit or self._scans.leaps(observation)
+        self._carried.follow(observation, scan.misfit, self.kidnapping.since)
         patience = self._p.health.new_session_time
         if self._map.saved is None and self.kidnapping.has_lasted(observation.stamp, patience):
-            if self._leapt and not (scan.misfit and self._scans.is_hidden(observation.points)):
-                return True, True
-            self._scans.start_new_submaps()
-            return False, False
+            if not self._carried.leapt:
+                self._scans.start_new_submaps()
+            return self._carried.leapt, self._carried.leapt
         return contradicted, False
-
-    def _begin_anywhere(self, observation: Observation) -> Observation:
-        """Map on from a pose that may be anywhere, until the graph finds out where that was."""
-        reach = self._p.submap.max_laser_range
-        anywhere = np.diag([reach, reach, math.pi / math.sqrt(3.0)]) ** 2
-        self.state.widen(anywhere)
-        self._scans.start_new_submaps()
-        self._reflectors.forget_anonymous()
-        motion = observation.motion
-        return replace(observation, motion=replace(motion, cov=motion.cov + anywhere))
 
     def _grow_map(
         self, observation: Observation, matches: Matches, scan: ScanEvidence, contradicted: bool
@@ -155,7 +145,7 @@ class FrontEnd:
     def _evaluate_health(
         self, observation: Observation, matches: Matches, scan: ScanEvidence
     ) -> Health:
-        stamp, confirmation = observation.stamp, self.confirmation
+        stamp, confirmation = observation.stamp, self._map.confirmation
         confirmation.check(
             stamp, math.hypot(*observation.motion.delta[:2].tolist()), len(matches.status),
             matches.num_used, matches.agree_with_map, self._map.grid_match,
@@ -186,7 +176,8 @@ class FrontEnd:
         contradicted: bool, began: float,
     ) -> Frame:  # fmt: skip
         pose, cov = self.state.pose, self.state.pose_cov
-        T_map_base, cov_map = self.in_map(pose, cov + self.late(observation.stamp_sigma))
+        late = self._motion.stamp_error_cov(float(self.state.x[2]), observation.stamp_sigma)
+        T_map_base, cov_map = self.in_map(pose, cov + late)
         jumped, self._jumped = self._jumped, False
         return Frame(
             observation.stamp, observation, pose, cov, T_map_base, cov_map,
@@ -196,7 +187,7 @@ class FrontEnd:
             chi2=float(matches.distance2[matches.status == USED].sum()),
             iterations=scan.iterations,
             wall_ms=(time.perf_counter() - began) * 1e3,
-            unconfirmed=contradicted or self.confirmation.is_pending,
+            unconfirmed=contradicted or self._map.confirmation.is_pending,
             jumped=jumped,
         )  # fmt: skip
 
@@ -285,18 +276,9 @@ class FrontEnd:
         return self._scans.kidnapping
 
     @property
-    def confirmation(self) -> MapConfirmation:
-        """Confirmation of the pose by the saved map."""
-        return self._map.confirmation
-
-    @property
     def newest(self) -> int | None:
         """Stamp of the newest observation, None before the first."""
         return self._motion.stamp
-
-    def late(self, sigma: float) -> Array:
-        """Covariance (3, 3) of the motion in the error ``sigma`` [s] of a stamp, local frame."""
-        return self._motion.stamp_error_cov(float(self.state.x[2]), sigma)
 
     def reflectors(self) -> Reflectors:
         """The confirmed reflectors in the map frame."""

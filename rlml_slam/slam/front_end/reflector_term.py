@@ -226,10 +226,7 @@ class ReflectorTerm:
         if detections is None or not len(detections):
             return observation
         if self._slip.cov.any():
-            motion = observation.motion
-            observation = replace(
-                observation, motion=replace(motion, cov=motion.cov + self._slip.cov)
-            )
+            observation = observation.with_noise(self._slip.cov)
         seen = np.flatnonzero(matches.index >= 0)
         spread2 = np.zeros(len(detections))
         spread2[seen] = self.tracks.spread2[matches.index[seen]]

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rlml_slam import se2
 from rlml_slam.estimation.health import ScanEvidence, eigenvalues_2x2, open_direction
@@ -26,7 +25,6 @@ from rlml_slam.slam.front_end.motion_hypotheses import Hypothesis
 from rlml_slam.slam.front_end.motion_term import MotionTerm
 from rlml_slam.slam.front_end.scan_update import fuse, prior_of, relative
 from rlml_slam.slam.front_end.submaps import Submaps
-from rlml_slam.slam.relocalization.grid_submap import hidden_share
 from rlml_slam.slam.relocalization.local_recovery import (
     AS_USUAL,
     TURN,
@@ -43,9 +41,6 @@ NEAR = 0.3  # [m] of a reflector, a detection may be one of it
 PENALTY = 0.1  # share of a fit that a motion loses which no robot has
 DOUBT = 0.02  # by which motions other than the odometry's have to fit better
 OPEN = 0.03  # motions whose fits differ by less are both possible
-HIDDEN = 0.5  # hidden_share() where something hides the map: about .75, at other places up to .35
-SOON = 250_000_000  # [ns] between two scans, in which a robot drives nowhere else
-SAME, SAME_SHARE = 0.1, 0.02  # [m], and share of the range, by which the same walls may be apart
 MIN_KNOWN = 0.33  # share of end points in known cells below which a scan cannot contradict
 
 
@@ -59,7 +54,6 @@ class ScanTerm:
         self._p = params
         self._state = state
         self._motion = motion
-        self._before: Observation | None = None  # the newest one with a scan
         self.start_new_submaps()
 
     def start_new_submaps(self) -> None:
@@ -68,28 +62,6 @@ class ScanTerm:
         self.kidnapping = KidnappingDetection(self._p.health)
         self._degeneracy = Degeneracy()
         self._last_fit = 0  # stamp of the last scan that was matched
-
-    def is_hidden(self, points: Array | None) -> bool:
-        """Whether something around the robot hides the map from a scan's end points (n, 2)."""
-        submap = self.submaps.target
-        if submap is None or points is None or len(points) < self._p.scan_match.min_points:
-            return False
-        return hidden_share(submap, points, self._prior(Sweep())[0]) > HIDDEN
-
-    def leaps(self, observation: Observation) -> bool:
-        """Whether a scan shows another place than the one just before, as if it was carried there.
-
-        Of slow lasers it cannot be said: between two scans a robot goes through a door.
-        """
-        before, points = self._before, observation.points
-        if before is None or before.points is None or points is None:
-            return False
-        if not len(before.points) or observation.stamp - before.stamp > SOON:
-            return False
-        moved = se2.transform(observation.motion.delta, points)
-        gap, _ = cKDTree(before.points).query(moved)
-        near = SAME + SAME_SHARE * np.hypot(points[:, 0], points[:, 1])
-        return bool(np.mean(gap < near) < 0.5)
 
     def deskew(self, observation: Observation) -> tuple[Observation, Sweep]:
         """Deskew a scan by the velocity of the state, if there is no odometry.
@@ -296,10 +268,7 @@ class ScanTerm:
         ``input_timeout``. A scan that ``contradicts`` the submap would hide that the robot is
         lost.
         """
-        if observation.points is None or observation.origin is None:
-            return
-        self._before = observation
-        if contradicts:
+        if observation.points is None or observation.origin is None or contradicts:
             return
         if len(observation.points) < self._p.scan_match.min_points:
             return

@@ -21,7 +21,6 @@ from rlml_slam.se2 import Array
 # often where the wall lies near their border, have become free: given back half of the wall's.
 BESIDE = 50
 WALL = 0.25  # probability from which a cell of the map may stop a beam
-BEFORE = 0.4  # [m] before an end point, its own wall is no obstacle: the pose is not exact
 RUN = 10  # cells in line from which on a wall lies along the lattice
 MAX_STEPS = 4096  # along a beam, 205 m in cells of 0.05 m: a message may have far smaller ones
 
@@ -112,35 +111,14 @@ def possible(submap: Submap, points: Array, pose: Array, score: float, best: flo
     fits better says nothing. An end point behind a wall of the map does not fit in any case.
     """
     ends = se2.transform(pose, points)
-    free = _values(submap, ends) == 0
     reach = float(np.hypot(points[:, 0], points[:, 1]).max())
-    free[free] = ~_is_behind_wall(submap, pose, ends[free], reach)
+    share = np.linspace(0.0, 1.0, min(max(2, int(reach / submap.resolution)), MAX_STEPS))[:, None]
+    free = _values(submap, ends) == 0
+    for k in np.flatnonzero(free).tolist():
+        # the laser is near enough to the base for this
+        way = pose[:2] + share * (ends[k] - pose[:2])
+        free[k] = not (_values(submap, way) > value_of(WALL)).any()
     return score + float(np.mean(free)) * max(best - UNKNOWN, 0.0)
-
-
-def hidden_share(submap: Submap, points: Array, pose: Array) -> float:
-    """Share of end points (n, 2) in front of the walls of the map, less that behind them.
-
-    Where something hides the walls, such as people around the robot, it is nearly one. At another
-    place, beams go through walls of the map, or end where nothing is mapped.
-    """
-    ranges = np.hypot(points[:, 0], points[:, 1])
-    before = np.maximum(1.0 - BEFORE / np.maximum(ranges, BEFORE), 0.0)
-    ends = se2.transform(pose, points * before[:, None])
-    behind = _is_behind_wall(submap, pose, ends, float(ranges.max()), 0.5)
-    known = _values(submap, se2.transform(pose, points)) > 0
-    return float(np.mean(known & ~behind) - np.mean(behind))
-
-
-def _is_behind_wall(
-    submap: Submap, pose: Array, ends: Array, reach: float, wall: float = WALL
-) -> NDArray[np.bool_]:
-    """Whether there is a ``wall`` (probability) between a pose and each of the ends (n, 2)."""
-    steps = min(max(2, int(reach / submap.resolution)), MAX_STEPS)
-    share = np.linspace(0.0, 1.0, steps)[:, None]
-    # the laser is near enough to the base for this
-    ways = (pose[:2] + share * (end - pose[:2]) for end in ends)
-    return np.array([(_values(submap, way) > value_of(wall)).any() for way in ways], dtype=bool)
 
 
 def _values(submap: Submap, points: Array) -> NDArray[np.uint16]:

@@ -8,7 +8,7 @@ import pytest
 
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Parameters
-from rlml_slam.slam.relocalization.grid_submap import hidden_share, possible, submap_of
+from rlml_slam.slam.relocalization.grid_submap import possible, submap_of
 
 ANGLES = np.linspace(-0.6, 0.6, 360)
 AHEAD = np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)
@@ -30,19 +30,6 @@ def test_end_points_behind_a_wall_do_not_fit_whatever_the_cells(resolution):
 def test_end_points_beyond_the_map_may_fit():
     submap = submap_of(grid_with_wall(0.05, 0), Parameters().submap).submap
     assert possible(submap, 3.0 * AHEAD, np.zeros(3), 0.3, 0.9) > 0.6
-
-
-def test_what_stands_around_the_robot_hides_the_map_and_another_room_does_not():
-    submap = submap_of(grid_with_wall(0.05, 38), Parameters().submap).submap
-    people = 0.5 * AHEAD
-    through, beyond = 1.5 * AHEAD, -3.0 * AHEAD
-    assert hidden_share(submap, people, np.zeros(3)) == 1.0
-    assert hidden_share(submap, through, np.zeros(3)) < -0.8
-    assert hidden_share(submap, beyond, np.zeros(3)) == 0.0
-    half = np.concatenate([people, through])
-    assert abs(hidden_share(submap, half, np.zeros(3))) < 0.1
-    walls = AHEAD[:, :1] ** -1 * 0.925 * AHEAD  # in their places
-    assert hidden_share(submap, walls, np.zeros(3)) > 0.9
 
 
 def test_a_grid_of_tiny_cells_costs_bounded_memory():

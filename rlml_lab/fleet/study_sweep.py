@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``rlml fleet sweep``: what a parameter changes, over many bags."""
+"""``rlml-lab study sweep``: what a parameter changes, over many bags."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ REFERENCE = 'reference'
 
 
 def add_parser(subparsers: Any) -> None:
-    """Declare ``rlml fleet sweep``."""
+    """Declare ``rlml-lab study sweep``."""
     parser = subparsers.add_parser(
         'sweep',
         help='what values of parameters change, over many bags',

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot that was carried is distinguished from one that drove there itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rlml_slam import se2
+from rlml_slam.slam.relocalization.carried_robot import CarriedRobot
+from rlml_slam.types import Motion, Observation
+
+SECOND = 1_000_000_000
+ANGLES = np.linspace(-1.5, 1.5, 180)
+STEP = np.array([0.1, 0.0, 0.15])
+
+
+def room(side, pose):
+    """End points (n, 2), seen from a pose, of the walls of a square room."""
+    beams = np.stack([np.cos(ANGLES + pose[2]), np.sin(ANGLES + pose[2])], axis=1)
+    walls = np.where(beams > 0.0, side, -side)
+    ends = pose[:2] + beams * ((walls - pose[:2]) / beams).min(axis=1, keepdims=True)
+    return se2.transform(se2.inverse(pose), ends)
+
+
+def leapt(second, period, misfit=True):
+    """Whether a contradiction begins with a leap, at the second of two scans."""
+    carried = CarriedRobot()
+    first = room(4.0, np.array([1.0, -0.5, 0.3]))
+    carried.follow(Observation(SECOND, Motion(np.zeros(3), np.eye(3)), first), False, None)
+    stamp = SECOND + period
+    now = Observation(stamp, Motion(STEP, 1e-4 * np.eye(3)), second)
+    carried.follow(now, misfit, stamp)
+    return carried.leapt
+
+
+@pytest.mark.parametrize('period', [25_000_000, 200_000_000])
+def test_another_room_is_a_leap_and_the_way_through_the_same_one_is_not(period):
+    there = se2.compose(np.array([1.0, -0.5, 0.3]), STEP)
+    assert not leapt(room(4.0, there), period)
+    assert leapt(room(9.0, there), period)
+    people = room(4.0, there)
+    people[60:100] *= 0.2  # before the robot
+    assert not leapt(people, period)
+
+
+def test_slow_laser_and_missing_scan_say_nothing():
+    assert not leapt(room(9.0, STEP), 600_000_000)
+    assert not leapt(None, 25_000_000)
+
+
+def test_scan_that_fits_where_reflectors_do_not_is_no_way_that_was_seen():
+    """In a bare corridor it fits anywhere."""
+    assert leapt(room(4.0, STEP), 25_000_000, misfit=False)
