@@ -24,13 +24,16 @@ class CarriedRobot:
 
     def __init__(self) -> None:
         self._before: Observation | None = None
+        self._moved = np.zeros(3)  # since then
         self.leapt = False
 
     def follow(self, observation: Observation, misfit: bool, since: int | None) -> None:
-        """Take the next scan, which is a ``misfit`` or not; stamp of the first contradiction."""
+        """Take the next frame, a ``misfit`` or not; stamp of the first contradiction."""
+        self._moved = se2.compose(self._moved, observation.motion.delta)
         if since == observation.stamp:
             self.leapt = not misfit or self._leaps(observation)
-        self._before = observation
+        if observation.points is not None:
+            self._before, self._moved = observation, np.zeros(3)
 
     def _leaps(self, observation: Observation) -> bool:
         """Of slow lasers it cannot be said: between two scans a robot goes through a door."""
@@ -39,7 +42,7 @@ class CarriedRobot:
             return False
         if observation.stamp - before.stamp > SOON:
             return False
-        gap, _ = cKDTree(before.points).query(se2.transform(observation.motion.delta, points))
+        gap, _ = cKDTree(before.points).query(se2.transform(self._moved, points))
         near = SAME + SAME_SHARE * np.hypot(points[:, 0], points[:, 1])
         return bool(np.mean(gap < near) < 0.5)
 

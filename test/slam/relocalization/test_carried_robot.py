@@ -23,12 +23,14 @@ def room(side, pose):
     return se2.transform(se2.inverse(pose), ends)
 
 
-def leapt(second, period, misfit=True):
+def leapt(second, period, misfit=True, between=()):
     """Whether a contradiction begins with a leap, at the second of two scans."""
     carried = CarriedRobot()
     first = room(4.0, np.array([1.0, -0.5, 0.3]))
     carried.follow(Observation(SECOND, Motion(np.zeros(3), np.eye(3)), first), False, None)
     stamp = SECOND + period
+    for motion in between:  # detections alone
+        carried.follow(Observation(SECOND + 1, Motion(motion, np.eye(3))), False, None)
     now = Observation(stamp, Motion(STEP, 1e-4 * np.eye(3)), second)
     carried.follow(now, misfit, stamp)
     return carried.leapt
@@ -42,6 +44,13 @@ def test_another_room_is_a_leap_and_the_way_through_the_same_one_is_not(period):
     people = room(4.0, there)
     people[60:100] *= 0.2  # before the robot
     assert not leapt(people, period)
+
+
+def test_detections_between_two_scans_change_nothing():
+    back = se2.inverse(STEP)
+    there = room(4.0, np.array([1.0, -0.5, 0.3]))
+    assert not leapt(there, 25_000_000, between=(back,))
+    assert leapt(room(9.0, STEP), 25_000_000, between=(back,))
 
 
 def test_slow_laser_and_missing_scan_say_nothing():
