@@ -79,6 +79,7 @@ class FrontEnd:
         matches = self._grow_map(observation, matches, scan, contradicted)
         if moved:  # it maps on, and the graph is to find out where that was
             self._scans.start_new_submaps()
+            scan = ScanEvidence(has_scan=scan.has_scan)
             self._reflectors.forget_anonymous()
             self.state.widen(unknown_way(self._p.submap))
             observation = observation.with_noise(unknown_way(self._p.submap))
@@ -115,10 +116,7 @@ class FrontEnd:
     def _contradicts_map(
         self, observation: Observation, matches: Matches, scan: ScanEvidence
     ) -> tuple[bool, bool]:
-        """Whether scan and reflectors contradict the map, and whether the robot was carried.
-
-        While mapping, a contradiction of ``new_session_time`` starts new submaps.
-        """
+        """Whether scan and reflectors contradict the map, and whether the robot was carried."""
         # an unmatched detection with an id is no contradiction here: the back end resolves it
         resolved = matches.num_unmatched_ids(observation.detections)
         fits = scan.used and scan.open_direction is None and not self._map.grid_match.refutes
@@ -126,7 +124,7 @@ class FrontEnd:
             observation.stamp, scan.misfit, fits,
             len(matches.status) - resolved, matches.num_used, bool(self.tracks.surveyed.any()),
         )  # fmt: skip
-        self._carried.follow(observation, scan.misfit, self.kidnapping.since)
+        self._carried.follow(observation, scan, self.kidnapping.since)
         patience = self._p.health.new_session_time
         if self._map.saved is None and self.kidnapping.has_lasted(observation.stamp, patience):
             if not self._carried.leapt:

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rlml_slam import params, se2
+from rlml_slam.estimation.health import ScanEvidence
 from rlml_slam.se2 import Array
 from rlml_slam.types import Observation
 
@@ -27,11 +28,14 @@ class CarriedRobot:
         self._moved = np.zeros(3)  # since then
         self.leapt = False
 
-    def follow(self, observation: Observation, misfit: bool, since: int | None) -> None:
-        """Take the next frame, a ``misfit`` or not; stamp of the first contradiction."""
+    def follow(self, observation: Observation, scan: ScanEvidence, since: int | None) -> None:
+        """Take the next frame, and the stamp of the first contradiction, None without one."""
         self._moved = se2.compose(self._moved, observation.motion.delta)
         if since == observation.stamp:
-            self.leapt = not misfit or self._leaps(observation)
+            fits_anywhere = scan.used and scan.open_direction is not None
+            self.leapt |= fits_anywhere or (scan.misfit and self._leaps(observation))
+        elif since is None and scan.used:
+            self.leapt = False
         if observation.points is not None:
             self._before, self._moved = observation, np.zeros(3)
 

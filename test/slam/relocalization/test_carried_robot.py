@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from rlml_slam import se2
+from rlml_slam.estimation.health import ScanEvidence
 from rlml_slam.slam.relocalization.carried_robot import CarriedRobot
 from rlml_slam.types import Motion, Observation
 
@@ -23,16 +24,25 @@ def room(side, pose):
     return se2.transform(se2.inverse(pose), ends)
 
 
-def leapt(second, period, misfit=True, between=()):
+GOOD = ScanEvidence(has_scan=True, used=True)
+MISFIT = ScanEvidence(has_scan=True, misfit=True)
+ALONG = ScanEvidence(has_scan=True, used=True, open_direction=0.0)
+
+
+def leapt(second, period, scan=MISFIT, between=(), after=()):
     """Whether a contradiction begins with a leap, at the second of two scans."""
     carried = CarriedRobot()
     first = room(4.0, np.array([1.0, -0.5, 0.3]))
-    carried.follow(Observation(SECOND, Motion(np.zeros(3), np.eye(3)), first), False, None)
+    carried.follow(Observation(SECOND, Motion(np.zeros(3), np.eye(3)), first), GOOD, None)
     stamp = SECOND + period
     for motion in between:  # detections alone
-        carried.follow(Observation(SECOND + 1, Motion(motion, np.eye(3))), False, None)
+        carried.follow(Observation(SECOND + 1, Motion(motion, np.eye(3))), ScanEvidence(), None)
     now = Observation(stamp, Motion(STEP, 1e-4 * np.eye(3)), second)
-    carried.follow(now, misfit, stamp)
+    carried.follow(now, scan, stamp)
+    for then, since in after:
+        stamp += period
+        still = Motion(np.zeros(3), np.eye(3))
+        carried.follow(Observation(stamp, still, second), then, stamp if since else None)
     return carried.leapt
 
 
@@ -55,9 +65,15 @@ def test_detections_between_two_scans_change_nothing():
 
 def test_slow_laser_and_missing_scan_say_nothing():
     assert not leapt(room(9.0, STEP), 600_000_000)
-    assert not leapt(None, 25_000_000)
+    assert not leapt(None, 25_000_000, ScanEvidence())
+
+
+def test_frame_without_a_scan_does_not_end_what_began_with_a_leap_and_one_that_fits_does():
+    there = room(9.0, STEP)
+    assert leapt(there, 25_000_000, after=[(ScanEvidence(), False), (MISFIT, True)])
+    assert not leapt(there, 25_000_000, after=[(GOOD, False), (MISFIT, True)])
 
 
 def test_scan_that_fits_where_reflectors_do_not_is_no_way_that_was_seen():
     """In a bare corridor it fits anywhere."""
-    assert leapt(room(4.0, STEP), 25_000_000, misfit=False)
+    assert leapt(room(4.0, STEP), 25_000_000, ALONG)
