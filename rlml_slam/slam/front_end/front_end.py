@@ -81,8 +81,8 @@ class FrontEnd:
             self._scans.start_new_submaps()
             scan = ScanEvidence(has_scan=scan.has_scan)
             self._reflectors.forget_anonymous()
-            self.state.widen(unknown_way(self._p.submap))
-            observation = observation.with_noise(unknown_way(self._p.submap))
+            self.state.widen(unknown_way(self._p))
+            observation = observation.with_noise(unknown_way(self._p))
         health = self._evaluate_health(observation, matches, scan)
         return self._frame(observation, matches, scan, health, contradicted, began)
 

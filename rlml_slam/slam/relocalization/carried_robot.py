@@ -24,33 +24,43 @@ class CarriedRobot:
     """Follows all scans of a robot; ``leapt`` where the newest contradiction of the map began."""
 
     def __init__(self) -> None:
-        self._before: Observation | None = None
-        self._moved = np.zeros(3)  # since then
+        self._way = np.zeros(3)
+        # by laser, its last scan and the way until it
+        self._before: dict[str, tuple[Observation, Array]] = {}
         self.leapt = False
 
     def follow(self, observation: Observation, scan: ScanEvidence, since: int | None) -> None:
         """Take the next frame, and the stamp of the first contradiction, None without one."""
-        self._moved = se2.compose(self._moved, observation.motion.delta)
+        self._way = se2.compose(self._way, observation.motion.delta)
         if since == observation.stamp:
             fits_anywhere = scan.used and scan.open_direction is not None
             self.leapt |= fits_anywhere or (scan.misfit and self._leaps(observation))
         elif since is None and scan.used:
             self.leapt = False
         if observation.points is not None:
-            self._before, self._moved = observation, np.zeros(3)
+            self._before[_laser(observation)] = observation, self._way
 
     def _leaps(self, observation: Observation) -> bool:
         """Of slow lasers it cannot be said: between two scans a robot goes through a door."""
-        before, points = self._before, observation.points
-        if before is None or before.points is None or not len(before.points) or points is None:
+        before, way = self._before.get(_laser(observation), (observation, self._way))
+        if before.points is None or not len(before.points) or observation.points is None:
             return False
         if observation.stamp - before.stamp > SOON:
             return False
-        gap, _ = cKDTree(before.points).query(se2.transform(self._moved, points))
-        near = SAME + SAME_SHARE * np.hypot(points[:, 0], points[:, 1])
+        points = se2.transform(se2.between(way, self._way), observation.points)
+        gap, _ = cKDTree(before.points).query(points)
+        near = SAME + SAME_SHARE * np.hypot(*observation.points.T)
         return bool(np.mean(gap < near) < 0.5)
 
 
-def unknown_way(p: params.Submap) -> Array:
-    """Covariance (3, 3) of a motion that nobody knows: 1 sigma is as far as the laser is used."""
-    return np.diag([p.max_laser_range, p.max_laser_range, math.pi / math.sqrt(3.0)]) ** 2
+def _laser(observation: Observation) -> str:
+    return '' if observation.scan is None else observation.scan.frame_id
+
+
+def unknown_way(p: params.Parameters) -> Array:
+    """Covariance (3, 3) of a motion that nobody knows: 1 sigma is as far as the laser is used.
+
+    It is lost there, whatever range the parameters say.
+    """
+    far = max(p.submap.max_laser_range, 2.0 * p.health.sigma_lost)
+    return np.diag([far, far, math.pi / math.sqrt(3.0)]) ** 2

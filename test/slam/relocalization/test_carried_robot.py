@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from rlml_slam import se2
 from rlml_slam.estimation.health import ScanEvidence
-from rlml_slam.slam.relocalization.carried_robot import CarriedRobot
-from rlml_slam.types import Motion, Observation
+from rlml_slam.params import Parameters, Submap
+from rlml_slam.slam.relocalization.carried_robot import CarriedRobot, unknown_way
+from rlml_slam.types import Motion, Observation, Scan
 
 SECOND = 1_000_000_000
 ANGLES = np.linspace(-1.5, 1.5, 180)
@@ -77,3 +80,25 @@ def test_frame_without_a_scan_does_not_end_what_began_with_a_leap_and_one_that_f
 def test_scan_that_fits_where_reflectors_do_not_is_no_way_that_was_seen():
     """In a bare corridor it fits anywhere."""
     assert leapt(room(4.0, STEP), 25_000_000, ALONG)
+
+
+def test_scan_is_compared_with_the_one_before_of_the_same_laser():
+    """The other laser looks back: what it sees was a leap, and the robot LOST until found."""
+    carried, here = CarriedRobot(), np.array([1.0, -0.5, 0.3])
+    back = se2.compose(here, np.array([0.0, 0.0, np.pi]))
+    still = Motion(np.zeros(3), np.eye(3))
+    for k in range(6):
+        name, pose = (('front', here), ('back', back))[k % 2]
+        scan = Scan(SECOND + k, name, -1.5, 1.0, 0.0, 0.1, 30.0, np.ones(1), np.ones(0))
+        seen = Observation(SECOND + k, still, room(4.0, pose), scan=scan)
+        carried.follow(seen, MISFIT, SECOND + k if k > 1 else None)
+        assert not carried.leapt
+    seen = Observation(SECOND + 6, still, room(9.0, here), scan=replace(scan, frame_id='front'))
+    carried.follow(seen, MISFIT, SECOND + 6)
+    assert carried.leapt
+
+
+def test_robot_that_may_be_anywhere_is_lost_whatever_the_range_of_its_laser():
+    near = Parameters(submap=Submap(max_laser_range=1.5))
+    assert unknown_way(near)[0, 0] > Parameters().health.sigma_lost**2
+    assert unknown_way(Parameters())[0, 0] == Parameters().submap.max_laser_range**2
