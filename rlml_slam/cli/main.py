@@ -9,6 +9,7 @@ an answer. A wrong command line is exit code 2, and a bug is a traceback.
 from __future__ import annotations
 
 import argparse
+import difflib
 import importlib
 import os
 import shlex
@@ -185,6 +186,9 @@ def _add_commands(
     subparsers = parser.add_subparsers(metavar='COMMAND', title='commands', required=True)
     words = [a for a in arguments if not a.startswith('-')]
     wanted = words[0] if words and words[0] == next(iter(arguments), None) else None
+    if wanted is not None and wanted not in table and '_ARGCOMPLETE' not in os.environ:
+        for near in difflib.get_close_matches(wanted, table, n=1):
+            parser.error(f'there is no command {wanted!r}; is {near!r} meant?')
     module = None
     for name, entry in table.items():
         if name != wanted:

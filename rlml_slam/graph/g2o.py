@@ -107,7 +107,10 @@ def _parse(path: Path) -> tuple[dict[str, _Lines], list[tuple[int, int]], Counte
         if len(raw) > MAX_SIZE:
             raise ValueError(f'more than {MAX_SIZE} bytes')
         text = raw.decode('ascii')
-    except (ValueError, OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
+        message = f'{path}: not a graph in g2o or TORO format: byte {error.start} is not ASCII'
+        raise FileFormatError(message) from None
+    except (ValueError, OSError, EOFError, zlib.error) as error:
         raise FileFormatError(f'{path}: cannot be read: {error}') from None
     lines = {tag: _Lines() for tag in TAGS}
     fixed: list[tuple[int, int]] = []

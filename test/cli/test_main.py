@@ -48,6 +48,25 @@ def test_module_runs_as_the_command():
     assert done.stdout.startswith('rlml ')
 
 
+@pytest.mark.parametrize(
+    ('words', 'meant'),
+    [(['repaly', 'bag'], 'replay'), (['map', 'impot'], 'import'), (['--version', 'xyzzy'], '')],
+)
+def test_misspelled_command_is_suggested(words, meant, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(words)
+    assert end.value.code == (2 if meant else 0)
+    assert (f"is '{meant}' meant?" in capsys.readouterr().err) == bool(meant)
+
+
+def test_command_that_is_like_none_lists_all(capsys):
+    with pytest.raises(SystemExit):
+        main(['xyzzy'])
+    err = capsys.readouterr().err
+    assert 'invalid choice' in err
+    assert all(name in err for name in COMMANDS)
+
+
 @pytest.mark.parametrize(('name', 'command'), list(entries()))
 def test_table_says_what_the_command_says(name, command):
     if command.module in ('rlml_slam.cli.demo', 'rlml_slam.cli.live'):

@@ -100,5 +100,5 @@ def test_scan_is_compared_with_the_one_before_of_the_same_laser():
 
 def test_robot_that_may_be_anywhere_is_lost_whatever_the_range_of_its_laser():
     near = Parameters(submap=Submap(max_laser_range=1.5))
-    assert unknown_way(near)[0, 0] > Parameters().health.sigma_lost**2
-    assert unknown_way(Parameters())[0, 0] == Parameters().submap.max_laser_range**2
+    assert unknown_way(near)[0, 0] > Parameters().health.sigma_lost ** 2
+    assert unknown_way(Parameters())[0, 0] == Parameters().submap.max_laser_range ** 2
