@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import sys
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -69,7 +68,6 @@ def answer_of(asker: Any, node: str, service: str, kind: Any, fields: dict[str, 
     while not client.wait_for_service(PATIENCE):
         if _others(asker) or time.monotonic() - began > ALONE:
             raise InputError(_absent(asker, node, service))
-        print('no node is seen yet', file=sys.stderr)
     future = client.call_async(kind.Request(**fields))
     rclpy.spin_until_future_complete(asker, future, timeout_sec=WORK)
     if not future.done() or future.result() is None:
