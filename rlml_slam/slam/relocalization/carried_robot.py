@@ -17,6 +17,7 @@ from rlml_slam.se2 import Array
 from rlml_slam.types import Observation
 
 SOON = 250_000_000  # [ns] between two scans, in which a robot drives nowhere else
+BY_CHANCE = 1_000_000_000  # [ns] in which scans of another place may fit
 SAME, SAME_SHARE = 0.1, 0.02  # [m], and share of the range, by which the same walls may be apart
 
 
@@ -27,6 +28,7 @@ class CarriedRobot:
         self._way = np.zeros(3)
         # by laser, its last scan and the way until it
         self._before: dict[str, tuple[Observation, Array]] = {}
+        self._fits = 0  # stamp of the first scan that fits again
         self.leapt = False
 
     def follow(self, observation: Observation, scan: ScanEvidence, since: int | None) -> None:
@@ -36,7 +38,10 @@ class CarriedRobot:
             fits_anywhere = scan.used and scan.open_direction is not None
             self.leapt |= fits_anywhere or (scan.misfit and self._leaps(observation))
         elif since is None and scan.used:
-            self.leapt = False
+            self._fits = self._fits or observation.stamp
+            self.leapt &= observation.stamp - self._fits < BY_CHANCE
+        if since is not None:
+            self._fits = 0
         if observation.points is not None:
             self._before[_laser(observation)] = observation, self._way
 
