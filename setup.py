@@ -114,7 +114,7 @@ setup(
             'pytest-xdist',
             'ruff',
         ],
-        # many recordings at once
+        # many maps at once (`rlml map merge`), and many recordings from a checkout
         'fleet': ['dask', 'distributed', 'fsspec', 'pyarrow'],
         'bench': ['evo', 'g2o-python', 'g2opy', 'gtsam', 'pyceres', 'yag-slam'],
     },

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``rlml-lab``: studies and benchmarks, run from a checkout.
+"""The command ``rlml-lab``: studies, benchmarks and work over many bags, run from a checkout.
 
 They are not part of what a robot installs; ``make env`` puts the command into ``.venv/bin``.
 """
@@ -36,11 +36,12 @@ COMMANDS: Table = {
                 'odometry that stands still while the robot drives, then catches up',
             ),
             'fleet': Command(
-                'rlml_lab.fleet.study_fleet',
+                'rlml_lab.fleet_studies.study_fleet',
                 'many replays on a cluster: the same, faster, through kills, and what they find',
             ),
             'sweep': Command(
-                'rlml_lab.fleet.study_sweep', 'what values of parameters change, over many bags'
+                'rlml_lab.fleet_studies.study_sweep',
+                'what values of parameters change, over many bags',
             ),
             'lifelong': Command(
                 'rlml_lab.studies.study_lifelong',
@@ -144,6 +145,15 @@ COMMANDS: Table = {
             ),
         },
     ),
+    'fleet': Group(
+        'many bags at once, on this machine or a cluster',
+        {
+            'replay': Command(
+                'rlml_lab.fleet.fleet_replay',
+                'many bags through the system, against the run before',
+            ),
+        },
+    ),
     'convert': Command('rlml_lab.datasets.convert', 'public data sets become bags'),
     'pictures': Command(
         'rlml_lab.live.pictures', 'the pictures of the documentation, by Chromium'
@@ -179,7 +189,10 @@ COMMANDS: Table = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command line of ``rlml-lab``; the exit code."""
     return command_line.main(
-        argv, COMMANDS, 'rlml-lab', 'Studies and benchmarks of rlml_slam, for its developers.'
+        argv,
+        COMMANDS,
+        'rlml-lab',
+        'Studies, benchmarks and work over many bags of rlml_slam, for its developers.',
     )
 
 

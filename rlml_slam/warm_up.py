@@ -14,7 +14,7 @@ from pathlib import Path
 
 OTHER_SYSTEMS = ('deformable', 'ekf')  # compiled when they are first used
 # tiers without kernels
-OUTER = ('ros', 'nodes', 'cli', 'datasets', 'evaluation', 'fleet', 'recordings', 'report')
+OUTER = ('ros', 'nodes', 'cli', 'datasets', 'evaluation', 'recordings', 'report')
 
 
 def core_modules() -> Iterator[str]:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Studies of many recordings at once."""
+"""``rlml-lab fleet …``: many recordings at once, on a cluster of Dask (extra ``fleet``)."""

@@ -5,11 +5,16 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
-from typing import TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
+from rlml_slam.cli.map.cluster import open_client
 from rlml_slam.errors import ParameterError
-from rlml_slam.fleet import cluster
-from rlml_slam.fleet.cluster import Result, Task
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+Task = TypeVar('Task', bound=tuple[Any, ...])
+Result = TypeVar('Result')
 
 # a number of processes of this machine (0: one per core), or the address of a scheduler
 Workers: TypeAlias = int | str
@@ -38,5 +43,17 @@ def each(
         yield from ((task, function(*task)) for task in tasks)
         return
     address, jobs = (workers, 0) if isinstance(workers, str) else (None, workers)
-    with cluster.open_client(address, jobs) as client:
-        yield from cluster.each(client, function, tasks)
+    with open_client(address, jobs) as client:
+        yield from each_by(client, function, tasks)
+
+
+def each_by(
+    client: Client, function: Callable[..., Result], tasks: Sequence[Task]
+) -> Iterator[tuple[Task, Result]]:
+    """(task, function(*task)) as they become ready; what a task raises is raised here."""
+    from distributed import as_completed
+
+    # each task is computed, equal ones too: Dask would find equal calls of a pure function again
+    pending = {client.submit(function, *task, pure=False): task for task in tasks}
+    for done in as_completed(list(pending)):
+        yield pending.pop(done), done.result()

@@ -90,15 +90,6 @@ COMMANDS: Table = {
     'plan': Command(
         'rlml_slam.cli.layout.plan', 'accuracy and uniqueness that a layout of reflectors gives'
     ),
-    'fleet': Group(
-        'many bags at once, on this machine or a cluster',
-        {
-            'replay': Command(
-                'rlml_slam.cli.fleet.fleet_replay',
-                'many bags through the system, against the run before',
-            ),
-        },
-    ),
     'audit': Command(
         'rlml_slam.cli.layout.audit', 'a run against its planned layout: what is not as planned'
     ),

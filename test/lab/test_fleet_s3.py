@@ -8,8 +8,8 @@ import json
 import pytest
 from made_bags import simulated_bag
 
-from rlml_slam.cli.main import main
-from rlml_slam.fleet.cluster import open_client
+from rlml_lab.main import main
+from rlml_slam.cli.map.cluster import open_client
 
 pytest.importorskip('distributed')
 fsspec = pytest.importorskip('fsspec')
@@ -30,7 +30,7 @@ def test_bags_and_results_in_s3_give_the_same_table(tmp_path, capsys, monkeypatc
     (bags / 'r2').mkdir()
     (bags / 'r2/broken.mcap').write_text('nonsense')
     assert replay(capsys, bags, '--out', here, '--jobs', '1')[0] == 1  # one is broken
-    from rlml_lab.fleet.stores import s3_server
+    from rlml_lab.fleet_studies.stores import s3_server
 
     # the workers are started where the server is: they read and write as well
     with s3_server(), open_client(None, 1) as client:
@@ -63,6 +63,6 @@ def test_bags_and_results_in_s3_give_the_same_table(tmp_path, capsys, monkeypatc
             assert why in capsys.readouterr().err
     # the server has gone
     assert main(['fleet', 'replay', place, '--out', out]) == 1
-    assert f'rlml: {place}: cannot be read: Could not connect' in capsys.readouterr().err
+    assert f'rlml-lab: {place}: cannot be read: Could not connect' in capsys.readouterr().err
     assert main(['fleet', 'replay', str(bags), '--out', out]) == 1
     assert 'fleet.trial: cannot be written: Could not connect' in capsys.readouterr().err

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import pytest
 
-from rlml_lab.fleet import by_processes
-from rlml_lab.fleet.fleet_bags import FAULTS, WORLDS, WRONG_POSE, Fleet, make_bag, name_of
+from rlml_lab.fleet.replay_job import replay_bag
+from rlml_lab.fleet.results import Results
+from rlml_lab.fleet.run import write_tables
+from rlml_lab.fleet_studies import by_processes
+from rlml_lab.fleet_studies.fleet_bags import FAULTS, WORLDS, WRONG_POSE, Fleet, make_bag, name_of
 from rlml_lab.main import main
 from rlml_lab.support.parallel_jobs import each
-from rlml_slam.fleet.replay_job import replay_bag
-from rlml_slam.fleet.results import Results
-from rlml_slam.fleet.run import write_tables
 from rlml_slam.ros.bags.bag import BagReader
 
 pytest.importorskip('distributed')

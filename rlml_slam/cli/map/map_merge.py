@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from rlml_slam import warm_up
+from rlml_slam.cli.map.cluster import open_client
 from rlml_slam.cli.support.usage import usage
-from rlml_slam.fleet.cluster import open_client
 from rlml_slam.maps import map_container, survey
 from rlml_slam.params import Parameters, from_mapping, read_yaml
 from rlml_slam.slam.merging.map_merging import merge_files

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``rlml fleet replay``: many bags through the system, against the run before."""
+"""``rlml-lab fleet replay``: many bags through the system, against the run before."""
 
 from __future__ import annotations
 
@@ -9,12 +9,8 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-from rlml_slam.cli.fleet.fleet_options import add_options, values_of
-from rlml_slam.cli.support.progress import Progress
-from rlml_slam.cli.support.text_table import aligned
-from rlml_slam.fleet.bags import find_bags, in_words
-from rlml_slam.fleet.cluster import open_client
-from rlml_slam.fleet.comparison import (
+from rlml_lab.fleet.bags import find_bags, in_words
+from rlml_lab.fleet.comparison import (
     LIMITS,
     Effect,
     Verdict,
@@ -23,10 +19,14 @@ from rlml_slam.fleet.comparison import (
     effects,
     limits_with,
 )  # fmt: skip
-from rlml_slam.fleet.page import fleet_page
-from rlml_slam.fleet.replay_job import Job, code_digest
-from rlml_slam.fleet.results import Record, Results
-from rlml_slam.fleet.run import replay_all, write_tables
+from rlml_lab.fleet.fleet_options import add_options, values_of
+from rlml_lab.fleet.page import fleet_page
+from rlml_lab.fleet.replay_job import Job, code_digest
+from rlml_lab.fleet.results import Record, Results
+from rlml_lab.fleet.run import replay_all, write_tables
+from rlml_slam.cli.map.cluster import open_client
+from rlml_slam.cli.support.progress import Progress
+from rlml_slam.cli.support.text_table import aligned
 from rlml_slam.params import from_mapping
 from rlml_slam.recordings.bag_replay import SYSTEMS
 
@@ -34,7 +34,7 @@ SHOWN = 20  # bags that are named on the terminal
 
 
 def add_parser(subparsers: Any) -> None:
-    """Declare ``rlml fleet replay``."""
+    """Declare ``rlml-lab fleet replay``."""
     defaults = ', '.join(f'{k} {v.step:g} or {v.share:.0%}' for k, v in LIMITS.items())
     parser = subparsers.add_parser(
         'replay',

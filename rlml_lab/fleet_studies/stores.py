@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import fsspec
 
-from rlml_lab.fleet.fleet_bags import Fleet, name_of
-from rlml_slam.fleet.bags import find_bags
-from rlml_slam.fleet.cluster import open_client
-from rlml_slam.fleet.replay_job import Job, code_digest
-from rlml_slam.fleet.results import Results
-from rlml_slam.fleet.run import replay_all, write_tables
+from rlml_lab.fleet.bags import find_bags
+from rlml_lab.fleet.replay_job import Job, code_digest
+from rlml_lab.fleet.results import Results
+from rlml_lab.fleet.run import replay_all, write_tables
+from rlml_lab.fleet_studies.fleet_bags import Fleet, name_of
+from rlml_slam.cli.map.cluster import open_client
 from rlml_slam.params import Parameters
 
 if TYPE_CHECKING:

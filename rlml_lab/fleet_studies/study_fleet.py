@@ -12,13 +12,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rlml_lab.fleet import by_processes, regressions, stores
-from rlml_lab.fleet.fleet_bags import Fleet, make_bag
+from rlml_lab.fleet.results import Record, Results
+from rlml_lab.fleet.run import replay_all, write_tables
+from rlml_lab.fleet_studies import by_processes, regressions, stores
+from rlml_lab.fleet_studies.fleet_bags import Fleet, make_bag
+from rlml_lab.support.parallel_jobs import each_by
+from rlml_slam.cli.map.cluster import open_client
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.errors import ParameterError
-from rlml_slam.fleet.cluster import each, open_client
-from rlml_slam.fleet.results import Record, Results
-from rlml_slam.fleet.run import replay_all, write_tables
 
 ROUNDS = 4  # in which one worker and two take turns, so that other load costs both alike
 MIN_SPEED_UP, MAX_OVERHEAD_S = 1.8, 0.05
@@ -71,7 +72,7 @@ def simulate(fleet: Fleet, n: int, quiet: bool) -> None:
     """Write the bags that are not there yet."""
     tasks = [(str(fleet.bags), k, fleet.seconds) for k in range(n)]
     with open_client(None) as client, Progress('simulate', n, quiet) as bar:
-        for k, _ in enumerate(each(client, make_bag, tasks), 1):
+        for k, _ in enumerate(each_by(client, make_bag, tasks), 1):
             bar.update(k)
 
 

@@ -8,16 +8,16 @@ import json
 from dataclasses import asdict
 from typing import Any
 
-from rlml_slam.cli.fleet.fleet_options import add_options, values_of
+from rlml_lab.fleet.bags import find_bags, in_words
+from rlml_lab.fleet.comparison import effect_rows, effects
+from rlml_lab.fleet.fleet_options import add_options, values_of
+from rlml_lab.fleet.replay_job import Job, code_digest
+from rlml_lab.fleet.results import Results
+from rlml_lab.fleet.run import columns_of, csv_of, replay_all, write_tables
+from rlml_slam.cli.map.cluster import open_client
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.cli.support.text_table import aligned
 from rlml_slam.errors import ParameterError
-from rlml_slam.fleet.bags import find_bags, in_words
-from rlml_slam.fleet.cluster import open_client
-from rlml_slam.fleet.comparison import effect_rows, effects
-from rlml_slam.fleet.replay_job import Job, code_digest
-from rlml_slam.fleet.results import Results
-from rlml_slam.fleet.run import columns_of, csv_of, replay_all, write_tables
 from rlml_slam.params import from_mapping
 from rlml_slam.plain_yaml import parse_yaml
 from rlml_slam.recordings.bag_replay import SYSTEMS

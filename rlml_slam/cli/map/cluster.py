@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 from rlml_slam.errors import ClusterError
 
 if TYPE_CHECKING:
     from distributed import Client
-
-Task = TypeVar('Task', bound=tuple[Any, ...])
-Result = TypeVar('Result')
 
 CONNECT_S = 30.0  # [s] within which a scheduler has to answer
 # A nanny starts its worker again; Dask would take out one that is absent this [s] after its first
@@ -69,15 +66,3 @@ def open_client(cluster: str | None, jobs: int = 0) -> Iterator[Client]:
         Client(local) as client,
     ):  # fmt: skip
         yield client
-
-
-def each(
-    client: Client, function: Callable[..., Result], tasks: Sequence[Task]
-) -> Iterator[tuple[Task, Result]]:
-    """(task, function(*task)) as they become ready; what a task raises is raised here."""
-    from distributed import as_completed
-
-    # each task is computed, equal ones too: Dask would find equal calls of a pure function again
-    pending = {client.submit(function, *task, pure=False): task for task in tasks}
-    for done in as_completed(list(pending)):
-        yield pending.pop(done), done.result()

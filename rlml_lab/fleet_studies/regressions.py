@@ -13,14 +13,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import rlml_lab
 import rlml_slam
-from rlml_lab.fleet.fleet_bags import Fleet, make_bag, name_of
-from rlml_slam.fleet.bags import Bag
-from rlml_slam.fleet.cluster import open_client
-from rlml_slam.fleet.comparison import compare
-from rlml_slam.fleet.replay_job import Job
-from rlml_slam.fleet.results import Results
-from rlml_slam.fleet.run import replay_all
+from rlml_lab.fleet.bags import Bag
+from rlml_lab.fleet.comparison import compare
+from rlml_lab.fleet.replay_job import Job
+from rlml_lab.fleet.results import Results
+from rlml_lab.fleet.run import replay_all
+from rlml_lab.fleet_studies.fleet_bags import Fleet, make_bag, name_of
+from rlml_slam.cli.map.cluster import open_client
 from rlml_slam.params import from_mapping
 
 # planted -> the world of its bags, and parameters; a wrong laser_pose is in the bag
@@ -87,10 +88,10 @@ def _reruns(fleet: Fleet, client: Any, names: list[str]) -> dict[str, int]:
 def _refactoring(fleet: Fleet, bags: int = 12) -> dict[str, Any]:
     """A copy of the package whose text differs, and whose results must not."""
     tree = fleet.out / 'refactored'
-    package = Path(rlml_slam.__file__).parent
     shutil.rmtree(tree, ignore_errors=True)
-    shutil.copytree(package, tree / package.name)
-    with (tree / package.name / 'fleet' / 'run.py').open('a') as f:
+    for package in (Path(rlml_slam.__file__).parent, Path(rlml_lab.__file__).parent):
+        shutil.copytree(package, tree / package.name)
+    with (tree / 'rlml_slam' / 'recordings' / 'bag_replay.py').open('a') as f:
         f.write('\n# a line that changes no result\n')
     subset = fleet.out / 'subset'
     for name in (name_of(k) for k in range(bags)):
@@ -98,7 +99,7 @@ def _refactoring(fleet: Fleet, bags: int = 12) -> dict[str, Any]:
         if not (subset / name).exists():
             shutil.copytree(fleet.bags / name, subset / name)
     done = subprocess.run(
-        [sys.executable, '-m', 'rlml_slam', 'fleet', 'replay', str(subset), '--out',
+        [sys.executable, '-m', 'rlml_lab', 'fleet', 'replay', str(subset), '--out',
          str(fleet.out / 'refactored_runs'), '--no-report', '--json', '--same-bytes',
          '--baseline', str(fleet.out / 'workers_1')],
         stdout=subprocess.PIPE, text=True, check=False,

@@ -12,7 +12,7 @@ from typing import Any
 
 from fsspec.core import url_to_fs
 
-from rlml_slam.fleet.store_errors import naming
+from rlml_lab.fleet.store_errors import naming
 from rlml_slam.maps.atomic_file import write_atomically
 
 RECORD, ALL, TRIAL = 'run.json', 'fleet.json', 'fleet.trial'

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from rlml_lab.fleet.bags import find_bags
+from rlml_lab.fleet.replay_job import Job, code_digest
 from rlml_slam.cli.simulate import write_bag
-from rlml_slam.fleet.bags import find_bags
-from rlml_slam.fleet.replay_job import Job, code_digest
 from rlml_slam.params import Parameters, SimulatorParameters, from_mapping
 from rlml_slam.simulation.simulation import Simulation
 from rlml_slam.simulation.world_file import load_world

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import pytest
 
+from rlml_lab.fleet.bags import find_bags, local_copy
 from rlml_slam.errors import BagError
-from rlml_slam.fleet.bags import find_bags, local_copy
 from rlml_slam.recordings.origin import digest_of
 
 fsspec = pytest.importorskip('fsspec')

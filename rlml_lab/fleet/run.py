@@ -9,9 +9,9 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
+from rlml_lab.fleet.replay_job import Job, failed, replay_bag
+from rlml_lab.fleet.results import Record, Results
 from rlml_slam.errors import ClusterError
-from rlml_slam.fleet.replay_job import Job, failed, replay_bag
-from rlml_slam.fleet.results import Record, Results
 
 if TYPE_CHECKING:
     from distributed import Client

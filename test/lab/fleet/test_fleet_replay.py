@@ -10,14 +10,15 @@ import signal
 import pytest
 from made_bags import simulated_bag
 
+from rlml_lab.fleet import replay_job
+from rlml_lab.fleet.bags import Bag, find_bags
+from rlml_lab.fleet.replay_job import SAME, Job, code_digest, replay_bag
+from rlml_lab.fleet.results import Results
+from rlml_lab.fleet.run import replay_all, write_tables
+from rlml_lab.main import main as lab
 from rlml_slam.cli.main import main
+from rlml_slam.cli.map.cluster import open_client
 from rlml_slam.errors import ClusterError
-from rlml_slam.fleet import replay_job
-from rlml_slam.fleet.bags import Bag, find_bags
-from rlml_slam.fleet.cluster import open_client
-from rlml_slam.fleet.replay_job import SAME, Job, code_digest, replay_bag
-from rlml_slam.fleet.results import Results
-from rlml_slam.fleet.run import replay_all, write_tables
 from rlml_slam.params import Parameters
 
 pytest.importorskip('distributed')
@@ -41,7 +42,7 @@ def workers():
 
 
 def fleet(*words) -> int:
-    return main(['fleet', *map(str, words)])
+    return lab(['fleet', *map(str, words)])
 
 
 def jobs_of(place, out, **options) -> list[Job]:
@@ -131,7 +132,7 @@ def _killed_once(job, mark):
 
 
 def test_bag_that_kills_every_worker_costs_its_own_row(bags, tmp_path, monkeypatch):
-    from rlml_slam.fleet import run
+    from rlml_lab.fleet import run
 
     monkeypatch.setattr(run, 'replay_bag', _deadly)
     with open_client(None, 1) as client:

@@ -13,8 +13,8 @@ from typing import Any
 
 from fsspec.core import url_to_fs
 
+from rlml_lab.fleet.store_errors import naming
 from rlml_slam.errors import BagError
-from rlml_slam.fleet.store_errors import naming
 
 METADATA = 'metadata.yaml'
 FILES = ('.bag', '.mcap')  # bags of one file

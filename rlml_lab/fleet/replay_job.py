@@ -21,12 +21,12 @@ from typing import Any
 from fsspec.core import url_to_fs
 
 import rlml_slam
+from rlml_lab.fleet.bags import Bag, local_copy
+from rlml_lab.fleet.results import Record, Results
+from rlml_lab.fleet.store_errors import naming
 from rlml_slam.errors import BagError, ClusterError, RlmlError
 from rlml_slam.evaluation.relations import read_relations, relation_errors
 from rlml_slam.evaluation.run_record import Run
-from rlml_slam.fleet.bags import Bag, local_copy
-from rlml_slam.fleet.results import Record, Results
-from rlml_slam.fleet.store_errors import naming
 from rlml_slam.params import Parameters
 from rlml_slam.recordings.bag_replay import replay
 from rlml_slam.recordings.origin import digest_of
@@ -76,13 +76,14 @@ class Job:
 
 @cache
 def code_digest() -> str:
-    """SHA-256 of the sources of this package, and of the versions of Python and libraries."""
-    root = Path(rlml_slam.__file__).parent
+    """SHA-256 of the package, of this folder, and of the versions of Python and libraries."""
     seen = hashlib.sha256(python_version().encode())
     for name in LIBRARIES:
         seen.update(f'{name} {version(name)}\0'.encode())
-    for file in sorted(root.rglob('*.py')):
-        seen.update(f'{file.relative_to(root).as_posix()}\0'.encode() + file.read_bytes())
+    for root in (Path(rlml_slam.__file__).parent, Path(__file__).parent):
+        for file in sorted(root.rglob('*.py')):
+            name = file.relative_to(root.parent).as_posix()
+            seen.update(f'{name}\0'.encode() + file.read_bytes())
     return seen.hexdigest()
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rlml_lab.fleet.results import Record
 from rlml_slam.errors import ParameterError
-from rlml_slam.fleet.results import Record
 
 RESAMPLES, SEED = 2000, 0  # of the bootstrap
 INTERVAL = (2.5, 97.5)  # [%]

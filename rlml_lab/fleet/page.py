@@ -10,10 +10,10 @@ from urllib.parse import quote
 
 import numpy as np
 
-from rlml_slam.fleet.bags import in_words
-from rlml_slam.fleet.comparison import LIMITS, Effect, Limit, Verdict, effect_rows
-from rlml_slam.fleet.results import Record
-from rlml_slam.fleet.run import span
+from rlml_lab.fleet.bags import in_words
+from rlml_lab.fleet.comparison import LIMITS, Effect, Limit, Verdict, effect_rows
+from rlml_lab.fleet.results import Record
+from rlml_lab.fleet.run import span
 from rlml_slam.report.page import heading, html_table, page, section
 
 COLUMNS = (

@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rlml_lab.fleet.comparison import LIMITS, compare, effects, limits_with
+from rlml_lab.fleet.page import fleet_page
+from rlml_lab.fleet.results import Record
 from rlml_slam.errors import ParameterError
-from rlml_slam.fleet.comparison import LIMITS, compare, effects, limits_with
-from rlml_slam.fleet.page import fleet_page
-from rlml_slam.fleet.results import Record
 
 ROW = {
     'name': 'a', 'status': 'ok', 'problem': '', 'bag': 'b', 'results': 'r', 'frames': 100,

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 import psutil
 
-import rlml_slam
-from rlml_lab.fleet.fleet_bags import Fleet
+import rlml_lab
+from rlml_lab.fleet_studies.fleet_bags import Fleet
 
 WORKER_KILLS = 5
 PATIENCE_S = 3600.0
@@ -64,7 +64,7 @@ def kills(fleet: Fleet) -> dict[str, Any]:
 def replay(fleet: Fleet, name: str, *options: str) -> subprocess.Popen[str]:
     """The command, as a process."""
     words = ['fleet', 'replay', str(fleet.bags), '--out', str(fleet.out / name), '--no-report']
-    command = [sys.executable, '-m', 'rlml_slam', *words, '--json', *options]
+    command = [sys.executable, '-m', 'rlml_lab', *words, '--json', *options]
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment())
 
 
@@ -75,9 +75,9 @@ def finished(client: subprocess.Popen[str]) -> dict[str, Any]:
 
 
 def environment() -> dict[str, str]:
-    """With this package first."""
+    """With this checkout first."""
     return {**os.environ, 'PYTHONPATH': os.pathsep.join(
-        [str(Path(rlml_slam.__file__).parents[1]), os.environ.get('PYTHONPATH', '')])}  # fmt: skip
+        [str(Path(rlml_lab.__file__).parents[1]), os.environ.get('PYTHONPATH', '')])}  # fmt: skip
 
 
 @contextmanager
