@@ -108,7 +108,7 @@ def _parse(path: Path) -> tuple[dict[str, _Lines], list[tuple[int, int]], Counte
             raise ValueError(f'more than {MAX_SIZE} bytes')
         text = raw.decode('ascii')
     except UnicodeDecodeError as error:
-        message = f'{path}: not a graph in g2o or TORO format: byte {error.start} is not ASCII'
+        message = f'{path}: no g2o or TORO file, which is ASCII: byte {error.start} is not'
         raise FileFormatError(message) from None
     except (ValueError, OSError, EOFError, zlib.error) as error:
         raise FileFormatError(f'{path}: cannot be read: {error}') from None

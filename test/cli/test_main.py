@@ -50,7 +50,7 @@ def test_module_runs_as_the_command():
 
 @pytest.mark.parametrize(
     ('words', 'meant'),
-    [(['repaly', 'bag'], 'replay'), (['map', 'impot'], 'import'), (['--version', 'xyzzy'], '')],
+    [(['repaly', 'bag'], 'replay'), (['map', 'impot'], 'import'), (['--version', 'repaly'], '')],
 )
 def test_misspelled_command_is_suggested(words, meant, capsys):
     with pytest.raises(SystemExit) as end:

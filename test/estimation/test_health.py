@@ -119,27 +119,6 @@ def test_robot_in_a_place_that_is_not_in_the_map_maps_on_after_a_while_and_stays
     assert slam.back_end.keyframes[-1].stamp > begun
 
 
-@pytest.mark.parametrize('turn', [0.3, 1.5, 2.5, 3.1])
-def test_robot_that_maps_at_an_unknown_place_knows_reflectors_with_ids_at_once(turn):
-    """Linearized at the heading that it had, it was 2 to 4 m off for seconds, and OK."""
-    limits = HealthLimits(new_session_time=2.0)
-    rng = np.random.default_rng(0)
-    unknown = drive((0.0, 0.1, 4.0))
-    back = drive((0.3, 0.2, 2.0), start=se2.compose(LOOP[-1], np.array([1.0, 0.5, turn])))
-    observed = [
-        *observations(ROOM, LOOP, rng=rng, ids=True),
-        *observations(OTHER_ROOM, unknown, rng=rng, reflectors=False),
-        *observations(ROOM, back, rng=rng, ids=True, scan=False),
-    ]
-    observed = [replace(o, stamp=FIRST + k * STEP) for k, o in enumerate(observed)]
-    frames, _ = run(observed, Slam(Parameters(health=limits)))
-    assert frames[-len(back) - 1].health.level == Level.LOST
-    found = frames[-len(back) :]
-    distance, _ = errors(np.array([f.T_map_base for f in found]), back)
-    assert distance.max() < 0.05
-    assert frames[-1].health.level == Level.OK
-
-
 def test_place_that_looks_like_another_stays_lost():
     """Half a turn changes nothing in this hall: who is carried about in it must not guess."""
     hall = replace(

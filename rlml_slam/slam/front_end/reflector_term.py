@@ -29,7 +29,6 @@ USED, GHOST = int(Status.USED), int(Status.GHOST)
 SLIP = 1.0  # 1 sigma, as a share of the motion, of wheels that spin or are locked
 WIDTH = 1.0  # [m] of a robot, which one wheel that slips turns
 AGREEING = 2.0 / 3.0  # share of the detections that have to match; of a carried robot, some do
-TURNED = 0.5  # [rad] 1 sigma of a heading, at which nothing can be linearized
 NEW, DEFERRED, AMBIGUOUS = int(Status.NEW), int(Status.DEFERRED), int(Status.AMBIGUOUS)
 
 
@@ -152,17 +151,7 @@ class ReflectorTerm:
             ids = NONE if detections is None else detections.ids
             self._inactive.update(self._state, self.tracks, ids)
         none = Matches.none(0 if detections is None else len(detections))
-        if detections is not None and self._state.pose_cov[2, 2] > TURNED**2:
-            self._place_by_ids(detections)
         return self.update(observation, none, may_slip=True)
-
-    def _place_by_ids(self, detections: Detections) -> None:
-        """Linearize where reflectors with ids are seen from, as nothing says otherwise."""
-        named = np.flatnonzero(detections.ids != ANONYMOUS)
-        _, k, rows = np.intersect1d(detections.ids[named], self.tracks.ids, return_indices=True)
-        if len(k) > 1:
-            places = self._state.landmarks()[rows]
-            self._state.x[:3] = se2.align(detections.points[named[k]], places)
 
     def update(
         self, observation: Observation, matches: Matches, may_slip: bool = False

@@ -40,7 +40,7 @@ class CarriedRobot:
         elif since is None and scan.used:
             self._fits = self._fits or observation.stamp
             self.leapt &= observation.stamp - self._fits < BY_CHANCE
-        if since is not None:
+        if since is not None or (scan.has_scan and not scan.used):
             self._fits = 0
         if observation.points is not None:
             self._before[_laser(observation)] = observation, self._way

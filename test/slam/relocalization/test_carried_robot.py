@@ -78,6 +78,15 @@ def test_frame_without_a_scan_or_one_that_fits_by_chance_does_not_end_what_began
     again = [*[(GOOD, False)] * 4, (MISFIT, True)] * 3  # never for a second
     assert leapt(there, slow, after=again)
     assert not leapt(there, slow, after=[*[(GOOD, False)] * 6, (MISFIT, True)])
+    unused = (ScanEvidence(has_scan=True), False)  # it does not fit: the second begins again
+    assert leapt(
+        there, slow, after=[*[(GOOD, False)] * 4, unused, *[(GOOD, False)] * 4, (MISFIT, True)]
+    )
+
+
+def test_scan_that_fits_where_reflectors_do_not_is_no_way_that_was_seen():
+    """In a bare corridor it fits anywhere."""
+    assert leapt(room(4.0, STEP), 25_000_000, ALONG)
 
 
 def test_scan_is_compared_with_the_one_before_of_the_same_laser():
