@@ -26,7 +26,7 @@ class CarriedRobot:
 
     def __init__(self) -> None:
         self._way = np.zeros(3)
-        # by laser, its last scan and the way until it
+        # by laser, its last scan, if it is not older than SOON, and the way until it
         self._before: dict[str, tuple[Observation, Array]] = {}
         self._fits = 0  # stamp of the first scan that fits again
         self.leapt = False
@@ -34,6 +34,8 @@ class CarriedRobot:
     def follow(self, observation: Observation, scan: ScanEvidence, since: int | None) -> None:
         """Take the next frame, and the stamp of the first contradiction, None without one."""
         self._way = se2.compose(self._way, observation.motion.delta)
+        soon = observation.stamp - SOON
+        self._before = {k: seen for k, seen in self._before.items() if seen[0].stamp >= soon}
         if since == observation.stamp:
             fits_anywhere = scan.used and scan.open_direction is not None
             self.leapt |= fits_anywhere or (scan.misfit and self._leaps(observation))
@@ -49,8 +51,6 @@ class CarriedRobot:
         """Of slow lasers it cannot be said: between two scans a robot goes through a door."""
         before, way = self._before.get(_laser(observation), (observation, self._way))
         if before.points is None or not len(before.points) or observation.points is None:
-            return False
-        if observation.stamp - before.stamp > SOON:
             return False
         points = se2.transform(se2.between(way, self._way), observation.points)
         gap, _ = cKDTree(before.points).query(points)

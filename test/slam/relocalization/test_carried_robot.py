@@ -105,6 +105,16 @@ def test_scan_is_compared_with_the_one_before_of_the_same_laser():
     assert carried.leapt
 
 
+def test_scans_of_any_number_of_lasers_are_not_kept():
+    """Where no transform is known, every name of a frame is one of a laser."""
+    carried, still = CarriedRobot(), Motion(np.zeros(3), np.eye(3))
+    for k in range(200):
+        scan = Scan(SECOND, f'laser{k}', -1.5, 1.0, 0.0, 0.1, 30.0, np.ones(1), np.ones(0))
+        seen = Observation(SECOND + k * 10_000_000, still, np.ones((3, 2)), scan=scan)
+        carried.follow(seen, GOOD, None)
+    assert len(carried._before) <= 26  # of a quarter of a second, at 100 Hz
+
+
 def test_robot_that_may_be_anywhere_is_lost_whatever_the_range_of_its_laser():
     near = Parameters(submap=Submap(max_laser_range=1.5))
     assert unknown_way(near)[0, 0] > Parameters().health.sigma_lost ** 2
