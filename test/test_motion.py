@@ -336,6 +336,14 @@ def test_standing_wheels_show_the_bias_and_the_robot_does_not_turn():
     assert m.bias_var < 1e-4
 
 
+def test_turn_in_a_short_gap_is_the_wheels_and_not_that_between_two_rates():
+    buffer = filled(line(1.0, 0.3), duration=1.0, imu=lambda t: 0.3)
+    buffer.add_imu(Imu(T0 + 2 * SECOND, -9.0))  # one wrong rate, 1 s after the last
+    buffer.add_odometry(Odometry(T0 + 2 * SECOND, line(1.0, 0.3)(2.0)))
+    m = buffer.motion(T0 + SECOND, T0 + 2 * SECOND)
+    np.testing.assert_allclose(m.delta[2], 0.3, atol=1e-6)
+
+
 def test_gap_of_the_imu_is_bridged_by_the_wheels():
     buffer = filled(line(1.0, 0.5), duration=10.0)
     for t in (0.0, 1.0, 9.0, 9.5):

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 import struct
 
 import numpy as np
@@ -342,6 +343,22 @@ def test_cloud_with_fields_outside_its_points_is_refused(make):
     msg.point_step = 8
     with pytest.raises(InputError, match='fields do not fit point_step 8'):
         read_cloud(msg)
+
+
+def test_cloud_whose_fields_overlap_is_refused(make):
+    msg = encode.detections(make, some_detections())
+    msg.fields = copy.deepcopy(msg.fields)
+    msg.fields[1].offset = 2
+    with pytest.raises(InputError, match="fields do not fit point_step 24: 'x' and 'y' overlap"):
+        read_cloud(msg)
+
+
+def test_cloud_whose_coordinates_are_whole_numbers_is_refused(make):
+    msg = encode.detections(make, some_detections())
+    msg.fields = copy.deepcopy(msg.fields)
+    msg.fields[0].datatype = 6  # UINT32
+    with pytest.raises(InputError, match='reflectors: x is uint32, not a float'):
+        decode.detections(msg, NOISE)
 
 
 def test_pose_array_is_read_by_position_alone(make):

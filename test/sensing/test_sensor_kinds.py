@@ -36,3 +36,11 @@ def test_sensor_that_was_set_up_in_another_way_is_followed():
     assert refused(before + [('laser', -1.5)] * 50) == list(
         range(len(before), len(before) + REPEATED - 1)
     )
+
+
+def test_each_value_is_compared_on_its_own():
+    """A sweep that varies, as a motor's speed does, does not hide a rare first angle."""
+    sweeps = np.random.default_rng(0).uniform(0.0, 0.5, 3 * MEMORY)
+    messages = [('laser', -1.0, 4.0, s) for s in sweeps]
+    messages[200] = ('laser', 0.5, 4.0, sweeps[200])
+    assert refused(messages) == [200]

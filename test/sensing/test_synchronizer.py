@@ -31,7 +31,7 @@ def odometry(stamp):
 
 def scan(stamp, ranges=(2.0, 3.0, np.nan, 4.0), frame='laser', time_increment=0.0):
     return Scan(
-        stamp, frame, -1.0, 0.5, time_increment, 0.1, 20.0,
+        stamp, frame, -1.0, min(0.5, 6.0 / max(len(ranges), 1)), time_increment, 0.1, 20.0,
         np.array(ranges, dtype=np.float32), np.zeros(0, dtype=np.float32),
     )  # fmt: skip
 
@@ -225,6 +225,9 @@ def test_late_and_duplicate_inputs_are_counted_and_left_out():
         ('scan', scan(T0 + 4 * SECOND, ranges=())),
         ('scan', replace(scan(T0 + 4 * SECOND), angle_min=float('nan'))),
         ('scan', replace(scan(T0 + 4 * SECOND), angle_increment=0.0)),
+        ('scan', replace(scan(T0 + 4 * SECOND), angle_increment=3.0)),
+        ('scan', replace(scan(T0 + 4 * SECOND), angle_increment=1e-9)),
+        ('scan', replace(scan(T0 + 4 * SECOND), angle_min=-25.0)),
         ('scan', replace(scan(T0 + 4 * SECOND), time_increment=float('inf'))),
         ('reflectors', detections(T0 + 4 * SECOND, ((np.nan, 1.0),))),
         (
@@ -241,6 +244,18 @@ def test_invalid_input_is_counted_and_costs_nothing(stream, bad):
     assert synchronizer.flush() == []
     (o,) = feed(synchronizer, [scan(t), detections(t), odometry(t + 20 * MS)])
     assert o.motion.known
+
+
+@pytest.mark.parametrize(
+    'change', [{'time_increment': 0.0}, {'angle_increment': 0.02}, {'angle_min': -0.5}]
+)
+def test_single_scan_of_another_sweep_is_left_out(change):
+    synchronizer, _ = running(until=T0)
+    for k in range(60):
+        sweep = scan(T0 + k * 100 * MS, np.full(100, 3.0) + 0.1 * k, time_increment=5e-4)
+        add(synchronizer, replace(sweep, **change) if k == 50 else sweep)
+    assert synchronizer.inputs.counts['scan']['invalid'] == 1
+    assert 'of another sensor' in synchronizer.inputs.last_error
 
 
 def test_scan_without_a_single_return_is_an_observation_without_points():

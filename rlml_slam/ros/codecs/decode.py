@@ -160,6 +160,9 @@ def detections(msg: Any, noise: Reflector, topic: str = 'reflectors') -> Detecti
     missing = {'x', 'y'} - set(cloud.dtype.names or ())
     if missing and len(cloud):
         raise InputError(f'{topic}: cloud has no field {", ".join(sorted(missing))}')
+    for name in {'x', 'y'} - missing:
+        if cloud.dtype[name].base.kind != 'f':
+            raise InputError(f'{topic}: {name} is {cloud.dtype[name]}, not a float')
     points = np.stack([column(cloud, 'x', np.nan), column(cloud, 'y', np.nan)], -1)
     finite = np.isfinite(points).all(-1)
     if msg.is_dense and not finite.all():

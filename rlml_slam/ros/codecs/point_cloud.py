@@ -91,7 +91,13 @@ def _layout(
         'offsets': [offset for _, offset, *_ in fields],
         'itemsize': point_step,
     }
-    return np.dtype(layout)  # type: ignore[call-overload]
+    dtype = np.dtype(layout)  # type: ignore[call-overload]
+    end, last = 0, ''
+    for offset, size, name in sorted((o, dtype[n].itemsize, n) for n, o, *_ in fields):
+        if offset < end:
+            raise ValueError(f'{last!r} and {name!r} overlap')
+        end, last = offset + size, name
+    return dtype
 
 
 def column(points: NDArray[np.void], name: str, absent: float) -> NDArray[np.float64]:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames and first angles of the messages of one stream: a rare one is not of the robot's sensor.
+"""What stays the same in the messages of a sensor: a rare other value is not of the robot's.
 
-One message in another frame, or with another first angle, would be seen from a wrong pose. Several
-lidars in turn, and scans whose first angle alternates, have kinds that are about as frequent; a
-sensor that was replaced, or set up in another way, sends one kind only.
+One message in another frame, or with other angles or times of its beams, would be seen from a
+wrong pose. Several lidars in turn, and scans whose first angle alternates, have values that are
+about as frequent; a sensor that was replaced, or set up in another way, sends its new values only.
 """
 
 from __future__ import annotations
@@ -11,28 +11,37 @@ from __future__ import annotations
 from collections import Counter, deque
 
 MEMORY = 100  # messages that are compared
-RARE = 20  # times as frequent is another kind: lidars that share a topic differ by less
-REPEATED = 5  # messages in a row of one kind: the sensor is another one now
-SAME = 0.02  # [rad] between first angles of one kind
+RARE = 20  # times as frequent is another value: lidars that share a topic differ by less
+REPEATED = 5  # messages in a row of one value: the sensor is another one now
+SAME = 0.02  # [rad], [s] between values that are one
+
+Kind = tuple[str, float]
 
 
 class SensorKinds:
-    """Kinds (frame, first angle) of the newest messages of a stream."""
+    """Frame and values, such as the first angle, of the newest messages of a stream."""
 
     def __init__(self) -> None:
-        self._seen: deque[tuple[str, float]] = deque(maxlen=MEMORY)
+        self._seen: list[deque[Kind]] = []
 
-    def is_foreign(self, frame_id: str, angle: float = 0.0) -> bool:
-        """Add a message; whether its kind is rare beside another one."""
-        kind = (frame_id, angle)
-        self._seen.append(kind)
-        if RARE * self._seen.count(kind) >= len(self._seen):
-            return False
-        newest = [self._seen[-k] for k in range(1, REPEATED + 1)]
-        alike = sum(_is_same(kind, other) for other in self._seen)
-        most = max(Counter(self._seen).values())
-        return RARE * alike < most and not all(_is_same(kind, other) for other in newest)
+    def is_foreign(self, frame_id: str, *values: float) -> bool:
+        """Add a message; whether its frame, or one of its ``values``, is rare beside another."""
+        kinds = [(frame_id, value) for value in values or (0.0,)]
+        while len(self._seen) < len(kinds):
+            self._seen.append(deque(maxlen=MEMORY))
+        return any([_is_rare(*pair) for pair in zip(self._seen, kinds, strict=True)])
 
 
-def _is_same(a: tuple[str, float], b: tuple[str, float]) -> bool:
+def _is_rare(seen: deque[Kind], kind: Kind) -> bool:
+    """Add what one message has; whether almost all others have something else."""
+    seen.append(kind)
+    if RARE * seen.count(kind) >= len(seen):
+        return False
+    newest = [seen[-k] for k in range(1, REPEATED + 1)]
+    alike = sum(_is_same(kind, other) for other in seen)
+    most = max(Counter(seen).values())
+    return RARE * alike < most and not all(_is_same(kind, other) for other in newest)
+
+
+def _is_same(a: Kind, b: Kind) -> bool:
     return a[0] == b[0] and abs(a[1] - b[1]) <= SAME

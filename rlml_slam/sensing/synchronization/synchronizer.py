@@ -32,6 +32,8 @@ from rlml_slam.sensing.synchronization.waiting_queue import WaitingQueue
 from rlml_slam.types import Detections, Imu, Observation, Odometry, Scan
 
 MEASURED = ('scan', 'reflectors')  # streams that give observations
+LARGEST_VIEW = 2.2 * math.pi  # [rad] some drivers repeat beams at the end of a turn
+FINEST = 1e-5  # [rad] between beams: the finest lidars have twenty times that
 MAX_SWEEP = 1.0  # [s] of one scan; all later inputs would wait for the odometry at its end
 
 
@@ -125,9 +127,9 @@ class Synchronizer:
         error = _invalid_geometry(scan)
         if error:
             self.inputs.count('scan', 'invalid', f'scan at {scan.stamp} ns: {error}')
-        elif self._is_of_sensor('scan', scan, scan.angle_min) and self._accept(
-            'scan', scan.stamp, source=scan.frame_id
-        ):
+        elif self._is_of_sensor(
+            'scan', scan, scan.angle_min, _field_of_view(scan), sweep_time(scan)
+        ) and self._accept('scan', scan.stamp, source=scan.frame_id):
             self._queue.note_lidar(scan)
             self._wait('scan', self._no_returns.left_out(scan))
         return self._release()
@@ -151,13 +153,18 @@ class Synchronizer:
         """Observations of all that still waits, at the end of the data."""
         return self._release(flush=True)
 
-    def _is_of_sensor(self, stream: str, item: Scan | Detections, angle: float = 0.0) -> bool:
-        """Whether it is of a sensor whose pose is known; counts the input as invalid if not."""
+    def _is_of_sensor(self, stream: str, item: Scan | Detections, *values: float) -> bool:
+        """Whether it is of a sensor whose pose is known; counts the input as invalid if not.
+
+        ``values`` are what stays the same in its messages, as those of one scan do.
+        """
         base, error = self._node.base_frame, f'{stream} in frame {item.frame_id[:100]!r}'
         if not self._assembly.has_frame(stream, item.frame_id):
             error += f', whose pose in {base} is unknown: publish it on /tf_static'
-        elif self._kinds[stream].is_foreign(item.frame_id, angle):
-            error += f' from {angle:g} rad: almost all others are of another sensor'
+        elif self._kinds[stream].is_foreign(item.frame_id, *values):
+            error += ', of another sensor than almost all others'
+            if values:
+                error += f' (angle_min, field of view, sweep: {np.round(values, 4).tolist()})'
         else:
             return True
         self.inputs.count(stream, 'invalid', error)
@@ -236,6 +243,11 @@ class Synchronizer:
         return out
 
 
+def _field_of_view(scan: Scan) -> float:
+    """Angle [rad] from the first to the last ray, negative if clockwise."""
+    return scan.angle_increment * (len(scan.ranges) - 1)
+
+
 def _invalid_geometry(scan: Scan) -> str:
     """Why a scan cannot be used, empty if it can."""
     n = len(scan.ranges)
@@ -246,6 +258,11 @@ def _invalid_geometry(scan: Scan) -> str:
         return 'it is empty'
     if not np.all(np.isfinite(geometry)) or scan.angle_increment == 0.0 or scan.range_min < 0.0:
         return 'its angles, times or ranges are not valid'
+    view = abs(_field_of_view(scan))
+    if view > LARGEST_VIEW or (n > 1 and abs(scan.angle_increment) < FINEST):
+        return f'angle_increment {scan.angle_increment:g} rad times {n} beams is no field of view'
+    if abs(scan.angle_min) > LARGEST_VIEW:
+        return f'angle_min is {scan.angle_min:g} rad, more than a turn'
     if not 0.0 <= sweep_time(scan) <= MAX_SWEEP:
         return (
             f'time_increment {scan.time_increment:g} s times {n} beams is no sweep of '

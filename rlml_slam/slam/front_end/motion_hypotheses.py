@@ -32,7 +32,8 @@ SAME = np.array([0.02, 0.02, 0.01])  # [m, m, rad] hypotheses that are closer ar
 # frames in a row: a scan within the step of odometry that catches up gets a part of it, which may
 # agree by chance
 CONFIRM = 2
-LONGEST = 5.0  # [s] of a stall; after that, odometry is what it is
+LONGEST = 5.0  # [s] of a stall, and after a gap; then, odometry is what it is
+GAP = 0.3  # [s] between frames, in which a robot goes as far as a wrong pose of odometry may be
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,8 @@ class MotionHypotheses:
     def forget(self) -> None:
         """The pose was moved: what comes is not compared with what was before."""
         self._trusted: tuple[int, Array, Array] | None = None
+        # what was trusted before the last gap, and the stamp of its end
+        self._before_gap: tuple[tuple[int, Array, Array] | None, int] = None, 0
         self._last: tuple[int, Array] | None = None  # stamp and pose of the last frame
         self._agreed = 0  # frames in a row, since it is open, at which odometry agreed
 
@@ -100,7 +103,11 @@ class MotionHypotheses:
         """The motion since the last frame by the odometry since it was trusted, if it is open."""
         assert self._trusted is not None
         assert self._last is not None
-        stamp, pose, odometry = self._trusted
+        trusted, (before, end) = self._trusted, self._before_gap
+        jumps_after_gap = not observation.motion.known and observation.stamp - end < LONGEST * 1e9
+        if trusted[0] == self._last[0] and before is not None and jumps_after_gap:
+            trusted = before
+        stamp, pose, odometry = trusted
         if stamp == self._last[0] or observation.odom_pose is None:
             return None
         dt = (observation.stamp - stamp) * 1e-9
@@ -118,6 +125,8 @@ class MotionHypotheses:
         was missing, only when what it says is where the scans are.
         """
         last, self._last = self._last, (observation.stamp, pose)
+        if last is not None and observation.stamp - last[0] > GAP * 1e9:
+            self._before_gap = self._trusted, observation.stamp
         odometry = observation.odom_pose
         if odometry is None:
             return

@@ -106,6 +106,39 @@ def test_odometry_after_a_long_gap_counts_from_where_it_was_trusted():
     assert (np.sqrt(np.diag(since.cov)) < 1.0).all()
 
 
+@pytest.mark.parametrize('after', [0.2, 4.0])
+def test_pose_of_odometry_after_a_gap_was_wrong_where_it_jumps_next(after):
+    drive = Drive()
+    drive.go()
+    before, wrong = drive.pose, np.array([-3.0, 1.0, 0.4])
+    drive.stamp += 10**9
+    drive.go(wrong, moved=wrong)  # nothing shows it: it is as far as a robot goes in a gap
+    for _ in range(round(after / DT) - 1):
+        drive.go()
+    way = se2.exp(TWIST * (1.2 + after))
+    drive.stamp += round(DT * 1e9)
+    unknown = Motion(np.zeros(3), np.eye(3), known=False)
+    since_start = se2.compose(STEP, way)
+    seen = Observation(drive.stamp, unknown, odom_pose=since_start)
+    _, since, *_ = (h.observation.motion for h in drive.hypotheses.of(seen, TWIST))
+    at = se2.compose(drive.pose, since.delta)
+    np.testing.assert_allclose(at, se2.compose(before, way), atol=1e-9)
+
+
+def test_jump_long_after_a_gap_is_of_another_cause():
+    drive = Drive()
+    drive.go()
+    drive.stamp += 10**9
+    for _ in range(30):
+        drive.go()
+    drive.stamp += round(DT * 1e9)
+    unknown = Motion(np.zeros(3), np.eye(3), known=False)
+    seen = Observation(drive.stamp, unknown, odom_pose=np.array([5.0, 1.0, 0.0]))
+    plain, onward = (h.observation.motion for h in drive.hypotheses.of(seen, TWIST))
+    assert plain is unknown
+    np.testing.assert_allclose(onward.delta, STEP, atol=1e-9)
+
+
 def test_robot_that_stops_has_stopped():
     drive = Drive()
     drive.go()
