@@ -33,7 +33,8 @@ CREEP = 0.25
 RECENT = 3.0  # [s] whose mean speed is that at which a robot goes on in a long gap
 ZERO = 0.05  # [m], [rad] from the pose at which odometry begins
 COAST = 0.2  # [s] for which a robot is taken to go on as it went before its odometry ended
-GYRO_GAP = 0.5  # [s] between two turn rates: beyond it a robot may have turned in any way
+# [s] between two turn rates, beyond which the wheels know better how far it turned meanwhile
+GYRO_GAP = 0.75
 # Share of the noise of a slow motion that is left where the wheels do not turn: what they miss is
 # less than a tick in all, and adds up to no walk. A larger one lets the noise of the first scan
 # turn the whole map, while the robot stands and could well average it out.
@@ -265,7 +266,8 @@ def _drive(
         stands = known and speed == 0.0 and sideways == 0.0 and turn == 0.0
         if stands:
             sigma_v, sigma_w = STANDING * n.speed_noise_floor, STANDING * n.turn_noise_floor
-        rate = np.nan if bridged else _rate(middle, imu_stamps, rates)
+        gyro_gap = GYRO_GAP if known else n.max_gap
+        rate = np.nan if bridged else _rate(middle, imu_stamps, rates, gyro_gap)
         sigma_rate = n.imu_turn_noise * abs(rate) + n.imu_turn_noise_floor
         bias, bias_sigma = rate - turn, math.hypot(sigma_rate, sigma_w)
         says_bias = known and not math.isnan(rate)
@@ -355,13 +357,13 @@ def _since(stamp: int, stamps: Stamps, at: int) -> float:
 
 
 @part
-def _rate(stamp: int, stamps: Stamps, rates: Array) -> float:
+def _rate(stamp: int, stamps: Stamps, rates: Array, max_gap: float) -> float:
     """The IMU's yaw rate, linear between its samples; NaN outside or across a gap."""
     k = np.searchsorted(stamps, stamp)
     if not 0 < k < len(stamps):
         return np.nan
     t0, t1 = stamps[k - 1], stamps[k]
-    if t1 - t0 > GYRO_GAP * SECOND:
+    if t1 - t0 > max_gap * SECOND:
         return np.nan
     f = (stamp - t0) / (t1 - t0)
     return float(rates[k - 1] * (1.0 - f) + rates[k] * f)

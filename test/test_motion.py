@@ -344,6 +344,14 @@ def test_turn_in_a_short_gap_is_the_wheels_and_not_that_between_two_rates():
     np.testing.assert_allclose(m.delta[2], 0.3, atol=1e-6)
 
 
+def test_slow_imu_is_used_where_there_are_no_wheels():
+    buffer = MotionBuffer(NOISE, 60.0)
+    for k in range(6):
+        buffer.add_imu(Imu(T0 + k * SECOND, 0.3))
+    m = buffer.motion(T0 + SECOND, T0 + 3 * SECOND)
+    assert m.delta[2] == pytest.approx(0.6)
+
+
 def test_gap_of_the_imu_is_bridged_by_the_wheels():
     buffer = filled(line(1.0, 0.5), duration=10.0)
     for t in (0.0, 1.0, 9.0, 9.5):

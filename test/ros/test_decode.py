@@ -349,8 +349,30 @@ def test_cloud_whose_fields_overlap_is_refused(make):
     msg = encode.detections(make, some_detections())
     msg.fields = copy.deepcopy(msg.fields)
     msg.fields[1].offset = 2
-    with pytest.raises(InputError, match="fields do not fit point_step 24: 'x' and 'y' overlap"):
-        read_cloud(msg)
+    with pytest.raises(InputError, match="fields 'x' and 'y' overlap"):
+        decode.detections(msg, NOISE)
+
+
+def test_fields_that_nobody_reads_may_be_anywhere(make):
+    msg = encode.detections(make, some_detections())
+    msg.fields = copy.deepcopy(msg.fields)
+    names = [f.name for f in msg.fields]
+    z = msg.fields[names.index('z')] if 'z' in names else None
+    other = copy.deepcopy(msg.fields[0])
+    other.name, other.count = 'xyz', 3
+    msg.fields = [*msg.fields, other]
+    if z is not None:
+        z.offset = 0
+    got = decode.detections(msg, NOISE)
+    np.testing.assert_allclose(got.points, some_detections().points, rtol=1e-6)
+
+
+def test_empty_cloud_of_whole_numbers_saw_nothing(make):
+    msg = encode.detections(make, some_detections())
+    msg.fields = copy.deepcopy(msg.fields)
+    msg.fields[0].datatype = 6  # UINT32
+    msg.width = 0
+    assert len(decode.detections(msg, NOISE).points) == 0
 
 
 def test_cloud_whose_coordinates_are_whole_numbers_is_refused(make):

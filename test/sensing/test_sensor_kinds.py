@@ -39,8 +39,15 @@ def test_sensor_that_was_set_up_in_another_way_is_followed():
 
 
 def test_each_value_is_compared_on_its_own():
-    """A sweep that varies, as a motor's speed does, does not hide a rare first angle."""
-    sweeps = np.random.default_rng(0).uniform(0.0, 0.5, 3 * MEMORY)
-    messages = [('laser', -1.0, 4.0, s) for s in sweeps]
-    messages[200] = ('laser', 0.5, 4.0, sweeps[200])
+    """Beams' times that vary, as a motor's speed does, do not hide a rare first angle."""
+    times = 1e-4 * np.random.default_rng(0).uniform(0.9, 1.1, 3 * MEMORY)
+    messages = [('laser', -1.0, 0.01, t) for t in times]
+    messages[200] = ('laser', 0.5, 0.01, times[200])
+    assert refused(messages) == [200]
+
+
+@pytest.mark.parametrize('rare', [(0.01, 0.0), (0.01, 2e-5), (0.02, 1e-5), (-0.01, 1e-5)])
+def test_rare_increment_is_refused_however_fast_the_laser(rare):
+    messages = [('laser', -1.0, 0.01, 1e-5)] * 3 * MEMORY
+    messages[200] = ('laser', -1.0, *rare)
     assert refused(messages) == [200]

@@ -4,7 +4,7 @@ import pytest
 from rlml_slam.errors import InputError
 from rlml_slam.motion import SECOND
 from rlml_slam.sensing.synchronization.input_counts import InputCounts
-from rlml_slam.sensing.synchronization.stamp_check import CONFIRM, PERSISTENT, StampCheck
+from rlml_slam.sensing.synchronization.stamp_check import CONFIRM, LASTING, PERSISTENT, StampCheck
 from rlml_slam.types import Imu
 
 T0 = 10 * SECOND
@@ -73,10 +73,24 @@ def test_stamps_that_stay_behind_show_that_the_newest_was_wrong():
 
 def test_clock_that_was_set_back_is_an_error():
     stamps, newest = running()
-    for _ in range(PERSISTENT - 1):
-        assert stamps.wrong_after('odom', newest - 10 * SECOND, newest) is None
-    with pytest.raises(InputError, match=r'the clock of odom jumped back by 10\.0 s'):
-        stamps.wrong_after('odom', newest - 10 * SECOND, newest)
+    start, lasts = newest - 10 * SECOND, LASTING // STEP
+    assert lasts > PERSISTENT
+    for k in range(lasts):
+        assert stamps.wrong_after('odom', start + k * STEP, newest) is None
+    with pytest.raises(InputError, match=r'the clock of odom jumped back by 9\.5 s'):
+        stamps.wrong_after('odom', start + lasts * STEP, newest)
+
+
+def test_burst_of_old_messages_is_no_clock_that_was_set_back():
+    """Of a second publisher, say, that had no processor for two seconds."""
+    stamps, newest = running()
+    for k in range(300):
+        assert stamps.wrong_after('odom', newest - 2 * SECOND + k * 10**6, newest) is None
+    for k in range(1, 100):
+        assert stamps.wrong_after('odom', newest + k * STEP, newest + (k - 1) * STEP) is None
+        assert stamps.accept('odom', newest + k * STEP, stamps.newest_of('odom'))
+        late = newest - 2 * SECOND + k * STEP
+        assert stamps.wrong_after('odom', late, newest + k * STEP) is None
 
 
 def test_one_wrong_stamp_of_a_late_stream_is_no_clock_that_was_set_back():
@@ -95,7 +109,7 @@ def test_clock_that_was_set_back_is_an_error_beside_a_stream_that_is_always_late
     first = [('reflectors', newest - SECOND), ('odom', newest)]
     later = [
         (stream, newest - 10 * SECOND + k * STEP - late)
-        for k in range(PERSISTENT)
+        for k in range(LASTING // STEP + 1)
         for stream, late in (('odom', 0), ('reflectors', SECOND))
     ]
 

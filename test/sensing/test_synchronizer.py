@@ -258,6 +258,16 @@ def test_single_scan_of_another_sweep_is_left_out(change):
     assert 'of another sensor' in synchronizer.inputs.last_error
 
 
+def test_scans_that_are_cut_off_are_used():
+    """Packets were lost, or the driver trims: the beams that are there are where they were."""
+    synchronizer, rng = running(until=T0)[0], np.random.default_rng(0)
+    for k in range(200):
+        n = 100 if k % 5 else int(rng.integers(20, 100))
+        sweep = scan(T0 + k * 100 * MS, np.full(n, 3.0) + 0.01 * k, time_increment=5e-4)
+        add(synchronizer, replace(sweep, angle_increment=0.06))
+    assert 'invalid' not in synchronizer.inputs.counts['scan']
+
+
 def test_scan_without_a_single_return_is_an_observation_without_points():
     synchronizer, t = running()
     (o,) = feed(

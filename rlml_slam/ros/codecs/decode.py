@@ -20,7 +20,7 @@ from rlml_slam.errors import InputError
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.motion import MAX_VARIANCE, SECOND
 from rlml_slam.params import Reflector
-from rlml_slam.ros.codecs.point_cloud import bounded, column, read_cloud
+from rlml_slam.ros.codecs.point_cloud import bounded, check_disjoint, column, read_cloud
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.polar import polar_covariance
 from rlml_slam.types import ANONYMOUS, Detections, Imu, Odometry, Scan
@@ -30,6 +30,7 @@ MIN_UPRIGHT = math.cos(MAX_TILT)
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # (x, y, yaw) of ROS's 6 x 6 covariances
 _ROUNDING = 1e-9  # of the largest variance
 LARGEST_VARIANCE = 1e15  # [m^2], [rad^2] of what another node of this package sends
+DETECTED = ('x', 'y', 'id', 'diameter', 'sigma_range', 'sigma_bearing')  # fields
 LARGEST_SIGMA = 100.0  # [m], [rad] of a detection
 # [ns] seconds are 32 bits in a message; transforms are published some seconds ahead
 LAST_STAMP = ((1 << 31) - 60) * SECOND
@@ -160,8 +161,9 @@ def detections(msg: Any, noise: Reflector, topic: str = 'reflectors') -> Detecti
     missing = {'x', 'y'} - set(cloud.dtype.names or ())
     if missing and len(cloud):
         raise InputError(f'{topic}: cloud has no field {", ".join(sorted(missing))}')
+    check_disjoint(cloud, DETECTED, topic)
     for name in {'x', 'y'} - missing:
-        if cloud.dtype[name].base.kind != 'f':
+        if len(cloud) and cloud.dtype[name].base.kind != 'f':
             raise InputError(f'{topic}: {name} is {cloud.dtype[name]}, not a float')
     points = np.stack([column(cloud, 'x', np.nan), column(cloud, 'y', np.nan)], -1)
     finite = np.isfinite(points).all(-1)

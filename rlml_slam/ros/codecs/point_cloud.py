@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -91,13 +92,17 @@ def _layout(
         'offsets': [offset for _, offset, *_ in fields],
         'itemsize': point_step,
     }
-    dtype = np.dtype(layout)  # type: ignore[call-overload]
+    return np.dtype(layout)  # type: ignore[call-overload]
+
+
+def check_disjoint(points: NDArray[np.void], names: Iterable[str], topic: str) -> None:
+    """Raise InputError where two of the fields share bytes; those that are absent are none."""
+    fields: Mapping[str, tuple[Any, ...]] = points.dtype.fields or {}
     end, last = 0, ''
-    for offset, size, name in sorted((o, dtype[n].itemsize, n) for n, o, *_ in fields):
+    for offset, name in sorted((fields[name][1], name) for name in names if name in fields):
         if offset < end:
-            raise ValueError(f'{last!r} and {name!r} overlap')
-        end, last = offset + size, name
-    return dtype
+            raise InputError(f'{topic}: fields {last!r} and {name!r} overlap')
+        end, last = offset + fields[name][0].itemsize, name
 
 
 def column(points: NDArray[np.void], name: str, absent: float) -> NDArray[np.float64]:

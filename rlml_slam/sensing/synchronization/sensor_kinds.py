@@ -4,6 +4,7 @@
 One message in another frame, or with other angles or times of its beams, would be seen from a
 wrong pose. Several lidars in turn, and scans whose first angle alternates, have values that are
 about as frequent; a sensor that was replaced, or set up in another way, sends its new values only.
+How many beams there are is not compared: drivers cut scans off.
 """
 
 from __future__ import annotations
@@ -13,35 +14,42 @@ from collections import Counter, deque
 MEMORY = 100  # messages that are compared
 RARE = 20  # times as frequent is another value: lidars that share a topic differ by less
 REPEATED = 5  # messages in a row of one value: the sensor is another one now
-SAME = 0.02  # [rad], [s] between values that are one
+SAME = 0.02  # [rad] between first angles that are one
+ALIKE = 0.2  # share by which increments differ that are one, as the speed of a motor does
 
 Kind = tuple[str, float]
 
 
 class SensorKinds:
-    """Frame and values, such as the first angle, of the newest messages of a stream."""
+    """Frame, first angle and increments of the newest messages of a stream."""
 
     def __init__(self) -> None:
         self._seen: list[deque[Kind]] = []
 
-    def is_foreign(self, frame_id: str, *values: float) -> bool:
-        """Add a message; whether its frame, or one of its ``values``, is rare beside another."""
-        kinds = [(frame_id, value) for value in values or (0.0,)]
+    def is_foreign(self, frame_id: str, angle: float = 0.0, *increments: float) -> bool:
+        """Add a message; whether its frame, or one of its values, is rare beside another.
+
+        ``angle`` [rad] is the first one; ``increments`` are of the angle and of the time.
+        """
+        kinds = [(frame_id, value) for value in (angle, *increments)]
         while len(self._seen) < len(kinds):
             self._seen.append(deque(maxlen=MEMORY))
-        return any([_is_rare(*pair) for pair in zip(self._seen, kinds, strict=True)])
+        shares = [0.0, *[ALIKE] * len(increments)]
+        return any([_is_rare(*each) for each in zip(self._seen, kinds, shares, strict=True)])
 
 
-def _is_rare(seen: deque[Kind], kind: Kind) -> bool:
+def _is_rare(seen: deque[Kind], kind: Kind, share: float) -> bool:
     """Add what one message has; whether almost all others have something else."""
     seen.append(kind)
     if RARE * seen.count(kind) >= len(seen):
         return False
     newest = [seen[-k] for k in range(1, REPEATED + 1)]
-    alike = sum(_is_same(kind, other) for other in seen)
+    alike = sum(_is_same(kind, other, share) for other in seen)
     most = max(Counter(seen).values())
-    return RARE * alike < most and not all(_is_same(kind, other) for other in newest)
+    return RARE * alike < most and not all(_is_same(kind, other, share) for other in newest)
 
 
-def _is_same(a: Kind, b: Kind) -> bool:
-    return a[0] == b[0] and abs(a[1] - b[1]) <= SAME
+def _is_same(a: Kind, b: Kind, share: float) -> bool:
+    """Whether frames are equal and values close: by SAME, or by a ``share`` above 0 of them."""
+    limit = share * max(abs(a[1]), abs(b[1])) if share else SAME
+    return a[0] == b[0] and abs(a[1] - b[1]) <= limit

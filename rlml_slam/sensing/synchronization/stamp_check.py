@@ -26,6 +26,8 @@ BACK = SECOND // 10  # [ns] a message farther behind its stream is not of a stre
 CONFIRM = 3  # messages that confirm, or refute, a suspicious stamp
 RECENT = 5  # stamps of a source that are remembered
 PERSISTENT = 10  # messages in a row that are behind: fewer are late, more are of a new clock
+# [ns] from the first to the last of these, or it is the clock of a late burst, not that of all
+LASTING = SECOND // 2
 
 
 class StampCheck:
@@ -47,6 +49,7 @@ class StampCheck:
         self._num_behind = 0  # messages in a row that are far behind
         self._seen: dict[str, int] = {}  # by stream: the newest stamp, of late messages too
         self._num_back = 0  # of these, the last ones in a row that are behind their stream
+        self._back_since = 0  # stamp of the first of these
         self._held: list[tuple[str, Message]] = []  # messages that are far ahead
         self._held_after = self.newest  # when the last one was held
         self._num_passed = 0  # messages since the newest of these that were not
@@ -142,18 +145,20 @@ class StampCheck:
         seen = max(self._newest_of.get(stream, stamp), self._seen.get(stream, stamp))
         self._seen[stream] = max(seen, stamp)
         if self.first is None or behind <= MAX_AHEAD:
-            self._num_behind = 0
+            self._num_behind = self._num_back = 0
             return None
         self._num_behind += 1
         went_back = seen - stamp > BACK
         self._num_back = self._num_back + 1 if went_back else 0
+        if self._num_back == 1:
+            self._back_since = stamp
         if self._num_behind < PERSISTENT:
             return None
-        self._num_behind = 0
         if last_used is not None and last_used - stamp > MAX_AHEAD:
-            if self._num_back < PERSISTENT:
+            if self._num_back < PERSISTENT or stamp - self._back_since < LASTING:
                 return None
             raise InputError(f'the clock of {stream} jumped back by {behind / SECOND:.1f} s')
+        self._num_behind = 0
         return stamp + MAX_AHEAD
 
     def early_after(self, stream: str, stamp: int, source: str) -> int | None:

@@ -128,7 +128,7 @@ class Synchronizer:
         if error:
             self.inputs.count('scan', 'invalid', f'scan at {scan.stamp} ns: {error}')
         elif self._is_of_sensor(
-            'scan', scan, scan.angle_min, _field_of_view(scan), sweep_time(scan)
+            'scan', scan, scan.angle_min, scan.angle_increment, scan.time_increment
         ) and self._accept('scan', scan.stamp, source=scan.frame_id):
             self._queue.note_lidar(scan)
             self._wait('scan', self._no_returns.left_out(scan))
@@ -164,7 +164,7 @@ class Synchronizer:
         elif self._kinds[stream].is_foreign(item.frame_id, *values):
             error += ', of another sensor than almost all others'
             if values:
-                error += f' (angle_min, field of view, sweep: {np.round(values, 4).tolist()})'
+                error += f' (angle_min, angle_increment, time_increment: {values})'
         else:
             return True
         self.inputs.count(stream, 'invalid', error)
@@ -243,11 +243,6 @@ class Synchronizer:
         return out
 
 
-def _field_of_view(scan: Scan) -> float:
-    """Angle [rad] from the first to the last ray, negative if clockwise."""
-    return scan.angle_increment * (len(scan.ranges) - 1)
-
-
 def _invalid_geometry(scan: Scan) -> str:
     """Why a scan cannot be used, empty if it can."""
     n = len(scan.ranges)
@@ -258,7 +253,7 @@ def _invalid_geometry(scan: Scan) -> str:
         return 'it is empty'
     if not np.all(np.isfinite(geometry)) or scan.angle_increment == 0.0 or scan.range_min < 0.0:
         return 'its angles, times or ranges are not valid'
-    view = abs(_field_of_view(scan))
+    view = abs(scan.angle_increment) * (n - 1)
     if view > LARGEST_VIEW or (n > 1 and abs(scan.angle_increment) < FINEST):
         return f'angle_increment {scan.angle_increment:g} rad times {n} beams is no field of view'
     if abs(scan.angle_min) > LARGEST_VIEW:

@@ -125,6 +125,38 @@ def test_pose_of_odometry_after_a_gap_was_wrong_where_it_jumps_next(after):
     np.testing.assert_allclose(at, se2.compose(before, way), atol=1e-9)
 
 
+def since_after_jump(drive, odometry):
+    """The motions where the next odometry (3,) has jumped to somewhere."""
+    drive.stamp += round(DT * 1e9)
+    unknown = Motion(np.zeros(3), np.eye(3), known=False)
+    seen = Observation(drive.stamp, unknown, odom_pose=odometry)
+    return [h.observation.motion for h in drive.hypotheses.of(seen, TWIST)]
+
+
+def test_wrong_pose_after_a_gap_is_known_beyond_a_second_gap():
+    drive = Drive()
+    drive.go()
+    before, wrong = drive.pose, np.array([-3.0, 1.0, 0.4])
+    drive.stamp += 10**9
+    drive.go(wrong, moved=wrong)
+    drive.stamp += 2 * 10**8
+    drive.go(se2.exp(0.4 * TWIST), moved=se2.exp(0.4 * TWIST))
+    way = se2.exp(TWIST * 1.8)
+    _, since, *_ = since_after_jump(drive, se2.compose(STEP, way))
+    at = se2.compose(drive.pose, since.delta)
+    np.testing.assert_allclose(at, se2.compose(before, way), atol=1e-9)
+
+
+def test_odometry_reset_beside_a_slow_laser_is_no_wrong_pose_after_a_gap():
+    """Of a laser of 1 Hz, each interval is a gap; the robot was where it went."""
+    drive = Drive()
+    for _ in range(4):
+        drive.stamp += 8 * 10**8
+        drive.go(se2.exp(TWIST), moved=se2.exp(TWIST))
+    found = since_after_jump(drive, np.array([3.0, 2.0, 0.0]))
+    np.testing.assert_allclose([m.delta for m in found], [np.zeros(3), STEP], atol=1e-9)
+
+
 def test_jump_long_after_a_gap_is_of_another_cause():
     drive = Drive()
     drive.go()
@@ -137,6 +169,20 @@ def test_jump_long_after_a_gap_is_of_another_cause():
     plain, onward = (h.observation.motion for h in drive.hypotheses.of(seen, TWIST))
     assert plain is unknown
     np.testing.assert_allclose(onward.delta, STEP, atol=1e-9)
+
+
+def test_odometry_that_goes_on_after_a_gap_is_not_compared_with_that_before():
+    """Scans may have shown since that the robot is elsewhere."""
+    drive = Drive()
+    drive.go()
+    drive.stamp += 10**9
+    drive.go(se2.exp(1.2 * TWIST), moved=se2.exp(0.5 * TWIST))
+    drive.stamp += round(DT * 1e9)
+    drive.odometry = se2.compose(drive.odometry, STEP)
+    unknown = Motion(np.zeros(3), np.eye(3), known=False)
+    seen = Observation(drive.stamp, unknown, odom_pose=drive.odometry)
+    found = [h.observation.motion for h in drive.hypotheses.of(seen, TWIST)]
+    np.testing.assert_allclose([m.delta for m in found], [np.zeros(3), STEP], atol=1e-9)
 
 
 def test_robot_that_stops_has_stopped():
