@@ -77,14 +77,14 @@ def test_clock_that_was_set_back_is_an_error():
     assert lasts > PERSISTENT
     for k in range(lasts):
         assert stamps.wrong_after('odom', start + k * STEP, newest) is None
-    with pytest.raises(InputError, match=r'the clock of odom jumped back by 9\.5 s'):
+    with pytest.raises(InputError, match=r'the clock of odom jumped back by 9\.0 s'):
         stamps.wrong_after('odom', start + lasts * STEP, newest)
 
 
 def test_burst_of_old_messages_is_no_clock_that_was_set_back():
     """Of a second publisher, say, that had no processor for two seconds."""
     stamps, newest = running()
-    for k in range(300):
+    for k in range(900):
         assert stamps.wrong_after('odom', newest - 2 * SECOND + k * 10**6, newest) is None
     for k in range(1, 100):
         assert stamps.wrong_after('odom', newest + k * STEP, newest + (k - 1) * STEP) is None

@@ -27,7 +27,7 @@ CONFIRM = 3  # messages that confirm, or refute, a suspicious stamp
 RECENT = 5  # stamps of a source that are remembered
 PERSISTENT = 10  # messages in a row that are behind: fewer are late, more are of a new clock
 # [ns] from the first to the last of these, or it is the clock of a late burst, not that of all
-LASTING = SECOND // 2
+LASTING = SECOND
 
 
 class StampCheck:
