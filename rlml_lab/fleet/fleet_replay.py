@@ -24,7 +24,7 @@ from rlml_lab.fleet.page import fleet_page
 from rlml_lab.fleet.replay_job import Job, code_digest
 from rlml_lab.fleet.results import Record, Results
 from rlml_lab.fleet.run import replay_all, write_tables
-from rlml_slam.cli.map.cluster import open_client
+from rlml_lab.support.cluster import open_client
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.cli.support.text_table import aligned
 from rlml_slam.params import from_mapping

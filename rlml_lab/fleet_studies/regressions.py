@@ -21,7 +21,7 @@ from rlml_lab.fleet.replay_job import Job
 from rlml_lab.fleet.results import Results
 from rlml_lab.fleet.run import replay_all
 from rlml_lab.fleet_studies.fleet_bags import Fleet, make_bag, name_of
-from rlml_slam.cli.map.cluster import open_client
+from rlml_lab.support.cluster import open_client
 from rlml_slam.params import from_mapping
 
 # planted -> the world of its bags, and parameters; a wrong laser_pose is in the bag

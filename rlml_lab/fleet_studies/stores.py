@@ -18,7 +18,7 @@ from rlml_lab.fleet.replay_job import Job, code_digest
 from rlml_lab.fleet.results import Results
 from rlml_lab.fleet.run import replay_all, write_tables
 from rlml_lab.fleet_studies.fleet_bags import Fleet, name_of
-from rlml_slam.cli.map.cluster import open_client
+from rlml_lab.support.cluster import open_client
 from rlml_slam.params import Parameters
 
 if TYPE_CHECKING:

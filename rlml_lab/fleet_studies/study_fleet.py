@@ -16,8 +16,8 @@ from rlml_lab.fleet.results import Record, Results
 from rlml_lab.fleet.run import replay_all, write_tables
 from rlml_lab.fleet_studies import by_processes, regressions, stores
 from rlml_lab.fleet_studies.fleet_bags import Fleet, make_bag
+from rlml_lab.support.cluster import open_client
 from rlml_lab.support.parallel_jobs import each_by
-from rlml_slam.cli.map.cluster import open_client
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.errors import ParameterError
 

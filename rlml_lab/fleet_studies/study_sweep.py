@@ -14,7 +14,7 @@ from rlml_lab.fleet.fleet_options import add_options, values_of
 from rlml_lab.fleet.replay_job import Job, code_digest
 from rlml_lab.fleet.results import Results
 from rlml_lab.fleet.run import columns_of, csv_of, replay_all, write_tables
-from rlml_slam.cli.map.cluster import open_client
+from rlml_lab.support.cluster import open_client
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.cli.support.text_table import aligned
 from rlml_slam.errors import ParameterError

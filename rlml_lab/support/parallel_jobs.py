@@ -7,7 +7,7 @@ import argparse
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
-from rlml_slam.cli.map.cluster import open_client
+from rlml_lab.support.cluster import open_client
 from rlml_slam.errors import ParameterError
 
 if TYPE_CHECKING:

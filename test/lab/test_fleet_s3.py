@@ -9,7 +9,7 @@ import pytest
 from made_bags import simulated_bag
 
 from rlml_lab.main import main
-from rlml_slam.cli.map.cluster import open_client
+from rlml_lab.support.cluster import open_client
 
 pytest.importorskip('distributed')
 fsspec = pytest.importorskip('fsspec')

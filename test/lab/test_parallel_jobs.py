@@ -7,8 +7,8 @@ import os
 
 import pytest
 
+from rlml_lab.support.cluster import open_client
 from rlml_lab.support.parallel_jobs import each_by
-from rlml_slam.cli.map.cluster import open_client
 
 pytest.importorskip('distributed')
 

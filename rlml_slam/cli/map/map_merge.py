@@ -8,17 +8,21 @@ import json
 import math
 import os
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 from rlml_slam import warm_up
-from rlml_slam.cli.map.cluster import open_client
 from rlml_slam.cli.support.usage import usage
+from rlml_slam.errors import ClusterError
 from rlml_slam.maps import map_container, survey
 from rlml_slam.params import Parameters, from_mapping, read_yaml
 from rlml_slam.slam.merging.map_merging import merge_files
 from rlml_slam.slam.merging.site_tree import Mapper, in_this_process
+
+CONNECT_S = 30.0  # [s] within which a scheduler has to answer
 
 
 def add_parser(subparsers: Any) -> None:
@@ -38,7 +42,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--config', metavar='YAML', type=Path, help='ROS parameter file')
     parser.add_argument(
         '--jobs', metavar='N', type=int, default=1,
-        help='worker processes of Dask, 0 for one per core; 1: this process (default)',
+        help='worker processes, 0 for one per core; 1: this process (default)',
     )  # fmt: skip
     parser.add_argument('--cluster', metavar='tcp://HOST:PORT', help='scheduler of Dask')
     parser.add_argument('--json', action='store_true', help='print one JSON object and no more')
@@ -81,17 +85,27 @@ def peak_mb() -> float | None:
 
 @contextmanager
 def mapper(cluster: str | None, jobs: int) -> Iterator[Mapper]:
-    """What runs a function over many arguments: this process, or the workers of Dask."""
-    if cluster is None and jobs == 1:
+    """What runs a function over many arguments: this process, worker processes, or Dask's.
+
+    Raises ClusterError where there is no scheduler, or no package to reach it.
+    """
+    if cluster is not None:
+        try:
+            from distributed import Client
+
+            client = Client(cluster, timeout=CONNECT_S)
+        except ModuleNotFoundError as e:
+            wanted = 'pip install "rlml_slam[fleet]"'
+            raise ClusterError(f'a cluster needs the Python package {e.name!r}: {wanted}') from e
+        except (OSError, ValueError, TypeError) as e:
+            raise ClusterError(f'no scheduler of Dask answers at {cluster}: {e}') from e
+        with client:
+            yield lambda f, *of: list(client.gather(client.map(f, *of, pure=False)))
+    elif jobs == 1:
         yield in_this_process
-        return
-    with open_client(cluster, jobs) as client:
-
-        def on_workers(function: Any, *arguments: Any) -> list[Any]:
-            done: list[Any] = client.gather(client.map(function, *arguments, pure=False))
-            return done
-
-        yield on_workers
+    else:
+        with ProcessPoolExecutor(jobs or None, get_context('spawn')) as pool:
+            yield lambda f, *of: list(pool.map(f, *of))
 
 
 def text(f: dict[str, Any], out: Path) -> str:

@@ -33,10 +33,6 @@ SAME = np.array([0.02, 0.02, 0.01])  # [m, m, rad] hypotheses that are closer ar
 # agree by chance
 CONFIRM = 2
 LONGEST = 5.0  # [s] of a stall; after that, odometry is what it is
-GAP = (
-    0.3  # [s] between frames: a robot may go as far meanwhile as a wrong pose of odometry is away
-)
-AFTER_GAP = 5.0  # [s] within which odometry that jumps shows that it was wrong since the gap
 
 
 @dataclass(frozen=True)
@@ -51,10 +47,7 @@ class Hypothesis:
 
 
 class MotionHypotheses:
-    """The frames at which odometry was trusted, the last one and the last before a gap.
-
-    Of each: its stamp [ns], pose and raw odometry (3,).
-    """
+    """The last frame at which odometry was trusted: its stamp [ns], pose and raw odometry (3,)."""
 
     def __init__(self, params: Parameters) -> None:
         self._p = params
@@ -63,11 +56,7 @@ class MotionHypotheses:
     def forget(self) -> None:
         """The pose was moved: what comes is not compared with what was before."""
         self._trusted: tuple[int, Array, Array] | None = None
-        # what was trusted before a gap after which the robot was not where it went, and its end
-        self._before_gap: tuple[tuple[int, Array, Array] | None, int] = None, 0
         self._last: tuple[int, Array] | None = None  # stamp and pose of the last frame
-        self._last_odometry: Array | None = None  # raw (3,) at that frame
-        self._is_after_odd_gap = False
         self._agreed = 0  # frames in a row, since it is open, at which odometry agreed
 
     def of(self, observation: Observation, velocity: Array | None) -> list[Hypothesis]:
@@ -84,7 +73,6 @@ class MotionHypotheses:
             return single
         since, onward = self._since_trusted(observation), None
         velocity = velocity if dt <= FRESH else None
-        self._is_after_odd_gap = dt > GAP and not _goes_on(plain.delta, velocity, dt)
         if velocity is not None and (since or not plain.known or _is_odd(plain, velocity, dt)):
             sigma = ACCELERATION * max(dt, SHORTEST) * dt
             cov = np.diag(sigma**2 + (0.5 * SAME) ** 2)
@@ -109,16 +97,10 @@ class MotionHypotheses:
         return deskewed(observation, se2.log(motion.delta) / dt, max_range)[0]
 
     def _since_trusted(self, observation: Observation) -> Motion | None:
-        """The motion since the last frame by the odometry since it was trusted, if it is open.
-
-        Where odometry jumps soon after a gap, that since it was trusted before the gap.
-        """
+        """The motion since the last frame by the odometry since it was trusted, if it is open."""
         assert self._trusted is not None
         assert self._last is not None
-        trusted, (before, end) = self._trusted, self._before_gap
-        if before is not None and observation.stamp - end < AFTER_GAP * 1e9:
-            trusted = before if self._jumps(observation) else trusted
-        stamp, pose, odometry = trusted
+        stamp, pose, odometry = self._trusted
         if stamp == self._last[0] or observation.odom_pose is None:
             return None
         dt = (observation.stamp - stamp) * 1e-9
@@ -129,15 +111,6 @@ class MotionHypotheses:
         # what the scans have shown since then is not without error either
         return Motion(delta, motion_of(way, dt, self._p.motion).cov + np.diag(SAME**2))
 
-    def _jumps(self, observation: Observation) -> bool:
-        """Whether odometry moved since the last frame as no robot does."""
-        assert self._last is not None
-        if self._last_odometry is None or observation.odom_pose is None:
-            return False
-        way = se2.between(self._last_odometry, observation.odom_pose)
-        dt = (observation.stamp - self._last[0]) * 1e-9
-        return not is_possible(way, dt, self._p.motion)
-
     def learn(self, observation: Observation, pose: Array) -> None:
         """Take the pose (3,) of the newest frame; trust the odometry where it agrees.
 
@@ -145,11 +118,7 @@ class MotionHypotheses:
         was missing, only when what it says is where the scans are.
         """
         last, self._last = self._last, (observation.stamp, pose)
-        before, end = self._before_gap
-        is_old = before is None or observation.stamp - end > AFTER_GAP * 1e9
-        if self._is_after_odd_gap and is_old:
-            self._before_gap = self._trusted, observation.stamp
-        self._last_odometry = odometry = observation.odom_pose
+        odometry = observation.odom_pose
         if odometry is None:
             return
         if last is not None and self._trusted is not None:
@@ -190,14 +159,6 @@ def _is_odd(motion: Motion, velocity: Array, dt: float) -> bool:
         return bool((goes_on > SAME).any())
     # of a burst of stamps, the times say nothing of the speed
     return dt >= SHORTEST and _penalty(motion.delta, velocity, dt) > 0.5
-
-
-def _goes_on(delta: Array, velocity: Array | None, dt: float) -> bool:
-    """Whether a motion (3,) in ``dt`` [s] is about what the velocity until then leads to."""
-    if velocity is None:
-        return False
-    away = se2.between(se2.exp(velocity * dt), delta)
-    return bool((np.abs(away) < MOVED + ACCELERATION * dt**2).all())
 
 
 def _penalty(delta: Array, velocity: Array | None, dt: float) -> float:

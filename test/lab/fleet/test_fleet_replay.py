@@ -16,8 +16,8 @@ from rlml_lab.fleet.replay_job import SAME, Job, code_digest, replay_bag
 from rlml_lab.fleet.results import Results
 from rlml_lab.fleet.run import replay_all, write_tables
 from rlml_lab.main import main as lab
+from rlml_lab.support.cluster import open_client
 from rlml_slam.cli.main import main
-from rlml_slam.cli.map.cluster import open_client
 from rlml_slam.errors import ClusterError
 from rlml_slam.params import Parameters
 

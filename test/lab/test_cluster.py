@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from rlml_slam.cli.map import cluster
+from rlml_lab.support import cluster
 from rlml_slam.errors import ClusterError
 
 pytest.importorskip('distributed')
