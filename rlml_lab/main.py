@@ -113,6 +113,10 @@ COMMANDS: Table = {
                 'rlml_lab.contact.study_contact',
                 'messages that nobody should send: nodes go on, poses too',
             ),
+            'starved': Command(
+                'rlml_lab.contact.study_starved',
+                'mutated messages beside a node that often has no processor',
+            ),
             'fuzz-files': Command(
                 'rlml_lab.contact.study_fuzz_files', 'mutated files of every format that is read'
             ),

@@ -33,8 +33,7 @@ CREEP = 0.25
 RECENT = 3.0  # [s] whose mean speed is that at which a robot goes on in a long gap
 ZERO = 0.05  # [m], [rad] from the pose at which odometry begins
 COAST = 0.2  # [s] for which a robot is taken to go on as it went before its odometry ended
-# [s] between two turn rates, beyond which the wheels know better how far it turned meanwhile
-GYRO_GAP = 0.75
+GYRO_GAP = 0.75  # [s] between turn rates: beyond it the wheels know better how far it turned
 # Share of the noise of a slow motion that is left where the wheels do not turn: what they miss is
 # less than a tick in all, and adds up to no walk. A larger one lets the noise of the first scan
 # turn the whole map, while the robot stands and could well average it out.

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -98,11 +99,10 @@ def _layout(
 def check_disjoint(points: NDArray[np.void], names: Iterable[str], topic: str) -> None:
     """Raise InputError where two of the fields share bytes; those that are absent are none."""
     fields: Mapping[str, tuple[Any, ...]] = points.dtype.fields or {}
-    end, last = 0, ''
-    for offset, name in sorted((fields[name][1], name) for name in names if name in fields):
-        if offset < end:
-            raise InputError(f'{topic}: fields {last!r} and {name!r} overlap')
-        end, last = offset + fields[name][0].itemsize, name
+    spans = sorted((fields[n][1], fields[n][0].itemsize, n) for n in names if n in fields)
+    for (start, size, name), (after, _, other) in pairwise(spans):
+        if start + size > after:
+            raise InputError(f'{topic}: fields {name!r} and {other!r} overlap')
 
 
 def column(points: NDArray[np.void], name: str, absent: float) -> NDArray[np.float64]:

@@ -27,10 +27,7 @@ class SensorKinds:
         self._seen: list[deque[Kind]] = []
 
     def is_foreign(self, frame_id: str, angle: float = 0.0, *increments: float) -> bool:
-        """Add a message; whether its frame, or one of its values, is rare beside another.
-
-        ``angle`` [rad] is the first one; ``increments`` are of the angle and of the time.
-        """
+        """Add a message; whether its frame, first angle or an increment is rare beside another."""
         kinds = [(frame_id, value) for value in (angle, *increments)]
         while len(self._seen) < len(kinds):
             self._seen.append(deque(maxlen=MEMORY))

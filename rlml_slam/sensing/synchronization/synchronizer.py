@@ -154,10 +154,7 @@ class Synchronizer:
         return self._release(flush=True)
 
     def _is_of_sensor(self, stream: str, item: Scan | Detections, *values: float) -> bool:
-        """Whether it is of a sensor whose pose is known; counts the input as invalid if not.
-
-        ``values`` are what stays the same in its messages, as those of one scan do.
-        """
+        """Whether it is of a known sensor, as its ``values`` show; counts it as invalid if not."""
         base, error = self._node.base_frame, f'{stream} in frame {item.frame_id[:100]!r}'
         if not self._assembly.has_frame(stream, item.frame_id):
             error += f', whose pose in {base} is unknown: publish it on /tf_static'

@@ -4,9 +4,9 @@
 Odometry may stall: it repeats its pose while the robot drives, and then catches up in one step.
 Scans have shown the motion meanwhile, so the step must not be added to it. Wheels are integrated
 on the robot: the odometry since the last frame at which it was trusted is one measurement,
-whatever came in between. So there are up to three hypotheses: odometry since the last frame,
-odometry since it was trusted, and that the robot goes on as it went. Scan and reflectors
-choose (:meth:`ScanTerm.likeliest`).
+whatever came in between. And a gyro may be wrong for a moment. So there are up to four hypotheses:
+odometry since the last frame, odometry since it was trusted, that the robot goes on as it went,
+and that it turned as the wheels did. Scan and reflectors choose (:meth:`ScanTerm.likeliest`).
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ SAME = np.array([0.02, 0.02, 0.01])  # [m, m, rad] hypotheses that are closer ar
 # frames in a row: a scan within the step of odometry that catches up gets a part of it, which may
 # agree by chance
 CONFIRM = 2
+TURN = 0.1  # [rad] by which gyro and wheels disagree: errors of both in a step are smaller
 LONGEST = 5.0  # [s] of a stall; after that, odometry is what it is
 
 
@@ -57,6 +58,7 @@ class MotionHypotheses:
         """The pose was moved: what comes is not compared with what was before."""
         self._trusted: tuple[int, Array, Array] | None = None
         self._last: tuple[int, Array] | None = None  # stamp and pose of the last frame
+        self._last_odometry: Array | None = None  # raw (3,) at that frame
         self._agreed = 0  # frames in a row, since it is open, at which odometry agreed
 
     def of(self, observation: Observation, velocity: Array | None) -> list[Hypothesis]:
@@ -78,7 +80,7 @@ class MotionHypotheses:
             cov = np.diag(sigma**2 + (0.5 * SAME) ** 2)
             onward = Motion(se2.exp(velocity * dt), cov, known=False)
         motions = [plain]
-        for other in (since, onward):
+        for other in (since, onward, self._by_wheels(observation, dt)):
             if other is not None and all(_differ(other.delta, m.delta) for m in motions):
                 motions.append(other)
         if len(motions) == 1:
@@ -111,6 +113,17 @@ class MotionHypotheses:
         # what the scans have shown since then is not without error either
         return Motion(delta, motion_of(way, dt, self._p.motion).cov + np.diag(SAME**2))
 
+    def _by_wheels(self, observation: Observation, dt: float) -> Motion | None:
+        """The motion since the last frame by the wheels alone, where a gyro says otherwise."""
+        plain, odometry = observation.motion, observation.odom_pose
+        if self._last_odometry is None or odometry is None or not plain.known:
+            return None
+        way = se2.between(self._last_odometry, odometry)
+        agree = abs(se2.wrapped(way[2] - plain.delta[2])) < TURN
+        if agree or not is_possible(way, dt, self._p.motion):
+            return None
+        return motion_of(way, dt, self._p.motion)
+
     def learn(self, observation: Observation, pose: Array) -> None:
         """Take the pose (3,) of the newest frame; trust the odometry where it agrees.
 
@@ -118,7 +131,7 @@ class MotionHypotheses:
         was missing, only when what it says is where the scans are.
         """
         last, self._last = self._last, (observation.stamp, pose)
-        odometry = observation.odom_pose
+        self._last_odometry = odometry = observation.odom_pose
         if odometry is None:
             return
         if last is not None and self._trusted is not None:

@@ -106,6 +106,21 @@ def test_odometry_after_a_long_gap_counts_from_where_it_was_trusted():
     assert (np.sqrt(np.diag(since.cov)) < 1.0).all()
 
 
+@pytest.mark.parametrize(('wrong', 'hypotheses'), [(0.05, 1), (1.6, 2)])
+def test_gyro_that_disagrees_with_the_wheels_is_doubted(wrong, hypotheses):
+    drive = Drive()
+    drive.go()
+    drive.stamp += round(DT * 1e9)
+    drive.odometry = se2.compose(drive.odometry, STEP)
+    by_gyro = se2.exp((TWIST + np.array([0.0, 0.0, wrong / DT])) * DT)
+    motion = Motion(by_gyro, 1e-4 * np.eye(3), True)
+    seen = Observation(drive.stamp, motion, odom_pose=drive.odometry)
+    found = [h.observation.motion.delta for h in drive.hypotheses.of(seen, None)]
+    assert len(found) == hypotheses
+    np.testing.assert_allclose(found[0], by_gyro)
+    np.testing.assert_allclose(found[1:], [STEP] * (hypotheses - 1), atol=1e-9)
+
+
 def test_robot_that_stops_has_stopped():
     drive = Drive()
     drive.go()
