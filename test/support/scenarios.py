@@ -257,7 +257,7 @@ SCENARIOS = (
         ((40, 'load', (SAVED,)),), delay=5.0, more=True,
     ),
     Scenario(
-        'clock that jumps back', TWICE, se2.inverse(TWICE[102]), ('map',),
+        'clock that jumps back', TWICE, se2.inverse(TWICE[110]), ('map',),
         ((100, 'jump_back', (30.0,)),), kept=1,
     ),
     Scenario(
