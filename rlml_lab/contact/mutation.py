@@ -8,12 +8,16 @@ import copy
 from typing import Any
 
 import numpy as np
+from rclpy.serialization import deserialize_message
+
+from rlml_slam.ros.codecs import decode
 
 REALS = (
     float('nan'), float('inf'), -float('inf'), 0.0, -0.0, 1e308, -1e308, 5e-324, 1e9, -1e9, 1e-9,
     -1.0, 3.4e38,
 )  # fmt: skip
 TEXTS = ('', '/', 'map', 'base_link', 'laser', 'a' * 300, 'ünknown frame', '\x01', '../../etc')
+BESIDE = -5_000_000, 5_000_000  # [ns] of a mutated message from the good one
 MOST = 100_000  # elements of a sequence that grows
 
 
@@ -23,6 +27,14 @@ def mutated(msg: Any, rng: np.random.Generator) -> Any:
     for _ in range(rng.integers(1, 4)):
         _change(out, rng)
     return out
+
+
+def beside(data: bytes, kind: type, topic: str, rng: np.random.Generator) -> Any:
+    """A mutated message made of a good one, at a stamp of its own: else it is a duplicate."""
+    msg = deserialize_message(data, kind)
+    stamp = decode.stamp(msg, topic) + int(rng.integers(*BESIDE))
+    msg.header.stamp.sec, msg.header.stamp.nanosec = divmod(stamp, 1_000_000_000)
+    return mutated(msg, rng)
 
 
 def _change(msg: Any, rng: np.random.Generator) -> None:

@@ -18,10 +18,10 @@ from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.serialization import serialize_message
 
 from rlml_lab.contact.good_messages import stream_of_room
-from rlml_lab.contact.mutation import mutated, random_bytes
+from rlml_lab.contact.mutation import beside, random_bytes
 from rlml_slam.cli.support.live_session import node, own_domain
 from rlml_slam.cli.support.processes import Processes, free_domain
 from rlml_slam.cli.support.usage import Usage
@@ -38,7 +38,6 @@ BYTES = 0.05  # share of random bytes
 TOPICS = ('scan', 'odom', 'imu', 'reflectors')
 FILLED = 10.0  # [s] until the black box is full
 OWN = 2000  # messages that are remembered as the intruder's own
-BESIDE = -5_000_000, 5_000_000  # [ns] of a mutated message from the good one
 
 
 class Intruder(Node):
@@ -96,11 +95,8 @@ class Intruder(Node):
         if self._rng.random() < BYTES:
             data = random_bytes(self._rng)
         else:
-            msg = deserialize_message(self._good[topic], self._kinds[topic])
-            # a stamp of its own, or it would be refused as a duplicate
-            stamp = decode.stamp(msg, topic) + int(self._rng.integers(*BESIDE))
-            msg.header.stamp.sec, msg.header.stamp.nanosec = divmod(stamp, 1_000_000_000)
-            data = serialize_message(mutated(msg, self._rng))
+            msg = beside(self._good[topic], self._kinds[topic], topic, self._rng)
+            data = serialize_message(msg)
         self._own.append(data)
         self._out[topic].publish(data)
         self.sent += 1

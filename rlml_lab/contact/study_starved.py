@@ -8,6 +8,8 @@ most messages are lost, wrong ones come at the end of gaps, and many come at onc
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import os
 import tempfile
 from collections import deque
@@ -21,7 +23,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from rlml_lab.contact.good_messages import STREAMS
 from rlml_lab.contact.in_process import PLACE, SENSORS, Truth
-from rlml_lab.contact.mutation import mutated
+from rlml_lab.contact.mutation import beside
 from rlml_slam.cli.main import main as command
 from rlml_slam.nodes.front_end import FrontEndNode
 from rlml_slam.nodes.slam import connected
@@ -33,7 +35,6 @@ from rlml_slam.slam.conversation import SessionFrame
 
 DEPTH = {'scan': 5, 'odom': 20, 'imu': 20, 'reflectors': 5}  # messages that wait
 AWAKE, SLEEPS = 50_000_000, 0.2  # [ns] between looks at what waits; share of these that is a sleep
-BESIDE = -5_000_000, 5_000_000  # [ns] of a mutated message from the good one
 SETTLE = 200  # messages after which the back end has caught up
 
 
@@ -56,7 +57,8 @@ def run(args: argparse.Namespace) -> int:
         with tempfile.TemporaryDirectory(prefix='rlml_starved_') as folder:
             bag, before = Path(folder) / 'bag', Path.cwd()
             words = ['simulate', args.world, str(bag), '--seed', str(seed), '--json']
-            command([*words, '--duration', str(args.duration)])
+            with contextlib.redirect_stdout(io.StringIO()):
+                command([*words, '--duration', str(args.duration)])
             os.chdir(folder)  # maps are saved there
             try:
                 share, errors, ok = drive(bag, args.rate, args.asleep, seed)
@@ -89,6 +91,7 @@ def drive(
     front.take = note
     waiting = {kind: deque[tuple[int, Any]](maxlen=DEPTH[kind]) for kind in SENSORS}
     good: dict[str, Any] = {}
+    kinds = {kind: type(msg) for _, kind, msg in stream}
     due, last, wakes, number = 0.0, stream[0][0], 0, 0
     try:
         for stamp, kind, msg in stream:
@@ -99,7 +102,9 @@ def drive(
             due, last = due + rate * (stamp - last) * 1e-9, stamp
             while due >= 1.0 and len(good) == len(SENSORS):
                 due, number, name = due - 1.0, number + 1, str(rng.choice(SENSORS))
-                waiting[name].append((number, _beside(good[name], name, rng)))
+                waiting[name].append(
+                    (number, beside(serialize_message(good[name]), type(good[name]), name, rng))
+                )
             number += 1
             waiting[kind].append((number, msg))
             good[kind] = msg
@@ -143,11 +148,3 @@ def _read(bag: Path) -> tuple[list[tuple[int, str, Any]], Truth]:
         ]
     at = {decode.stamp(m, 'ground_truth'): m.pose.pose for m in truth}
     return stream, {t: decode.planar_pose(pose, 'ground_truth') for t, pose in at.items()}
-
-
-def _beside(msg: Any, topic: str, rng: np.random.Generator) -> Any:
-    """A mutated copy with a stamp of its own."""
-    out = deserialize_message(serialize_message(msg), type(msg))
-    stamp = decode.stamp(out, topic) + int(rng.integers(*BESIDE))
-    out.header.stamp.sec, out.header.stamp.nanosec = divmod(stamp, 1_000_000_000)
-    return mutated(out, rng)
