@@ -91,7 +91,6 @@ def drive(
     front.take = note
     waiting = {kind: deque[tuple[int, Any]](maxlen=DEPTH[kind]) for kind in SENSORS}
     good: dict[str, Any] = {}
-    kinds = {kind: type(msg) for _, kind, msg in stream}
     due, last, wakes, number = 0.0, stream[0][0], 0, 0
     try:
         for stamp, kind, msg in stream:
