@@ -16,16 +16,18 @@ import math
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
 
 from rlml_slam.errors import FileFormatError, MapError
 from rlml_slam.maps.atomic_file import write_atomically
 from rlml_slam.maps.occupancy import UNKNOWN, OccupancyGrid
 from rlml_slam.plain_yaml import parse_yaml
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 OCCUPIED_THRESH = 0.65
 FREE_THRESH = 0.196  # below the 50/255 of an unknown pixel, which 0.25 would read as free
@@ -170,6 +172,8 @@ def _shades(path: Path, mode: str) -> tuple[NDArray[np.uint16], int, NDArray[np.
     """
     if not path.is_file():
         raise MapError(f'{path}: cannot be read: no such file')
+    from PIL import Image, UnidentifiedImageError  # 8 MB that a node without such a map saves
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter('error', Image.DecompressionBombWarning)

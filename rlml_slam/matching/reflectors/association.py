@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 from scipy.special import gammaincinv
 
 from rlml_slam.matching.reflectors import association_status
@@ -159,6 +160,8 @@ class Associator:
 
 def _nearest(cost: Array, compatible: NDArray[np.bool_]) -> tuple[Indices, Indices]:
     """The one-to-one assignment of least cost inside the gates, most matches first."""
-    rows, cols = linear_sum_assignment(np.where(compatible, cost, 1e6))
+    # scipy.optimize does the same for 9 MB more; weights of zero would be no edges here
+    weights = csr_array(np.where(compatible, 1.0 + cost - cost.min(initial=0.0), 1e6))
+    rows, cols = min_weight_full_bipartite_matching(weights)
     keep = compatible[rows, cols]
     return rows[keep], cols[keep]
