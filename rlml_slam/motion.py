@@ -387,6 +387,7 @@ class MotionBuffer:
         self._imu_stamps: list[int] = []
         self._rates: list[float] = []
         self._parked: Odometry | None = None
+        self._delay = 0
 
     @property
     def newest(self) -> int | None:
@@ -404,6 +405,8 @@ class MotionBuffer:
         One sample that jumps away and is not followed by another there is a fault and dropped;
         two that agree are odometry that was reset, across which the motion is unknown.
         """
+        if self._delay:
+            sample = Odometry(sample.stamp - self._delay, sample.pose)
         if self._stamps and sample.stamp <= self._stamps[-1]:
             return True
         if self._stamps:
@@ -423,6 +426,11 @@ class MotionBuffer:
         self._poses.append(np.array(sample.pose, dtype=np.float64))
         self._forget(self._stamps, sample.stamp, self._poses, self._twists)
         return True
+
+    def set_odometry_delay(self, delay: int) -> None:
+        """Odometry, that which is there as well, was measured ``delay`` [ns] before its stamp."""
+        self._stamps = [stamp + self._delay - delay for stamp in self._stamps]
+        self._delay = delay
 
     def _step(self, stamp: int, pose: Array, sample: Odometry) -> Array | None:
         """Velocity (3,) since an earlier sample, None where no robot moves like that."""
@@ -493,7 +501,7 @@ class MotionBuffer:
 
     def forget_odometry_after(self, stamp: int) -> None:
         """Drop the odometry later than a stamp."""
-        k = bisect_right(self._stamps, stamp)
+        k = bisect_right(self._stamps, stamp - self._delay)
         del self._stamps[k:], self._poses[k:], self._twists[k:]
         if not self._twists:
             self._twists.append(np.zeros(3))
@@ -517,7 +525,8 @@ class MotionBuffer:
         return 0 if near else after - before
 
     def pose_at(self, stamp: int) -> Array | None:
-        """Raw odometry pose (3,) at the stamp, None outside of what is known."""
+        """Raw odometry pose (3,) that has the stamp, None outside of what is known."""
+        stamp -= self._delay
         if not self.covers(stamp):
             return None
         k = bisect_left(self._stamps, stamp)

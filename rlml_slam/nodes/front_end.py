@@ -24,8 +24,7 @@ from rlml_slam.types import Frame, Observation
 class FrontEndNode(ManagedNode):
     """Drives a FrontEnd with the robot's sensors; all stamps are those of the input.
 
-    With a back end in the same process, ``take`` gets its frames, and ``command`` is for that
-    back end's commands.
+    With a back end in the same process, ``take`` gets its frames, ``command`` its commands.
     """
 
     def __init__(self, has_back_end: bool = False, **options: Any) -> None:
@@ -89,6 +88,7 @@ class FrontEndNode(ManagedNode):
             self.take(record)
         self.health.update(record.frame)
         self.black_box.follow(record.frame)
+        self.sensors.synchronizer.follow(record.frame)
 
 
 def main() -> int:

@@ -62,6 +62,9 @@ class Node(Group, prefix=''):
     filter_stamps: bool = param(
         True, 'remove the jitter of the stamps of sensors with a constant rate'
     )
+    estimate_odometry_delay: bool = param(
+        True, 'correct the stamps of odometry by how late they are against the scans'
+    )
     leave_out_robot_parts: bool = param(
         True, 'leave out beams that see the robot itself: their range stays the same as it moves'
     )

@@ -335,6 +335,8 @@ def input_figures(synchronizer: Synchronizer) -> dict[str, object]:
         out['last refused input'] = inputs.last_error
     if odometry.source:
         out['odometry is read from'] = '/tf' if odometry.source == TF else 'its topic'
+    if synchronizer.delay.now:
+        out['odometry is stamped late by'] = f'{synchronizer.delay.now * 1e-9:.2f} s'
     apart = str(odometry.comparison)
     if apart:
         out['odometry topic against /tf'] = apart

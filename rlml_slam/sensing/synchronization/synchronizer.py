@@ -24,12 +24,13 @@ from rlml_slam.sensing.no_return import NoReturnRanges
 from rlml_slam.sensing.reflectors.scan_reflectors import ScanReflectors
 from rlml_slam.sensing.synchronization.input_counts import InputCounts
 from rlml_slam.sensing.synchronization.observation_assembly import ObservationAssembly
+from rlml_slam.sensing.synchronization.odometry_delay import OdometryDelay
 from rlml_slam.sensing.synchronization.odometry_sources import TF, TOPIC, OdometrySources
 from rlml_slam.sensing.synchronization.sensor_kinds import SensorKinds
 from rlml_slam.sensing.synchronization.stamp_check import CONFIRM, StampCheck
 from rlml_slam.sensing.synchronization.stamp_jitter import StampJitter
 from rlml_slam.sensing.synchronization.waiting_queue import WaitingQueue
-from rlml_slam.types import Detections, Imu, Observation, Odometry, Scan
+from rlml_slam.types import Detections, Frame, Imu, Observation, Odometry, Scan
 
 MEASURED = ('scan', 'reflectors')  # streams that give observations
 LARGEST_VIEW = 2.2 * math.pi  # [rad] some drivers repeat beams at the end of a turn
@@ -53,6 +54,7 @@ class Synchronizer:
         self._fastest_turn = params.motion.max_turn_rate
         n = self._node
         self.odometry = OdometrySources(n.odom_source, n.tf_buffer_duration)
+        self.delay = OdometryDelay()
         self._assembly = ObservationAssembly(params, self.inputs, self.odometry.transforms)
         self._no_returns = NoReturnRanges()
         self._kinds = {stream: SensorKinds() for stream in MEASURED}
@@ -101,6 +103,7 @@ class Synchronizer:
             self.inputs.count(TOPIC, 'compared')
             return self._release()
         sample = used if stamp == used.stamp else Odometry(stamp, used.pose)
+        self.delay.add_odometry(stamp, sample.pose[2])
         self.inputs.count(TOPIC, 'used' if self.buffer.add_odometry(sample) else 'jump')
         if not len(self._queue):
             self._assembly.carry(stamp)
@@ -148,6 +151,15 @@ class Synchronizer:
             self._assembly.leave_detection()
             self._wait('reflectors', d)
         return self._release()
+
+    def follow(self, frame: Frame) -> None:
+        """Correct the stamps of odometry by what the pose of an observation says of its delay."""
+        if not self._node.estimate_odometry_delay:
+            return
+        before = self.delay.now
+        self.delay.add_pose(frame.stamp, frame.T_local_base[2])
+        if self.delay.now != before:
+            self.buffer.set_odometry_delay(self.delay.now)
 
     def flush(self) -> list[Observation]:
         """Observations of all that still waits, at the end of the data."""

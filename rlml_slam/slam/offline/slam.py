@@ -124,6 +124,7 @@ class Slam(SynchronizedSystem):
         for observation in observations:
             self._deliver_late(observation.stamp)
             record = self.session.process(observation)
+            self.synchronizer.follow(record.frame)
             self.batch_reassociation.add(observation, record.frame)
             self._give(record)
             assert self._newest is not None

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How late odometry is stamped against the scans, from turns that both have measured.
+
+A driver that stamps what a controller sent some time ago is late; one that stamps a scan when all
+of it has arrived makes odometry early. Where the turn rate changes, the turn between two poses of
+the scans is that of the odometry at one delay only.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from rlml_slam import se2
+from rlml_slam.motion import SECOND
+
+GRID = np.arange(-30, 31) * (SECOND // 100)  # [ns] delays that are compared
+LIMIT = 0.05  # [rad] what a difference counts at most: a wrong pose, wheels that slip
+TELLING = 0.003  # [rad] by which the differences of a turn that counts vary over the grid
+MEMORY = 300  # turns after which one counts for 1 / e
+ENOUGH = 100  # turns before anything is said
+SURE = 0.7  # of the sum at the present delay: at a better one, it is at most that
+
+
+class OdometryDelay:
+    """Compares turns of the robot; ``now`` [ns] is the delay that is found."""
+
+    def __init__(self) -> None:
+        self.now = 0
+        self._odometry: deque[tuple[int, float]] = deque()  # stamp [ns], heading without wraps
+        self._poses: deque[tuple[int, float]] = deque(maxlen=100)
+        self._sums, self._num = np.zeros(len(GRID)), 0.0
+
+    def add_odometry(self, stamp: int, heading: float) -> None:
+        """One sample: its stamp [ns] as it came, and its heading [rad]."""
+        if self._odometry and stamp <= self._odometry[-1][0]:
+            self._odometry.clear()
+            self._poses.clear()
+        last = self._odometry[-1][1] if self._odometry else heading
+        self._odometry.append((stamp, last + se2.wrapped(heading - last)))
+        oldest = (self._poses[0][0] if self._poses else stamp) + GRID[0]
+        while len(self._odometry) > 2 and self._odometry[1][0] < oldest:
+            self._odometry.popleft()
+
+    def add_pose(self, stamp: int, heading: float) -> None:
+        """One pose of the scans at a stamp [ns]; compared when odometry is there."""
+        self._poses.append((stamp, heading))
+        while len(self._poses) > 1 and self._is_covered(self._poses[1][0]):
+            (start, before), (end, after) = self._poses.popleft(), self._poses[0]
+            if 0 < end - start < SECOND:
+                self._compare(start, end, after - before)
+
+    def _is_covered(self, stamp: int) -> bool:
+        return bool(self._odometry) and self._odometry[-1][0] >= stamp + GRID[-1]
+
+    def _compare(self, start: int, end: int, turn: float) -> None:
+        stamps, headings = np.array(self._odometry).T
+        at_start, at_end = (np.interp(GRID + t, stamps, headings) for t in (start, end))
+        error = se2.wrap(turn - (at_end - at_start))
+        cost = np.minimum(error**2, LIMIT**2)
+        if np.ptp(cost) < TELLING**2:
+            return
+        keep = 1.0 - 1.0 / MEMORY
+        self._sums, self._num = keep * self._sums + cost, keep * self._num + 1.0
+        best = int(np.argmin(self._sums))
+        if self._num > ENOUGH and self._sums[best] < SURE * self._sums[self.now == GRID][0]:
+            self.now = int(GRID[best])

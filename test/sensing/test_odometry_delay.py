@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The delay of odometry is found from turns, and where there is none, none is said."""
+
+import numpy as np
+import pytest
+
+from rlml_slam.motion import SECOND, MotionBuffer
+from rlml_slam.params import MotionNoise, Parameters
+from rlml_slam.sensing.synchronization.odometry_delay import OdometryDelay
+from rlml_slam.sensing.synchronization.synchronizer import Synchronizer
+from rlml_slam.types import Odometry
+
+START = 1_700_000_000 * SECOND
+
+
+def heading(t):
+    """Of a robot that turns to and fro [rad]."""
+    return 0.8 * np.sin(0.9 * t) + 0.3 * np.sin(2.3 * t + 1.0)
+
+
+def drive(delay, seconds=120.0, scale=1.0, noise=0.003, slips=0.0, seed=0):
+    """Odometry at 20 Hz stamped ``delay`` [s] late, poses at 5 Hz; the delays [ns] found."""
+    rng = np.random.default_rng(seed)
+    found, slipped = OdometryDelay(), 0.0
+    events = [(t + delay, 'odometry', t) for t in np.arange(0.0, seconds, 0.05)]
+    events += [(t, 'pose', t) for t in np.arange(0.0, seconds, 0.2)]
+    said = []
+    for stamp, kind, t in sorted(events):
+        at = START + round(stamp * SECOND)
+        if kind == 'odometry':
+            slipped += 0.1 * (rng.random() < slips)
+            found.add_odometry(at, scale * heading(t) + slipped + noise * rng.standard_normal())
+        else:
+            found.add_pose(at, heading(t) + noise * rng.standard_normal())
+        said.append(found.now)
+    return np.array(said)
+
+
+@pytest.mark.parametrize('delay', [-0.2, -0.07, 0.03, 0.1, 0.25])
+@pytest.mark.parametrize('seed', range(3))
+def test_delay_is_found(delay, seed):
+    said = drive(delay, seed=seed)
+    assert said[0] == 0
+    assert (np.abs(said[len(said) // 2 :] / SECOND - delay) < 0.016).all()
+
+
+@pytest.mark.parametrize('change', [{}, {'scale': 0.9}, {'slips': 0.01}, {'noise': 0.02}])
+def test_odometry_that_is_wrong_in_other_ways_is_not_late(change):
+    assert not drive(0.0, **change).any()
+
+
+def test_delay_is_found_where_wheels_slip():
+    assert abs(drive(0.1, scale=0.95, slips=0.01)[-1] / SECOND - 0.1) < 0.016
+
+
+def test_straight_driving_says_nothing():
+    found = OdometryDelay()
+    for k in range(2000):
+        found.add_odometry(START + k * SECOND // 20 + SECOND // 10, 0.3)
+        found.add_pose(START + k * SECOND // 20, 0.3)
+    assert found.now == 0
+
+
+def test_clock_that_is_set_back_begins_again_and_keeps_the_delay():
+    found = OdometryDelay()
+    for begin in (START, START - 100 * SECOND):
+        for k in range(600):
+            t = 0.1 * k
+            found.add_odometry(begin + round((t + 0.1) * SECOND), heading(t))
+            found.add_pose(begin + round(t * SECOND), heading(t))
+        assert abs(found.now / SECOND - 0.1) < 0.011
+
+
+def test_motion_is_that_of_odometry_stamped_right():
+    buffers = [MotionBuffer(MotionNoise(), 100.0) for _ in range(3)]
+    delay = SECOND // 5
+    buffers[1].set_odometry_delay(delay)
+    for k in range(200):
+        pose = np.array([0.02 * k, 0.0, heading(0.05 * k)])
+        stamp = START + k * SECOND // 20
+        buffers[0].add_odometry(Odometry(stamp, pose))
+        buffers[1].add_odometry(Odometry(stamp + delay, pose))
+        buffers[2].add_odometry(Odometry(stamp + delay, pose))
+        if k == 100:
+            buffers[2].set_odometry_delay(delay)
+    begin, end = START + 3 * SECOND, START + 8 * SECOND
+    right, *shifted = (b.motion(begin, end) for b in buffers)
+    for motion in shifted:
+        np.testing.assert_allclose(motion.delta, right.delta, atol=1e-12)
+        np.testing.assert_allclose(motion.cov, right.cov, atol=1e-12)
+    # others look up the pose that has the stamp
+    np.testing.assert_allclose(buffers[1].pose_at(end + delay), buffers[0].pose_at(end))
+    assert buffers[1].newest == buffers[0].newest
+    buffers[1].forget_odometry_after(end + delay)
+    buffers[0].forget_odometry_after(end)
+    assert buffers[1].newest == buffers[0].newest
+
+
+def test_synchronizer_without_frames_has_no_delay():
+    assert Synchronizer(Parameters()).delay.now == 0
