@@ -151,7 +151,10 @@ class Sensors:
         ordered = (queues[k] for k in range(len(self._queues)))
         count = sum(map(len, queues.values()))
         self._missing = [k for k in self._missing if not queues[k]]
-        for item in heapq.merge(*ordered, key=lambda item: _stamp(item[1], self._feed.tf.path)):
+        path = self._feed.tf.path
+        stamped = list(heapq.merge(*ordered, key=lambda item: _stamp(item[1], path)))
+        self.synchronizer.expect(_stamp(msg, path) for _, msg in stamped)
+        for item in stamped:
             self.add(*item)
         return count
 

@@ -272,6 +272,21 @@ def test_wrong_frame_is_counted_and_named(live, node):
     assert "scan in frame 'camera'" in node.sensors.synchronizer.inputs.last_error
 
 
+def test_burst_of_old_messages_beside_new_ones_does_not_restart_the_front_end(live, node):
+    feed(node, 6.0)
+    index = {stream: k for k, (stream, _) in enumerate(node.sensors._queues)}
+    burst: dict[int, list] = {}
+    for stream, msg in room(['/scan', '/odom', '/imu'], seconds=7.0):
+        since = decode.stamp(msg, '') / SECOND - 1.0
+        if 1.0 < since < 4.0 or 6.0 < since < 7.0:
+            burst.setdefault(index[stream], []).append((stream, msg))
+    session = node.control.session.session
+    node.sensors._take(burst)
+    assert node.control.session.session == session
+    assert used(node, 'scan', 'late') > 20
+    assert node.last.stamp / SECOND - 1.0 > 6.5
+
+
 def test_first_refusal_of_a_stream_is_told_on_the_console(live, node, monkeypatch):
     said = []
     monkeypatch.setattr(node.sensors, '_logger', SimpleNamespace(warning=said.append, info=print))

@@ -93,6 +93,18 @@ def test_burst_of_old_messages_is_no_clock_that_was_set_back():
         assert stamps.wrong_after('odom', late, newest + k * STEP) is None
 
 
+def test_old_messages_that_arrived_with_others_on_time_are_no_clock_that_was_set_back():
+    stamps, newest = running()
+    old = [newest - 9 * SECOND + k * STEP for k in range(4 * LASTING // STEP)]
+    stamps.expect([*old, newest + STEP])
+    for stamp in old:
+        assert stamps.wrong_after('odom', stamp, newest) is None
+    # random stamps are not on time
+    stamps.expect([*old, newest + 60 * SECOND, 2**62, 0])
+    with pytest.raises(InputError, match='jumped back'):
+        [stamps.wrong_after('odom', stamp, newest) for stamp in old]
+
+
 def test_one_wrong_stamp_of_a_late_stream_is_no_clock_that_was_set_back():
     """It arrives 2 s behind the others, and one of its messages has a stamp of long ago."""
     stamps, newest = running(200)

@@ -11,7 +11,7 @@ A stamp nearer ahead is accepted at once; it was wrong if two in a row of its so
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import TypeAlias
 
 from rlml_slam.errors import InputError
@@ -50,6 +50,7 @@ class StampCheck:
         self._seen: dict[str, int] = {}  # by stream: the newest stamp, of late messages too
         self._num_back = 0  # of these, the last ones in a row that are behind their stream
         self._back_since = 0  # stamp of the first of these
+        self._goes_on = False  # messages that are on time have arrived as well
         self._held: list[tuple[str, Message]] = []  # messages that are far ahead
         self._held_after = self.newest  # when the last one was held
         self._num_passed = 0  # messages since the newest of these that were not
@@ -135,6 +136,10 @@ class StampCheck:
         self._inputs.count(stream, 'duplicate')
         return True
 
+    def expect(self, stamps: Iterable[int]) -> None:
+        """Stamps [ns] of all that have arrived together, before the first of them is added."""
+        self._goes_on = any(abs(stamp - self.newest) <= MAX_AHEAD for stamp in stamps)
+
     def wrong_after(self, stream: str, stamp: int, last_used: int | None) -> int | None:
         """Time [ns] after which stamps were wrong, if too many messages are far behind; or None.
 
@@ -155,7 +160,8 @@ class StampCheck:
         if self._num_behind < PERSISTENT:
             return None
         if last_used is not None and last_used - stamp > MAX_AHEAD:
-            if self._num_back < PERSISTENT or stamp - self._back_since < LASTING:
+            lasted = self._num_back >= PERSISTENT and stamp - self._back_since >= LASTING
+            if not lasted or self._goes_on:
                 return None
             raise InputError(f'the clock of {stream} jumped back by {behind / SECOND:.1f} s')
         self._num_behind = 0

@@ -11,7 +11,7 @@ the stamps is removed (:mod:`stamp_jitter`); stamps that cannot be right are rej
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -79,6 +79,10 @@ class Synchronizer:
     def set_sensor_pose(self, frame_id: str, T_base_sensor: Array) -> None:
         """Set the pose (3,) of a sensor; without it the parameter ``laser_pose`` is used."""
         self._assembly.set_sensor_pose(frame_id, T_base_sensor)
+
+    def expect(self, stamps: Iterable[int]) -> None:
+        """Stamps [ns] of messages that arrived together; added by stamp, old ones come first."""
+        self._stamps.expect(stamps)
 
     def add_odometry(self, sample: Odometry) -> list[Observation]:
         """Add one sample of the odometry topic."""
