@@ -148,15 +148,13 @@ class Sensors:
         """
         queues = {k: first.get(k, []) + self._taken(k) for k in reversed(range(len(self._queues)))}
         self.arrange([listener.topic_name for _, listener in self._queues])
-        ordered = (queues[k] for k in range(len(self._queues)))
-        count = sum(map(len, queues.values()))
         self._missing = [k for k in self._missing if not queues[k]]
-        path = self._feed.tf.path
-        stamped = list(heapq.merge(*ordered, key=lambda item: _stamp(item[1], path)))
-        self.synchronizer.expect(_stamp(msg, path) for _, msg in stamped)
-        for item in stamped:
+        ordered, path = (queues[k] for k in range(len(self._queues))), self._feed.tf.path
+        items = list(heapq.merge(*ordered, key=lambda item: _stamp(item[1], path)))
+        self.synchronizer.expect(_stamp(msg, path) for _, msg in items)
+        for item in items:
             self.add(*item)
-        return count
+        return len(items)
 
     def flush_if_silent(self) -> None:
         """Where nothing has come for a while: a pose for the scan that waits for odometry."""
@@ -186,14 +184,13 @@ class Sensors:
                 if self._queues[k][0] != 'odom' or not self._feed.tf.path
             ]
             if missing:
-                names = ', '.join(missing) + self._others(self._missing)
-                self._logger.warning(f'waiting for {names}')
+                self._logger.warning(f'waiting for {", ".join(missing)}{self._others()}')
             self._missing = []
 
-    def _others(self, missing: list[int]) -> str:
+    def _others(self) -> str:
         """Other topics of the types that are missing, but for the node's own."""
         own = f'{self._node.get_fully_qualified_name()}/'
-        kinds = {STREAMS[self._queues[k][0]][1]: self._queues[k][0] for k in missing}
+        kinds = {STREAMS[self._queues[k][0]][1]: self._queues[k][0] for k in self._missing}
         known = {subscription.topic_name for _, subscription in self._queues}
         found = [
             f'{topic} ({kinds[t]})'
