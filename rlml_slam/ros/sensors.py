@@ -151,7 +151,7 @@ class Sensors:
         self._missing = [k for k in self._missing if not queues[k]]
         ordered, path = (queues[k] for k in range(len(self._queues))), self._feed.tf.path
         items = list(heapq.merge(*ordered, key=lambda item: _stamp(item[1], path)))
-        self.synchronizer.expect(_stamp(msg, path) for _, msg in items)
+        self.synchronizer.expect((_stamp(msg, path) for _, msg in items), time.monotonic())
         for item in items:
             self.add(*item)
         return len(items)

@@ -93,16 +93,48 @@ def test_burst_of_old_messages_is_no_clock_that_was_set_back():
         assert stamps.wrong_after('odom', late, newest + k * STEP) is None
 
 
+def old_messages(newest):
+    return [newest - 9 * SECOND + k * STEP for k in range(4 * LASTING // STEP)]
+
+
+def arrive(stamps, newest, *others):
+    """Old messages arrive at the pace of their stamps, each one together with others."""
+    for k, stamp in enumerate(old_messages(newest)):
+        stamps.expect([stamp, *others], k * STEP / SECOND)
+        assert stamps.wrong_after('odom', stamp, newest) is None
+
+
 def test_old_messages_that_arrived_with_others_on_time_are_no_clock_that_was_set_back():
     stamps, newest = running()
-    old = [newest - 9 * SECOND + k * STEP for k in range(4 * LASTING // STEP)]
-    stamps.expect([*old, newest + STEP])
-    for stamp in old:
-        assert stamps.wrong_after('odom', stamp, newest) is None
-    # random stamps are not on time
-    stamps.expect([*old, newest + 60 * SECOND, 2**62, 0])
+    arrive(stamps, newest, newest + STEP)
+
+
+def test_random_stamps_beside_a_clock_that_was_set_back_are_not_on_time():
+    stamps, newest = running()
     with pytest.raises(InputError, match='jumped back'):
-        [stamps.wrong_after('odom', stamp, newest) for stamp in old]
+        arrive(stamps, newest, newest + 60 * SECOND, 2**62, 0)
+
+
+@pytest.mark.parametrize('pace', [1.0, 20.0])
+def test_old_messages_that_arrive_all_at_once_are_no_clock_that_was_set_back(pace):
+    stamps = StampCheck(InputCounts())
+    for k in range(1000):
+        stamps.expect([T0 + k * STEP], k * STEP / SECOND / pace)
+        assert stamps.accept('odom', T0 + k * STEP, stamps.newest_of('odom'))
+    newest, now = stamps.newest, 999 * STEP / SECOND / pace
+    for k, stamp in enumerate(old_messages(newest)):
+        stamps.expect([stamp], now + 0.01 * k * STEP / SECOND / pace)
+        assert stamps.wrong_after('odom', stamp, newest) is None
+    stamps.expect([newest + STEP], now + 1.0)
+    stamps.wrong_after('odom', newest + STEP, newest)
+
+    def set_back():
+        for k, stamp in enumerate(old_messages(newest)[:60]):
+            stamps.expect([stamp], now + 2.0 + k * STEP / SECOND / pace)
+            stamps.wrong_after('odom', stamp, newest)
+
+    with pytest.raises(InputError, match='jumped back'):
+        set_back()
 
 
 def test_one_wrong_stamp_of_a_late_stream_is_no_clock_that_was_set_back():

@@ -26,8 +26,11 @@ BACK = SECOND // 10  # [ns] a message farther behind its stream is not of a stre
 CONFIRM = 3  # messages that confirm, or refute, a suspicious stamp
 RECENT = 5  # stamps of a source that are remembered
 PERSISTENT = 10  # messages in a row that are behind: fewer are late, more are of a new clock
-# [ns] from the first to the last of these, or it is the clock of a late burst, not that of all
+# [ns] from the first to the last of these, or it is the clock of a late burst, not that of all;
+# at the pace of all stamps it arrives in BURST of the time or more
 LASTING = SECOND
+BURST = 0.3
+PACE = 2 * SECOND  # over which the pace of the stamps is measured
 
 
 class StampCheck:
@@ -50,7 +53,10 @@ class StampCheck:
         self._seen: dict[str, int] = {}  # by stream: the newest stamp, of late messages too
         self._num_back = 0  # of these, the last ones in a row that are behind their stream
         self._back_since = 0  # stamp of the first of these
+        self._back_at = 0.0  # when it arrived
         self._goes_on = False  # messages that are on time have arrived as well
+        self._now: float | None = None  # when they arrived, if that is known
+        self._pace, self._mark = 1.0, (0, 0.0)  # seconds of stamps in a second; since when
         self._held: list[tuple[str, Message]] = []  # messages that are far ahead
         self._held_after = self.newest  # when the last one was held
         self._num_passed = 0  # messages since the newest of these that were not
@@ -136,9 +142,18 @@ class StampCheck:
         self._inputs.count(stream, 'duplicate')
         return True
 
-    def expect(self, stamps: Iterable[int]) -> None:
-        """Stamps [ns] of all that have arrived together, before the first of them is added."""
+    def expect(self, stamps: Iterable[int], now: float) -> None:
+        """Messages with these stamps [ns] arrived together, at ``now`` [s] of a steady clock.
+
+        Without it, all that is known of a message is its stamp, as in a replay.
+        """
+        self._now = now
         self._goes_on = any(abs(stamp - self.newest) <= MAX_AHEAD for stamp in stamps)
+        (stamp, then), newest = self._mark, self.newest
+        if self.first is not None and not stamp <= newest < stamp + PACE:
+            if stamp:
+                self._pace = max((newest - stamp) / SECOND / max(now - then, 1e-3), 1.0)
+            self._mark = newest, now
 
     def wrong_after(self, stream: str, stamp: int, last_used: int | None) -> int | None:
         """Time [ns] after which stamps were wrong, if too many messages are far behind; or None.
@@ -156,16 +171,22 @@ class StampCheck:
         went_back = seen - stamp > BACK
         self._num_back = self._num_back + 1 if went_back else 0
         if self._num_back == 1:
-            self._back_since = stamp
+            self._back_since, self._back_at = stamp, self._now or 0.0
         if self._num_behind < PERSISTENT:
             return None
         if last_used is not None and last_used - stamp > MAX_AHEAD:
             lasted = self._num_back >= PERSISTENT and stamp - self._back_since >= LASTING
-            if not lasted or self._goes_on:
+            if not lasted or self._goes_on or self._is_burst():
                 return None
             raise InputError(f'the clock of {stream} jumped back by {behind / SECOND:.1f} s')
         self._num_behind = 0
         return stamp + MAX_AHEAD
+
+    def _is_burst(self) -> bool:
+        """Whether what is behind arrived faster than its stamps say, compared with all others."""
+        if self._now is None:
+            return False
+        return (self._now - self._back_at) * self._pace * SECOND < BURST * LASTING
 
     def early_after(self, stream: str, stamp: int, source: str) -> int | None:
         """Time [ns] after which the newest stamps of a source were wrong, or None.

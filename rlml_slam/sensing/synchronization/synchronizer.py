@@ -80,9 +80,9 @@ class Synchronizer:
         """Set the pose (3,) of a sensor; without it the parameter ``laser_pose`` is used."""
         self._assembly.set_sensor_pose(frame_id, T_base_sensor)
 
-    def expect(self, stamps: Iterable[int]) -> None:
-        """Stamps [ns] of messages that arrived together; added by stamp, old ones come first."""
-        self._stamps.expect(stamps)
+    def expect(self, stamps: Iterable[int], now: float) -> None:
+        """Messages with these stamps [ns] arrived together, at ``now`` [s] of a steady clock."""
+        self._stamps.expect(stamps, now)
 
     def add_odometry(self, sample: Odometry) -> list[Observation]:
         """Add one sample of the odometry topic."""
