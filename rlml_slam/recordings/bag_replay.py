@@ -98,8 +98,8 @@ def replay(
         if detected and 'reflectors' not in result.topics:
             result.topics['reflectors'] = f'intensities of the scans: {detected}'
             result.inputs['reflectors'] = {'used': slam.synchronizer.reflectors.num_scans}
-        if late := slam.synchronizer.delay.now:
-            result.topics['odom'] += f', stamped late by {late * 1e-9:.2f} s'
+        if slam.synchronizer.delay.now:
+            result.topics['odom'] += f', stamped {slam.synchronizer.delay}'
         if recording is not None:
             recording.add(bag.end, frames, slam)
             recording.finish(slam, run_errors(result))

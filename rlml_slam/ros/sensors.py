@@ -336,7 +336,7 @@ def input_figures(synchronizer: Synchronizer) -> dict[str, object]:
     if odometry.source:
         out['odometry is read from'] = '/tf' if odometry.source == TF else 'its topic'
     if synchronizer.delay.now:
-        out['odometry is stamped late by'] = f'{synchronizer.delay.now * 1e-9:.2f} s'
+        out['odometry is stamped'] = str(synchronizer.delay)
     apart = str(odometry.comparison)
     if apart:
         out['odometry topic against /tf'] = apart

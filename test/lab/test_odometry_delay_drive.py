@@ -33,6 +33,41 @@ def worst(given, estimate):
     return distances[len(distances) // 2 :].max()
 
 
+class Watched(Slam):
+    """Remembers the observations."""
+
+    def __init__(self, params):
+        super().__init__(params)
+        self.seen = []
+
+    def process(self, observations):
+        observations = list(observations)
+        self.seen += observations
+        return super().process(observations)
+
+
+def driven_live(given, delay):
+    """The system as it is on a robot, where nothing waits longer than ``odom_timeout``."""
+    slam = Watched(replace(Parameters(), node=Node(use_imu=False, use_reflectors=False)))
+    for message in late(delay)(given.messages, np.random.default_rng(0)):
+        feed_one(slam, message)
+    return slam
+
+
+def test_early_odometry_has_a_pose_at_every_scan(hall):
+    slam = driven_live(hall, -0.2)
+    assert abs(slam.synchronizer.delay.now / SECOND + 0.2) < 0.025
+    missing = [o.odom_pose is None for o in slam.seen]
+    assert len(missing) > 1000
+    assert sum(missing) <= 3
+
+
+def test_scans_do_not_wait_in_vain_for_odometry_that_is_too_late(hall):
+    slam = driven_live(hall, 0.3)
+    assert slam.synchronizer.delay.now / SECOND > 0.25
+    assert slam.counts['scan'].get('waited_out', 0) < 30
+
+
 def test_delay_of_a_drive_is_found(hall):
     slam = Slam(patient(Parameters()))
     for message in late(DELAY)(hall.messages, np.random.default_rng(0)):

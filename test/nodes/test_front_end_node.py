@@ -284,6 +284,7 @@ def test_burst_of_old_messages_beside_new_ones_does_not_restart_the_front_end(li
     node.sensors._take(burst)
     assert node.control.session.session == session
     assert used(node, 'scan', 'late') > 20
+    assert node.sensors.synchronizer.delay._poses  # the poses of the node get there
     assert node.last.stamp / SECOND - 1.0 > 6.5
 
 

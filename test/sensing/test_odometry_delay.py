@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from rlml_slam.motion import SECOND, MotionBuffer
-from rlml_slam.params import MotionNoise, Parameters
+from rlml_slam.params import MotionNoise
 from rlml_slam.sensing.synchronization.odometry_delay import OdometryDelay
-from rlml_slam.sensing.synchronization.synchronizer import Synchronizer
 from rlml_slam.types import Odometry
 
 START = 1_700_000_000 * SECOND
@@ -18,7 +17,7 @@ def heading(t):
     return 0.8 * np.sin(0.9 * t) + 0.3 * np.sin(2.3 * t + 1.0)
 
 
-def drive(delay, seconds=120.0, scale=1.0, noise=0.003, slips=0.0, seed=0):
+def drive(delay, seconds=120.0, scale=1.0, noise=0.003, slips=0.0, seed=0, course=heading):
     """Odometry at 20 Hz stamped ``delay`` [s] late, poses at 5 Hz; the delays [ns] found."""
     rng = np.random.default_rng(seed)
     found, slipped = OdometryDelay(), 0.0
@@ -29,9 +28,9 @@ def drive(delay, seconds=120.0, scale=1.0, noise=0.003, slips=0.0, seed=0):
         at = START + round(stamp * SECOND)
         if kind == 'odometry':
             slipped += 0.1 * (rng.random() < slips)
-            found.add_odometry(at, scale * heading(t) + slipped + noise * rng.standard_normal())
+            found.add_odometry(at, scale * course(t) + slipped + noise * rng.standard_normal())
         else:
-            found.add_pose(at, heading(t) + noise * rng.standard_normal())
+            found.add_pose(at, course(t) + noise * rng.standard_normal())
         said.append(found.now)
     return np.array(said)
 
@@ -53,22 +52,51 @@ def test_delay_is_found_where_wheels_slip():
     assert abs(drive(0.1, scale=0.95, slips=0.01)[-1] / SECOND - 0.1) < 0.016
 
 
-def test_straight_driving_says_nothing():
+def standing(t):
+    return 0.0 * t
+
+
+def in_aisles(t):
+    """Of a vehicle that drives straight for 17 s and turns by 90 degrees in 3 s."""
+    k = np.floor(t / 20.0)
+    share = np.clip((t - 20.0 * k) / 3.0, 0.0, 1.0)
+    return 0.5 * np.pi * (k + share**2 * (3.0 - 2.0 * share))
+
+
+@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('noise', [0.001, 0.003])
+def test_noise_of_a_robot_that_stands_is_no_delay(noise, seed):
+    assert not drive(0.0, 300.0, noise=noise, seed=seed, course=standing).any()
+
+
+@pytest.mark.parametrize('delay', [0.0, 0.15, -0.1])
+@pytest.mark.parametrize('seed', range(3))
+def test_few_turns_are_enough(delay, seed):
+    said = drive(delay, 600.0, noise=0.001, seed=seed, course=in_aisles)
+    assert abs(said[-1] / SECOND - delay) < 0.016
+
+
+def test_poses_that_pause_cost_no_memory_and_turns_across_the_pause_do_not_count():
     found = OdometryDelay()
-    for k in range(2000):
-        found.add_odometry(START + k * SECOND // 20 + SECOND // 10, 0.3)
-        found.add_pose(START + k * SECOND // 20, 0.3)
+    found.add_pose(START, 0.0)
+    for k in range(20_000):
+        found.add_odometry(START + k * SECOND // 100, 0.01 * (k % 300))
+    assert len(found._odometry) < 600
+    for k in range(500):
+        found.add_pose(START + 100 * SECOND + k * SECOND // 5, 1.0 * k)
     assert found.now == 0
 
 
-def test_clock_that_is_set_back_begins_again_and_keeps_the_delay():
+def test_stamps_that_go_back_are_not_compared_with_those_before():
     found = OdometryDelay()
+    late = 0.1
     for begin in (START, START - 100 * SECOND):
-        for k in range(600):
+        for k in range(900):
             t = 0.1 * k
-            found.add_odometry(begin + round((t + 0.1) * SECOND), heading(t))
+            found.add_odometry(begin + round((t + late) * SECOND), heading(t))
             found.add_pose(begin + round(t * SECOND), heading(t))
-        assert abs(found.now / SECOND - 0.1) < 0.011
+        assert abs(found.now / SECOND - late) < 0.011
+    assert str(found) == 'late by 0.10 s'
 
 
 def test_motion_is_that_of_odometry_stamped_right():
@@ -94,7 +122,3 @@ def test_motion_is_that_of_odometry_stamped_right():
     buffers[1].forget_odometry_after(end + delay)
     buffers[0].forget_odometry_after(end)
     assert buffers[1].newest == buffers[0].newest
-
-
-def test_synchronizer_without_frames_has_no_delay():
-    assert Synchronizer(Parameters()).delay.now == 0

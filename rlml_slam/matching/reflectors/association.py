@@ -160,8 +160,11 @@ class Associator:
 
 def _nearest(cost: Array, compatible: NDArray[np.bool_]) -> tuple[Indices, Indices]:
     """The one-to-one assignment of least cost inside the gates, most matches first."""
+    some, known = np.flatnonzero(compatible.any(axis=1)), np.flatnonzero(compatible.any(axis=0))
+    cost, fits = cost[np.ix_(some, known)], compatible[np.ix_(some, known)]
     # scipy.optimize does the same for 9 MB more; weights of zero would be no edges here
-    weights = csr_array(np.where(compatible, 1.0 + cost - cost.min(initial=0.0), 1e6))
-    rows, cols = min_weight_full_bipartite_matching(weights)
+    weights = np.where(fits, 1.0 + cost - cost.min(initial=np.inf, where=fits), 1e6)
+    rows, cols = min_weight_full_bipartite_matching(csr_array(weights))
+    rows, cols = some[rows], known[cols]
     keep = compatible[rows, cols]
     return rows[keep], cols[keep]

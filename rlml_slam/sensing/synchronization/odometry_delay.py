@@ -16,11 +16,13 @@ from rlml_slam import se2
 from rlml_slam.motion import SECOND
 
 GRID = np.arange(-30, 31) * (SECOND // 100)  # [ns] delays that are compared
+SHORTEST, LONGEST = 150_000_000, SECOND  # [ns] between two poses
 LIMIT = 0.05  # [rad] what a difference counts at most: a wrong pose, wheels that slip
-TELLING = 0.003  # [rad] by which the differences of a turn that counts vary over the grid
+TELLING = 0.03  # [rad] by which a turn that counts varies over the grid: noise is less
 MEMORY = 300  # turns after which one counts for 1 / e
-ENOUGH = 100  # turns before anything is said
+ENOUGH = 40  # turns before anything is said
 SURE = 0.7  # of the sum at the present delay: at a better one, it is at most that
+KEPT = 5 * SECOND  # [ns] of odometry, where no poses come
 
 
 class OdometryDelay:
@@ -30,7 +32,10 @@ class OdometryDelay:
         self.now = 0
         self._odometry: deque[tuple[int, float]] = deque()  # stamp [ns], heading without wraps
         self._poses: deque[tuple[int, float]] = deque(maxlen=100)
-        self._sums, self._num = np.zeros(len(GRID)), 0.0
+        self._sums, self._num = np.zeros(len(GRID)), 0.0  # over the turns, by delay
+
+    def __str__(self) -> str:
+        return f'{"late" if self.now > 0 else "early"} by {abs(self.now) / SECOND:.2f} s'
 
     def add_odometry(self, stamp: int, heading: float) -> None:
         """One sample: its stamp [ns] as it came, and its heading [rad]."""
@@ -39,28 +44,29 @@ class OdometryDelay:
             self._poses.clear()
         last = self._odometry[-1][1] if self._odometry else heading
         self._odometry.append((stamp, last + se2.wrapped(heading - last)))
-        oldest = (self._poses[0][0] if self._poses else stamp) + GRID[0]
+        oldest = max((self._poses[0][0] if self._poses else stamp) + GRID[0], stamp - KEPT)
         while len(self._odometry) > 2 and self._odometry[1][0] < oldest:
             self._odometry.popleft()
 
     def add_pose(self, stamp: int, heading: float) -> None:
         """One pose of the scans at a stamp [ns]; compared when odometry is there."""
+        if self._poses and 0 <= stamp - self._poses[-1][0] < SHORTEST:
+            return
         self._poses.append((stamp, heading))
-        while len(self._poses) > 1 and self._is_covered(self._poses[1][0]):
+        while len(self._poses) > 1 and self._odometry and self._is_reached(self._poses[1][0]):
             (start, before), (end, after) = self._poses.popleft(), self._poses[0]
-            if 0 < end - start < SECOND:
+            if 0 < end - start < LONGEST and self._odometry[0][0] <= start + GRID[0]:
                 self._compare(start, end, after - before)
 
-    def _is_covered(self, stamp: int) -> bool:
-        return bool(self._odometry) and self._odometry[-1][0] >= stamp + GRID[-1]
+    def _is_reached(self, stamp: int) -> bool:
+        return self._odometry[-1][0] >= stamp + int(GRID[-1])
 
     def _compare(self, start: int, end: int, turn: float) -> None:
         stamps, headings = np.array(self._odometry).T
-        at_start, at_end = (np.interp(GRID + t, stamps, headings) for t in (start, end))
-        error = se2.wrap(turn - (at_end - at_start))
-        cost = np.minimum(error**2, LIMIT**2)
-        if np.ptp(cost) < TELLING**2:
+        turns = np.interp(GRID + end, stamps, headings) - np.interp(GRID + start, stamps, headings)
+        if np.ptp(turns) < TELLING:
             return
+        cost = np.minimum(se2.wrap(turn - turns) ** 2, LIMIT**2)
         keep = 1.0 - 1.0 / MEMORY
         self._sums, self._num = keep * self._sums + cost, keep * self._num + 1.0
         best = int(np.argmin(self._sums))

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from rlml_slam.motion import MotionBuffer
+from rlml_slam.motion import SECOND, MotionBuffer
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.deskew import sweep_time
@@ -35,6 +35,7 @@ from rlml_slam.types import Detections, Frame, Imu, Observation, Odometry, Scan
 MEASURED = ('scan', 'reflectors')  # streams that give observations
 LARGEST_VIEW = 2.2 * math.pi  # [rad] some drivers repeat beams at the end of a turn
 FINEST = 1e-5  # [rad] between beams: the finest lidars have twenty times that
+WAITED = 0.75  # share of ``odom_timeout`` by which odometry is corrected at most
 MAX_SWEEP = 1.0  # [s] of one scan; all later inputs would wait for the odometry at its end
 
 
@@ -55,6 +56,8 @@ class Synchronizer:
         n = self._node
         self.odometry = OdometrySources(n.odom_source, n.tf_buffer_duration)
         self.delay = OdometryDelay()
+        # scans would wait for later odometry in vain
+        self._longest_delay = int(WAITED * self._node.odom_timeout * SECOND)
         self._assembly = ObservationAssembly(params, self.inputs, self.odometry.transforms)
         self._no_returns = NoReturnRanges()
         self._kinds = {stream: SensorKinds() for stream in MEASURED}
@@ -102,7 +105,10 @@ class Synchronizer:
         valid = np.shape(sample.pose) == (3,) and all(map(math.isfinite, sample.pose))
         if not self._accept(source, sample.stamp, valid, 'pose is not finite'):
             return self._release()
-        used = self.odometry.use(source, sample)
+        last, used = self.odometry.source, self.odometry.use(source, sample)
+        if last and last != self.odometry.source:  # another driver, another delay
+            self.delay = OdometryDelay()
+            self.buffer.set_odometry_delay(0)
         if used is None or not self._node.use_odom:
             self.inputs.count(TOPIC, 'compared')
             return self._release()
@@ -163,7 +169,7 @@ class Synchronizer:
         before = self.delay.now
         self.delay.add_pose(frame.stamp, frame.T_local_base[2])
         if self.delay.now != before:
-            self.buffer.set_odometry_delay(self.delay.now)
+            self.buffer.set_odometry_delay(min(self.delay.now, self._longest_delay))
 
     def flush(self) -> list[Observation]:
         """Observations of all that still waits, at the end of the data."""
@@ -241,7 +247,10 @@ class Synchronizer:
         out = []
         for stream, message in self._stamps.release_held(1 if flush else CONFIRM):
             out += self._add[stream](message)
-        while group := self._queue.pop(self.odometry.newest(self.buffer.newest), flush):
+        newest = self.buffer.newest
+        if newest is not None:  # others look up the odometry that has the stamp of the scan
+            newest += min(self.delay.now, 0)
+        while group := self._queue.pop(self.odometry.newest(newest), flush):
             stamp = group[0].stamp
             if self._assembly.is_in_gap(stamp):
                 self.inputs.count(group[0].stream, 'in_gap')
