@@ -202,7 +202,7 @@ def save_map(folder: Path) -> int:
 def check(scenario: Scenario, outcome: Outcome, saved_keyframes: int) -> None:
     """Hold an outcome against the expectations."""
     s, o = scenario, outcome
-    assert tuple(o.decisions) == s.decisions
+    assert tuple(o.decisions) == s.decisions, o.decisions
     tail = o.frames[-10:]
     assert tail[-1][0] >= len(s.poses) - 3
     true = se2.compose(s.T_map_world, np.array([s.poses[k] for k, _, _ in tail]))

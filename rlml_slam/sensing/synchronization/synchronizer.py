@@ -113,8 +113,11 @@ class Synchronizer:
             self.inputs.count(TOPIC, 'compared')
             return self._release()
         sample = used if stamp == used.stamp else Odometry(stamp, used.pose)
-        self.delay.add_odometry(stamp, sample.pose[2])
-        self.inputs.count(TOPIC, 'used' if self.buffer.add_odometry(sample) else 'jump')
+        if self.buffer.add_odometry(sample):
+            self.inputs.count(TOPIC, 'used')
+            self.delay.add_odometry(stamp, sample.pose[2])
+        else:
+            self.inputs.count(TOPIC, 'jump')
         if not len(self._queue):
             self._assembly.carry(stamp)
         return self._release()
