@@ -63,6 +63,10 @@ COMMANDS: Table = {
                 'rlml_lab.studies.study_relocalization',
                 'whether reflectors alone give the pose, and whether the answer is right',
             ),
+            'building': Command(
+                'rlml_lab.studies.study_building',
+                'large loops in made buildings, and whether each closure is right',
+            ),
             'lego': Command(
                 'rlml_lab.lego.study_lego',
                 'spikes and EKF on the LEGO robot among cylinders: figures and a picture',

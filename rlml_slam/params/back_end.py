@@ -46,7 +46,7 @@ class BackEnd(Group):
         5, 'keyframes between two optimizations when there is no closure', '', 1, 1000
     )
     odometry_robust_scale: float = param(
-        3.0, 'Cauchy scale of odometry edges, in sigmas', '', 0.5, 1e3
+        3.0, 'Huber scale of odometry edges, in sigmas', '', 0.5, 1e3
     )
     closure_robust_scale: float = param(
         2.0, 'Huber scale of loop closures, in sigmas', '', 0.5, 1e3

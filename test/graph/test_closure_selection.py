@@ -141,6 +141,39 @@ def test_a_wrong_group_that_agrees_is_refused():
     assert_allclose(graph.poses, best, atol=1e-6)
 
 
+@pytest.mark.parametrize('kind', [LossKind.CAUCHY, LossKind.HUBER])
+@pytest.mark.parametrize('count', [1, 2, 3])
+def test_wrong_closures_that_tear_robust_odometry_apart_are_refused(kind, count):
+    # at the end of a long loop, a few poses are said to be beside their way, by a corridor, which
+    # the drift allows; then right closures follow. With a robust loss, the odometry into and out
+    # of these pays less than closures do, and all closures fit
+    rng, n = np.random.default_rng(0), 400
+    phi = 2.0 * np.pi * np.arange(n + 60) / n
+    truth = np.stack([30 * np.cos(phi), 30 * np.sin(phi), se2.wrap(phi + np.pi / 2)], -1)
+    losses = Losses(odometry=Loss(kind, 3.0), closure=Loss(LossKind.HUBER, 2.0))
+    graph = Graph(losses)
+    graph.add_poses(truth)
+    graph.fixed_poses[0] = True
+
+    def edge(edge_kind, i, j, sigma, aside=0.0):
+        noisy = se2.compose(se2.between(truth[i], truth[j]), sigma * rng.standard_normal(3))
+        delta = se2.compose(noisy, np.array([0.0, aside, 0.0]))
+        return graph.add_edge(edge_kind, i, j, delta, np.diag(sigma**-2.0))
+
+    for k in range(n + 59):
+        edge(EdgeKind.ODOMETRY, k, k + 1, np.array([0.003, 0.003, 0.002]))
+    tight = np.array([0.01, 0.01, 0.004])
+    first = n + 2
+    wrong = [
+        edge(EdgeKind.CLOSURE, first - n + 3 * k, first + 3 * k, tight, 2.4) for k in range(count)
+    ]
+    for k in range(first + 3 * count + 4, n + 60, 3):
+        edge(EdgeKind.CLOSURE, k - n, k, tight)
+    chosen = select_closures(graph, EXACT)
+    assert_array_equal(chosen.edges[~chosen.accepted], wrong)
+    assert graph.losses is losses
+
+
 def test_selection_does_not_depend_on_where_the_map_lies_nor_on_the_start():
     one, other = laps(), laps(turned=2.0)
     for graph in (one, other):

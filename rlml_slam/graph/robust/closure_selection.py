@@ -65,13 +65,15 @@ class Selection:
 def select_closures(
     graph: Graph, parameters: params.Solver | None = None, excluded: Ints | None = None
 ) -> Selection:
-    """Enable the consistent closures and disable all others; the estimate is the optimum then.
+    """Enable the consistent closures and disable all others.
 
-    The edges ``excluded`` stay disabled in any case. All other factors are trusted. Raises
+    The edges ``excluded`` stay disabled in any case. All other factors are trusted: odometry and
+    scan edges have no robust loss here, and the estimate is the optimum of that. Raises
     SolverError like ``optimize``.
     """
     losses = graph.losses
-    graph.losses = replace(losses, closure=Loss())
+    # a robust loss would let a wrong closure tear the way apart, and then all would fit
+    graph.losses = replace(losses, closure=Loss(), odometry=Loss(), scan=Loss())
     try:
         return _Selector(graph, parameters or params.Solver(), excluded).run()
     finally:

@@ -314,8 +314,12 @@ class BackEnd:
 
 
 def _losses(p: Parameters) -> Losses:
-    """Robust losses; the front end's own motion, without wheels that may slip, has none."""
-    odometry = Loss(LossKind.CAUCHY, p.back_end.odometry_robust_scale)
+    """Robust losses; the front end's own motion, without wheels that may slip, has none.
+
+    The pull of odometry does not fade with its error: else one wrong closure could take a keyframe
+    anywhere.
+    """
+    odometry = Loss(LossKind.HUBER, p.back_end.odometry_robust_scale)
     return Losses(
         odometry=odometry if p.node.use_odom else Loss(),
         closure=Loss(LossKind.HUBER, p.back_end.closure_robust_scale),

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scan match of a keyframe with a finished submap: branch and bound, refinement, verification.
 
-Verified by the score, by the ratio of the second-best score to the best one, and by the
-covariance: a scan has to constrain its pose in all directions. Where the drift is large, weak
+Verified by the score, for which end points behind walls fit nothing, by the ratio of the
+second-best score to the best one, and by the covariance: a scan has to constrain its pose in all
+directions. Where the drift is large, weak
 matches are searched for as well (weak_match.py).
 """
 
@@ -19,7 +20,8 @@ from rlml_slam.matching.scans import scan_information
 from rlml_slam.matching.scans.branch_and_bound import Criteria, WideResult, Window, wide
 from rlml_slam.matching.scans.scan_match import linearize, match
 from rlml_slam.matching.scans.search_pyramid import Pyramid
-from rlml_slam.matching.scans.submap import Submap
+from rlml_slam.matching.scans.submap import P_MIN, Submap
+from rlml_slam.matching.scans.visibility import hidden_share
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.closure_candidates import Candidate
@@ -38,7 +40,8 @@ MAX_LOOKUPS = 5_000_000  # of a search for weak matches, which prunes less
 SEARCH_SIGMA = np.array([0.5, 0.5, 0.2])  # [m, m, rad] prior of the refinement at the best cell
 
 AMBIGUOUS, DEGENERATE = 'a second pose fits as well', 'the scan does not constrain one direction'
-UNDECIDED = (AMBIGUOUS, DEGENERATE)  # such a match contradicts nothing
+HIDDEN = 'walls of the submap hide what the scan sees'
+UNDECIDED = (AMBIGUOUS, DEGENERATE, HIDDEN)  # such a match contradicts nothing
 
 
 @dataclass(frozen=True)
@@ -129,20 +132,25 @@ class ClosureMatcher:
             return rejected(AMBIGUOUS, result.best.score, result.best.pose, result.second.pose)
         prior = np.diag(1.0 / SEARCH_SIGMA**2)
         found = match(submap, points, result.best.pose, prior, self._p.scan_match, searched=False)
-        if found.score < p.min_score * (1.0 if surroundings is None else WEAK_SHARE):
+        least = p.min_score * (1.0 if surroundings is None else WEAK_SHARE)
+        if found.score < least:
             return rejected('the score after refinement is too low', found.score)
+        assert key.origin is not None
+        hidden = hidden_share(submap, points, key.origin, found.pose)
+        seen = found.score - hidden * (found.score - P_MIN)  # eq. 63
+        if seen < least:
+            return rejected(HIDDEN, seen)
         information = scan_information.information(submap, points, found.pose, self._p.scan_match)
         if _largest_variance(information) > MAX_SIGMA**2:
-            return rejected(DEGENERATE, found.score, found.pose)
+            return rejected(DEGENERATE, seen, found.pose)
         term = linearize(submap, points, found.pose)
         second = math.nan if result.second is None else result.second.score / result.best.score
         overlap = term.inliers / max(term.count, 1)
-        assert key.origin is not None
         view_range = float(np.median(np.hypot(*(points - key.origin).T)))
-        log_odds = self._log_odds(min(result.best.score, found.score))
+        log_odds = self._log_odds(min(result.best.score, seen))
         wide = candidate.search_area > p.searched
         fit = Match(
-            m, key, found.pose, information, found.score, overlap, second, candidate.search_area,
+            m, key, found.pose, information, seen, overlap, second, candidate.search_area,
             log_odds, view_range=view_range, weak=log_odds < 0.0, wide=wide,
         )  # fmt: skip
         return SearchResult(candidate, fit, found.pose[None])

@@ -3,7 +3,8 @@
 
 A closure whose residual is more likely under the density of wrong matches than under that of
 correct ones triggers a selection among all closures (graph/robust/closure_selection.py): those
-consistent with odometry and with each other stay enabled, the others are disabled.
+consistent with odometry and with each other stay enabled, and those that fit the robust estimate;
+the others are disabled.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.closure_records import ClosureRecords
 from rlml_slam.slam.closures.loop_closure import Closure, ClosureStatus, State
 
-# a selection takes as long as many solves: before the next one, the graph grows by this factor
+# a selection takes as long as many solves: before the next one, the poses or the closures of the
+# graph grow by this factor
 GROWTH = 1.5
 MAJORITY = 0.9  # share of all closures that must be correct for a selection to be applied
 WEIGHT_STEP = 0.05  # smallest change of a weight that is recorded
@@ -41,7 +43,7 @@ class ClosureMonitor:
         self._p = params
         self._graph = graph
         self._wrong = uniform(params.loop_closure.searched)
-        self._poses_at_selection = 0
+        self._size_at_selection = np.zeros(2)
 
     def needs_selection(self, closures: ClosureRecords, final: bool = False) -> bool:
         """Record residuals and weights; whether an active closure is more likely wrong.
@@ -52,10 +54,10 @@ class ClosureMonitor:
         if not len(edges):
             return False
         is_wrong = self._record(edges, closures.statuses)
-        poses = len(self._graph.poses)
-        if not is_wrong or not (final or poses >= GROWTH * self._poses_at_selection):
+        size = np.array([len(self._graph.poses), len(edges)])
+        if not is_wrong or not (final or (size >= GROWTH * self._size_at_selection).any()):
             return False
-        self._poses_at_selection = poses
+        self._size_at_selection = size
         return True
 
     def select(self, closures: ClosureRecords) -> dict[int, bool]:
@@ -66,6 +68,7 @@ class ClosureMonitor:
         accepted = closures.accepted()
         revoked = [c.edge for c in accepted if c.status.state is State.REVOKED]
         before = self._graph.edges.enabled.copy()
+        fitting = self._fitting(closures.edges)
         chosen = select_closures(self._graph, self._p.solver, np.array(revoked, np.int64))
         # a closure that is neither confirmed nor refuted stays: it was verified when it was made
         good = chosen.accepted | (chosen.evidence > 0.0)
@@ -73,6 +76,8 @@ class ClosureMonitor:
         if np.sum(good) < MAJORITY * np.sum(~is_revoked):
             # so many verified matches are not wrong: the odometry is, and nothing is changed
             good = before[chosen.edges]
+        # one that fits the robust estimate as well: a selection trusts odometry, which may slip
+        good |= np.isin(chosen.edges, fitting)
         good[is_revoked] = False
         self._graph.edges.enabled[chosen.edges] = good
         return dict(zip(chosen.edges.tolist(), good.tolist(), strict=True))
@@ -107,9 +112,7 @@ class ClosureMonitor:
     def _record(self, edges: NDArray[np.int64], statuses: Sequence[ClosureStatus]) -> bool:
         """Record residuals and weights; whether any enabled one is more likely wrong."""
         graph = self._graph
-        i, j = graph.edges.nodes[edges].T
-        e = relative_pose(graph.poses[i], graph.poses[j], graph.edges.measured[edges])[0]
-        information = graph.edges.information[edges]
+        e, information = self._errors(edges)
         s, on = chi2(e, information), graph.edges.enabled[edges]
         loss = graph.losses.closure
         w = np.where(on, loss_weights(int(loss.kind), loss.scale, s), 0.0)
@@ -120,6 +123,16 @@ class ClosureMonitor:
         for status, residual in zip(statuses, s.tolist(), strict=True):
             status.residual = residual
         return bool((on & (self._evidence(e, information) < 0.0)).any())
+
+    def _errors(self, edges: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Residuals (k, 3) of the estimate as it is, and their information (k, 3, 3)."""
+        poses, e = self._graph.poses, self._graph.edges
+        i, j = e.nodes[edges].T
+        return relative_pose(poses[i], poses[j], e.measured[edges])[0], e.information[edges]
+
+    def _fitting(self, edges: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Those that are rather right by their residuals."""
+        return edges[self._evidence(*self._errors(edges)) >= 0.0]
 
     def _evidence(self, e: Array, information: Array) -> Array:
         """Log likelihood ratio (k,) of correct to wrong."""

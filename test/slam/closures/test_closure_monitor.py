@@ -13,12 +13,14 @@ from rlml_slam import se2
 from rlml_slam.cli import closures as command
 from rlml_slam.cli.main import main
 from rlml_slam.errors import InputError, MapError, SolverError
+from rlml_slam.graph import loss_weights
 from rlml_slam.graph.batch.solver import optimize
 from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.factors import Losses
 from rlml_slam.graph.model.graph import Graph, Renumbering
 from rlml_slam.graph.model.robust_loss import Loss, LossKind
 from rlml_slam.params import Parameters
+from rlml_slam.slam.back_end.back_end import _losses as back_end_losses
 from rlml_slam.slam.closures import closure_records
 from rlml_slam.slam.closures.closure_monitor import ClosureMonitor
 from rlml_slam.slam.closures.closure_records import ClosureRecords
@@ -140,6 +142,41 @@ def test_doubts_are_put_off_until_the_graph_has_grown_or_ends(drive):
     last = drive.close(5, 100, np.zeros(3))
     assert drive.solve() == ()
     assert drive.solve(final=True) == (last,)
+
+
+def test_doubts_are_heard_as_soon_as_there_are_more_closures(drive):
+    drive.close(10, 70, np.zeros(3))
+    assert len(drive.solve()) == 1
+    later = drive.close(15, 75, np.zeros(3))
+    for k in range(len(drive.closures) // 2):  # no pose is new
+        drive.close(20 + k, 60 + k)
+    assert drive.solve() == (later,)
+
+
+def test_no_pull_of_odometry_fades_with_its_error():
+    """Else one wrong closure takes its keyframe anywhere, and then fits."""
+    losses = back_end_losses(Parameters())
+
+    def pull(loss, sigmas):
+        return float(loss_weights(int(loss.kind), loss.scale, np.array([sigmas**2]))[0]) * sigmas
+
+    assert pull(losses.odometry, 1e3) >= pull(losses.odometry, 10.0) > 0.0
+    # a wrong closure has to tear two edges, into a keyframe and out of it
+    assert 2.0 * pull(losses.odometry, 1e3) > pull(losses.closure, 1e3)
+
+
+@pytest.mark.parametrize('slip', [(1.5, 0.0, 0.0), (0.0, 0.0, 0.4)])
+def test_closures_after_wheels_have_slipped_stay(slip):
+    """Odometry contradicts them, and a selection trusts it; but they fit the robust estimate."""
+    drive = Drive()
+    drive.graph.losses = back_end_losses(Parameters())
+    drive.drive(4 * PER_LAP - 10)
+    k = drive.graph.add_pose(drive.true(4 * PER_LAP - 10))
+    step = se2.between(drive.true(k - 1), drive.true(k))
+    drive.edge(EdgeKind.ODOMETRY, k - 1, k, se2.compose(step, np.array(slip)))
+    drive.drive(9)
+    wrong = drive.close(10, 70, np.zeros(3))
+    assert drive.solve() == (wrong,)
 
 
 def test_a_disabled_closure_comes_back_when_it_is_judged_right(drive):

@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loops in a made building are closed rightly, and the table says so."""
+
+import argparse
+
+import numpy as np
+
+from rlml_lab.studies import study_building as study
+from rlml_slam import se2
+
+
+def test_route_is_one_that_a_robot_can_drive():
+    poses = study.route(60.0, 0.5)
+    steps = se2.between(poses[:-1], poses[1:])
+    assert np.isfinite(poses).all()
+    assert np.hypot(steps[:, 0], steps[:, 1]).max() < 1.1 * 0.5 * study.SPEED
+    assert np.abs(steps[:, 2]).max() < 1.1 * 0.5 * study.TURN
+
+
+def test_odometry_without_errors_is_the_way():
+    poses = study.route(40.0, 0.5)
+    odometry = study.odometry_of(poses, 0.0, np.random.default_rng(0))
+    assert np.abs(se2.between(se2.compose(poses[0], odometry), poses)).max() < 1e-9
+
+
+def test_closures_of_a_building_are_right(capsys):
+    args = argparse.Namespace(size=40.0, rate=2.0, poor=1.0, seeds=1, first=0)
+    assert study.run(args) == 0
+    header, row = capsys.readouterr().out.splitlines()
+    assert 'enabled wrong' in header
+    _, scans, odometry, _, rms, _, right, wrong, enabled, ok_and_wrong, _ = row.split()
+    assert int(scans) == len(study.route(40.0, 0.5))
+    assert float(rms) < 0.1 < float(odometry)
+    assert int(right) > 10
+    assert (wrong, enabled, ok_and_wrong) == ('0', '0', '0.00%')

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scan that fits a submap only through its walls closes no loop."""
+
+import numpy as np
+import pytest
+
+from rlml_slam import se2
+from rlml_slam.matching.scans.submap import Submap
+from rlml_slam.params import Parameters
+from rlml_slam.simulation.ray_cast import cast
+from rlml_slam.simulation.world import Geometry
+from rlml_slam.slam.closures.closure_candidates import Candidate
+from rlml_slam.slam.closures.closure_matching import HIDDEN, ClosureMatcher, Match
+from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap
+from rlml_slam.slam.keyframes import Keyframe
+
+NEAR = ((-15.0, 0.0, 15.0, 0.0),)  # the wall in between
+FAR = ((-15.0, 2.4, 15.0, 2.4), (6.0, 0.0, 6.0, 2.4), (-3.0, 2.0, -3.0, 2.4), (1.0, 2.2, 1.0, 2.4))
+VIEW = np.radians(np.arange(-90.0, 90.5, 1.0))
+
+
+def scan(pose, walls):
+    """End points (n, 2) in base, where the laser is."""
+    segments = np.hstack([np.array(walls), np.zeros((len(walls), 2))])
+    geometry = Geometry(segments, np.zeros((0, 5)), np.zeros((len(walls), 4)))
+    n = len(VIEW)
+    r, _, _ = cast(np.tile(pose[:2], (n, 1)), pose[2] + VIEW, np.zeros(n), geometry, 20.0)
+    hit = np.isfinite(r)
+    return r[hit, None] * np.stack([np.cos(VIEW[hit]), np.sin(VIEW[hit])], -1)
+
+
+def keyframe(index):
+    none = np.zeros(3), np.zeros((3, 3)), None, np.zeros(2)
+    return Keyframe(index, index + 1, *none, scan_stamp=0)
+
+
+@pytest.mark.parametrize(('y', 'fits'), [(1.0, True), (-1.0, False)])
+def test_scan_that_fits_through_a_wall_is_refused(y, fits):
+    submap = Submap()
+    for x in np.arange(-4.0, 4.0, 0.4):
+        pose = np.array([x, 1.2, 0.0])
+        submap.insert(se2.transform(pose, scan(pose, NEAR + FAR)), pose[:2])
+    m = KeyframeSubmap(keyframe(0), submap, 20, T_anchor_grid=np.zeros(3))
+    pose = np.array([-1.0, y, 0.6])
+    found = ClosureMatcher(Parameters()).match(
+        Candidate(m, pose, 0.5, 0.1), keyframe(30), scan(pose, FAR)
+    )
+    if fits:
+        assert isinstance(found.result, Match)
+        assert np.abs(found.result.T_grid_key - pose).max() < 0.05
+    else:
+        assert found.result.why == HIDDEN
+        assert found.result.score < Parameters().loop_closure.min_score
