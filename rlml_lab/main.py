@@ -65,7 +65,7 @@ COMMANDS: Table = {
             ),
             'building': Command(
                 'rlml_lab.studies.study_building',
-                'large loops in made buildings, and whether each closure is right',
+                'large loops in made buildings: whether each closure is right',
             ),
             'lego': Command(
                 'rlml_lab.lego.study_lego',

@@ -45,8 +45,9 @@ HEADER = (
 def add_parser(subparsers: Any) -> None:
     """Declare ``rlml-lab study building``."""
     parser = subparsers.add_parser(
-        'building', help='large loops in made buildings', description=__doc__
-    )
+        'building', help='large loops in made buildings: whether each closure is right',
+        description=__doc__,
+    )  # fmt: skip
     parser.add_argument('--size', type=float, default=100.0, help='of the building [m]')
     parser.add_argument('--rate', type=float, default=5.0, help='of the scans [Hz]')
     parser.add_argument('--poor', type=float, default=1.0, help="factor of the odometry's errors")

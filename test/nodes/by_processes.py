@@ -25,7 +25,8 @@ PATIENCE = 60.0  # [s] for a process to come, or for what it has to say
 CLOUD = 'sensor_msgs/msg/PointCloud2'
 DEEP = QoSProfile(depth=2000)
 LOGS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-LATEST = 25  # frames before its end, the drive waits for what is still to be decided
+LATEST = 50  # frames before its end, the robot slows down while anything is to be decided
+SLOWER = 1.0  # [s] of the wall clock between two frames then: a search has its time
 COMMANDS = {'rlml/session_start': DEEP, 'rlml/localization_map': LATCHED}
 TALK = {'front_end': 'rlml/frames', 'back_end': 'rlml/session_start'}
 SENSORS = ('scan', 'odom', 'reflectors')
@@ -35,7 +36,7 @@ class ByProcesses(Driver):
     """Front end and back end as executables, which a restart ends and starts.
 
     Services are asked while the robot drives on; it waits for a reset, which is of a moment, for a
-    process to start, and near its end for what is still to be decided.
+    process to start; near its end it slows down while anything is to be decided.
     """
 
     make = staticmethod(make_rclpy)
@@ -129,11 +130,14 @@ class ByProcesses(Driver):
         self._due += STEP / 1e9 / PACE
         self._spin(self._due - time.monotonic())
         s = self.scenario
-        if self.now - self.shift == EPOCH + (len(s.poses) - LATEST) * STEP:
-            most = len(s.decisions)
-            is_decided = lambda: len(decisions(self._commands)) >= most  # noqa: E731
-            self._live.spin_until(is_decided, PATIENCE, 'no decision')
-            self._due = time.monotonic()
+        if self.now - self.shift >= EPOCH + (len(s.poses) - LATEST) * STEP:
+            end = time.monotonic() + SLOWER
+            while not self._is_decided() and (left := end - time.monotonic()) > 0.0:
+                self._live.executor.spin_once(timeout_sec=left)
+            self._due = max(self._due, time.monotonic())
+
+    def _is_decided(self):
+        return len(decisions(self._commands)) >= len(self.scenario.decisions)
 
     def _spin(self, seconds):
         end = time.monotonic() + seconds
