@@ -35,8 +35,8 @@ SENSORS = ('scan', 'odom', 'reflectors')
 class ByProcesses(Driver):
     """Front end and back end as executables, which a restart ends and starts.
 
-    Services are asked while the robot drives on; it waits for a reset, which is of a moment, for a
-    process to start; near its end it slows down while anything is to be decided.
+    Services are asked while the robot drives on. It waits for a reset, which is of a moment, and
+    for a process to start. Near its end it slows down while anything is to be decided.
     """
 
     make = staticmethod(make_rclpy)

@@ -3,8 +3,7 @@
 
 Verified by the score, for which end points behind walls fit nothing, by the ratio of the
 second-best score to the best one, and by the covariance: a scan has to constrain its pose in all
-directions. Where the drift is large, weak
-matches are searched for as well (weak_match.py).
+directions. Where the drift is large, weak matches are searched for as well (weak_match.py).
 """
 
 from __future__ import annotations
