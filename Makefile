@@ -20,6 +20,8 @@ MADE := $(VENV)/.made-for-$(ROS)
 
 # the wheels mark a process that has set itself up; another environment's Python must not see it
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
+# images often set it: every process would then compile all that it imports, for 3 s
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help env kernels demo test lint types docs ci tf s3 config clean
 
