@@ -4,6 +4,9 @@
 The robot drives around the building, back to where it began, and through corridors between; its
 laser looks ahead only, and its odometry is a poor one. Rooms and corridors look alike, and a
 scan that is displaced by the width of a corridor fits there almost as well.
+
+``--stall`` lets the odometry stand still again and again, and then catch up in one step; ``--cut``
+leaves out all messages. In a bare corridor no scan says how far the robot drove meanwhile.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import argparse
 import itertools
 import math
 import time
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -42,6 +46,22 @@ HEADER = (
 )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Drive:
+    """Of one building: ``size`` [m], ``rate`` of scans [Hz], ``speed`` [m/s], errors of odometry.
+
+    Every ``interval`` [s] it stands still for ``stall`` [s], or all is missing for ``cut`` [s].
+    """
+
+    size: float
+    rate: float = 5.0
+    poor: float = 1.0
+    speed: float = SPEED
+    stall: float = 0.0
+    cut: float = 0.0
+    interval: float = 60.0
+
+
 def add_parser(subparsers: Any) -> None:
     """Declare ``rlml-lab study building``."""
     parser = subparsers.add_parser(
@@ -51,21 +71,23 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--size', type=float, default=100.0, help='of the building [m]')
     parser.add_argument('--rate', type=float, default=5.0, help='of the scans [Hz]')
     parser.add_argument('--poor', type=float, default=1.0, help="factor of the odometry's errors")
+    parser.add_argument('--speed', type=float, default=SPEED, help='of the robot [m/s]')
+    parser.add_argument('--stall', type=float, default=0.0, metavar='S', help='of the odometry')
+    parser.add_argument('--cut', type=float, default=0.0, metavar='S', help='without any message')
+    parser.add_argument('--every', type=float, default=60.0, metavar='S', help='for both of these')
     parser.add_argument('--seeds', type=int, default=3, help='number of buildings')
     parser.add_argument('--first', type=int, default=0, help='the first seed')
 
 
 def run(args: argparse.Namespace) -> int:
     """Drive through each building and print a row."""
-    rows = [
-        (f'{seed}', *drive(args.size, seed, args.rate, args.poor))
-        for seed in range(args.first, args.first + args.seeds)
-    ]
-    print(aligned([HEADER, *rows]))
+    how = Drive(args.size, args.rate, args.poor, args.speed, args.stall, args.cut, args.every)
+    seeds = range(args.first, args.first + args.seeds)
+    print(aligned([HEADER, *((f'{seed}', *drive(how, seed)) for seed in seeds)]))
     return 0
 
 
-def route(size: float, interval: float) -> Array:
+def route(size: float, interval: float, speed: float = SPEED) -> Array:
     """True poses (n, 3), one every ``interval`` [s]."""
     n = max(round(size / PITCH), 1)
     half = n // 2
@@ -80,9 +102,9 @@ def route(size: float, interval: float) -> Array:
         way = b - a
         far, course = math.hypot(*way), math.atan2(way[1], way[0])
         turn = se2.wrapped(course - heading)
-        steps = max(int(abs(turn) / TURN / interval), 1)
+        steps = max(int(abs(turn) / (TURN * speed / SPEED) / interval), 1)
         out += [np.array([*a, heading + turn * (k + 1) / steps]) for k in range(steps)]
-        steps = max(int(far / SPEED / interval), 1)
+        steps = max(int(far / speed / interval), 1)
         s = far * (np.arange(steps) + 1.0) / steps
         aside = SWAY * np.sin(s / WAVE) * np.sin(np.pi * s / far)
         across = np.array([-way[1], way[0]]) / far
@@ -105,22 +127,33 @@ def odometry_of(poses: Array, poor: float, rng: np.random.Generator) -> Array:
     return np.array(out)
 
 
-def drive(size: float, seed: int, rate: float, poor: float) -> tuple[str, ...]:
+def is_within(stamps: Array, interval: float, lasts: float, start: float) -> NDArray[np.bool_]:
+    """Which of ``stamps`` (n,) [s] are in the first ``lasts`` [s] of an interval, from a start."""
+    inside: NDArray[np.bool_] = (stamps >= start) & ((stamps - start) % interval < lasts)
+    return inside
+
+
+def drive(how: Drive, seed: int) -> tuple[str, ...]:
     """The row of one building."""
-    building, rng = Building(seed, size), np.random.default_rng(seed + 100)
-    poses = route(size, 1.0 / rate)
-    odometry = odometry_of(poses, poor, rng)
+    building, rng = Building(seed, how.size), np.random.default_rng(seed + 100)
+    poses = route(how.size, 1.0 / how.rate, how.speed)
+    odometry = odometry_of(poses, how.poor, rng)
+    seconds, start = np.arange(len(poses)) / how.rate, how.interval * float(rng.random())
+    stalls = is_within(seconds, how.interval, how.stall, start)
+    kept = ~is_within(seconds, how.interval, how.cut, start)
+    for k in (np.flatnonzero(stalls[1:]) + 1).tolist():
+        odometry[k] = odometry[k - 1]
     slam, frames = Slam(Parameters()), list[Frame]()
     slam.set_sensor_pose('laser', LASER)
-    stamps = START + np.round(np.arange(len(poses)) / rate * 1e9).astype(np.int64)
-    spent = 0.0
-    for stamp, pose, odom in zip(stamps.tolist(), poses, odometry, strict=True):
+    stamps, spent = START + np.round(seconds * 1e9).astype(np.int64), 0.0
+    for k in np.flatnonzero(kept).tolist():
+        stamp = int(stamps[k])
         scan = Scan(
             stamp, 'laser', float(VIEW[0]), float(VIEW[1] - VIEW[0]), 0.0, 0.05, 80.0,
-            ranges(building, pose, rng), np.zeros(0, np.float32),
+            ranges(building, poses[k], rng), np.zeros(0, np.float32),
         )  # fmt: skip
         began = time.perf_counter()
-        frames += [*slam.add_odometry(Odometry(stamp, odom)), *slam.add_scan(scan)]
+        frames += [*slam.add_odometry(Odometry(stamp, odometry[k])), *slam.add_scan(scan)]
         spent += time.perf_counter() - began
     began = time.perf_counter()
     frames += slam.finish()

@@ -23,13 +23,32 @@ def test_odometry_without_errors_is_the_way():
     assert np.abs(se2.between(se2.compose(poses[0], odometry), poses)).max() < 1e-9
 
 
-def test_closures_of_a_building_are_right(capsys):
-    args = argparse.Namespace(size=40.0, rate=2.0, poor=1.0, seeds=1, first=0)
-    assert study.run(args) == 0
+def test_stalls_and_cuts_come_again_and_again():
+    inside = study.is_within(np.arange(0.0, 10.0), 4.0, 2.0, 1.0)
+    assert np.flatnonzero(inside).tolist() == [1, 2, 5, 6, 9]
+
+
+def row_of(capsys, **options):
+    usual = {'size': 40.0, 'rate': 2.0, 'poor': 1.0, 'speed': study.SPEED, 'stall': 0.0}
+    more = {'cut': 0.0, 'every': 30.0, 'seeds': 1, 'first': 0}
+    assert study.run(argparse.Namespace(**{**usual, **more, **options})) == 0
     header, row = capsys.readouterr().out.splitlines()
     assert 'enabled wrong' in header
-    _, scans, odometry, _, rms, _, right, wrong, enabled, ok_and_wrong, _ = row.split()
+    return row.split()
+
+
+def test_closures_of_a_building_are_right(capsys):
+    _, scans, odometry, _, rms, _, right, wrong, enabled, ok_and_wrong, _ = row_of(capsys)
     assert int(scans) == len(study.route(40.0, 0.5))
     assert float(rms) < 0.1 < float(odometry)
     assert int(right) > 10
     assert (wrong, enabled, ok_and_wrong) == ('0', '0', '0.00%')
+
+
+def test_odometry_that_stalls_in_bare_corridors_is_not_lost(capsys):
+    """The robot stood still for seconds after each stall: 7.4 m, 7.8 % of the poses OK and wrong."""
+    row = row_of(capsys, size=60.0, rate=5.0, speed=0.9, stall=0.8, every=60.0, first=22)
+    before_closing, rms, ok_and_wrong = float(row[3]), float(row[4]), row[9]
+    assert before_closing < 3.0
+    assert rms < 0.2
+    assert ok_and_wrong == '0.00%'

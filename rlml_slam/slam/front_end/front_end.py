@@ -66,7 +66,7 @@ class FrontEnd:
         were ambiguous or outside their gates with the prior; each detection is used once.
         """
         began = self._finish_last_step()
-        observation = self._scans.likeliest(self._motion.hypotheses(observation))
+        observation = self._motion.likeliest(observation, self._scans.fit)
         self._motion.predict(self.state, observation)
         observation, sweep = self._scans.deskew(observation)
         matches = self._reflectors.begin(observation, self._motion.velocity)

@@ -6,14 +6,20 @@ Scans have shown the motion meanwhile, so the step must not be added to it. Whee
 on the robot: the odometry since the last frame at which it was trusted is one measurement,
 whatever came in between. And a gyro may be wrong for a moment. So there are up to four hypotheses:
 odometry since the last frame, odometry since it was trusted, that the robot goes on as it went,
-and that it turned as the wheels did. Scan and reflectors choose (:meth:`ScanTerm.likeliest`).
+and that it turned as the wheels did. Scan and reflectors choose (:meth:`ScanTerm.fit`).
+
+In a bare corridor they cannot: several motions fit, at different places. Then the motion is a
+guess, from which no velocity follows, and the odometry is as open as it was before.
 """
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlml_slam import se2
 from rlml_slam.motion import is_possible, motion_of
@@ -34,6 +40,16 @@ SAME = np.array([0.02, 0.02, 0.01])  # [m, m, rad] hypotheses that are closer ar
 CONFIRM = 2
 TURN = 0.1  # [rad] by which gyro and wheels disagree: errors of both in a step are smaller
 LONGEST = 5.0  # [s] of a stall; after that, odometry is what it is
+PENALTY = 0.1  # share of a fit that a motion loses which no robot has
+SINCE = 0.1  # penalty of the odometry since it was trusted, and
+DOUBT = 0.2  # of a motion that is not the odometry's
+GUESSED = 0.3  # after a guess, of any but the odometry since it was trusted
+OPEN = 0.03  # motions whose fits differ by less are both possible
+
+
+# how well scan and reflectors of an observation fit, 0 to 1, and at which pose (3,)
+Found = tuple[float, Array] | None
+Fit = Callable[[Observation], Found]
 
 
 @dataclass(frozen=True)
@@ -60,6 +76,37 @@ class MotionHypotheses:
         self._last: tuple[int, Array] | None = None  # stamp and pose of the last frame
         self._last_odometry: Array | None = None  # raw (3,) at that frame
         self._agreed = 0  # frames in a row, since it is open, at which odometry agreed
+        self._velocity: tuple[int, Array] | None = None  # the last one known, and its stamp
+        self._is_guessed = False  # the newest motion: neither odometry nor scan says it
+
+    def likeliest(self, observation: Observation, velocity: Array | None, fit: Fit) -> Observation:
+        """The observation with the motion that fits best; ``velocity`` (3,) as in :meth:`of`.
+
+        While several fit about as well, the covariance of the motion is that of their mixture.
+        Where nothing was seen, it is the first one, the odometry's.
+        """
+        hypotheses = self.of(observation, velocity)
+        if len(hypotheses) == 1:  # a guess stays one until the odometry is trusted again
+            return hypotheses[0].observation
+        found = [fit(h.observation) for h in hypotheses]
+        if found[0] is None:
+            self._is_guessed = True
+            return hypotheses[0].observation
+        scores = np.array([0.0 if f is None else f[0] for f in found])
+        likely = scores - PENALTY * np.array([h.penalty for h in hypotheses])
+        best = int(np.argmax(likely))
+        motions = [h.observation.motion.delta for h in hypotheses]
+        alike = scores > scores[best] - OPEN
+        before = self._is_guessed
+        self._is_guessed = _is_free(motions, found, alike, before)
+        chosen = hypotheses[best].observation
+        if self._is_guessed and (before or chosen.motion.known):
+            return chosen  # the same doubt again, or one that ends when the odometry catches up
+        cov = chosen.motion.cov.copy()
+        for k in np.flatnonzero(likely > likely[best] - OPEN):
+            away = se2.between(motions[best], motions[k])
+            cov += np.outer(away, away)
+        return replace(chosen, motion=replace(chosen.motion, cov=cov))
 
     def of(self, observation: Observation, velocity: Array | None) -> list[Hypothesis]:
         """What may have happened since the last frame, the odometry's motion first.
@@ -67,28 +114,53 @@ class MotionHypotheses:
         It is the only one where nothing speaks against it. ``velocity`` (3,) is that until then,
         None if it is unknown.
         """
-        plain, single = observation.motion, [Hypothesis(observation, 0.0)]
+        single = [Hypothesis(observation, 0.0)]
         if self._last is None or self._trusted is None:
             return single
         dt = (observation.stamp - self._last[0]) * 1e-9
         if dt <= 0.0:
             return single
-        since, onward = self._since_trusted(observation), None
-        velocity = velocity if dt <= FRESH else None
-        if velocity is not None and (since or not plain.known or _is_odd(plain, velocity, dt)):
-            sigma = ACCELERATION * max(dt, SHORTEST) * dt
-            cov = np.diag(sigma**2 + (0.5 * SAME) ** 2)
-            onward = Motion(se2.exp(velocity * dt), cov, known=False)
-        motions = [plain]
-        for other in (since, onward, self._by_wheels(observation, dt)):
-            if other is not None and all(_differ(other.delta, m.delta) for m in motions):
-                motions.append(other)
+        velocity = self._known(observation.stamp, velocity)
+        motions = list[tuple[Motion, float]]()
+        for motion, penalty in self._motions(observation, velocity, dt):
+            if all(_differ(motion.delta, other.delta) for other, _ in motions):
+                motions.append((motion, penalty))
         if len(motions) == 1:
             return single
-        return [
-            Hypothesis(self._moved(observation, m, dt), _penalty(m.delta, velocity, dt))
-            for m in motions
-        ]
+        return [Hypothesis(self._moved(observation, m, dt), penalty) for m, penalty in motions]
+
+    def _motions(
+        self, observation: Observation, velocity: Array | None, dt: float
+    ) -> list[tuple[Motion, float]]:
+        """Motions of ``dt`` [s] with their penalties, those that are the same among them."""
+        plain, since = observation.motion, self._since_trusted(observation, velocity)
+        sudden = _penalty(plain.delta, velocity, dt)
+        if since is not None and not _differ(since[0].delta, plain.delta):
+            # so it moved since it was trusted, not in one step
+            sudden, since = min(sudden, since[1]), None
+        # of a burst of stamps, the times say nothing of the speed
+        is_odd = sudden > 0.5 and dt >= SHORTEST
+        if not plain.delta.any():
+            is_odd = _goes_on(velocity, dt)
+        out = [(plain, sudden)]
+        if since is not None:
+            a, b = (GUESSED, 0.0) if self._is_guessed else (0.0, SINCE)
+            out = [(plain, sudden + a), (since[0], since[1] + b)]
+        if velocity is not None and (since is not None or not plain.known or is_odd):
+            out.append((_onward(velocity, dt), GUESSED if self._is_guessed else DOUBT))
+        wheels = self._by_wheels(observation, dt)
+        if wheels is not None:
+            out.append((wheels, DOUBT + _penalty(wheels.delta, velocity, dt)))
+        return out
+
+    def _known(self, stamp: int, velocity: Array | None) -> Array | None:
+        """The velocity; after a guess the last one that was none, while it lasts."""
+        assert self._last is not None
+        if not self._is_guessed:
+            self._velocity = None if velocity is None else (self._last[0], velocity)
+        if self._velocity is None or stamp - self._velocity[0] > FRESH * 1e9:
+            return None
+        return self._velocity[1]
 
     def _moved(self, observation: Observation, motion: Motion, dt: float) -> Observation:
         """The observation with another motion, and its scan de-skewed by that."""
@@ -98,8 +170,13 @@ class MotionHypotheses:
         observation = replace(observation, motion=motion)
         return deskewed(observation, se2.log(motion.delta) / dt, max_range)[0]
 
-    def _since_trusted(self, observation: Observation) -> Motion | None:
-        """The motion since the last frame by the odometry since it was trusted, if it is open."""
+    def _since_trusted(
+        self, observation: Observation, velocity: Array | None
+    ) -> tuple[Motion, float] | None:
+        """The motion since the last frame by the odometry since it was trusted, if it is open.
+
+        With its penalty, of the whole way since.
+        """
         assert self._trusted is not None
         assert self._last is not None
         stamp, pose, odometry = self._trusted
@@ -111,7 +188,8 @@ class MotionHypotheses:
             return None
         delta = se2.between(self._last[1], se2.compose(pose, way))
         # what the scans have shown since then is not without error either
-        return Motion(delta, motion_of(way, dt, self._p.motion).cov + np.diag(SAME**2))
+        cov = motion_of(way, dt, self._p.motion).cov + np.diag(SAME**2)
+        return Motion(delta, cov), _penalty(way, velocity, dt)
 
     def _by_wheels(self, observation: Observation, dt: float) -> Motion | None:
         """The motion since the last frame by the wheels alone, where a gyro says otherwise."""
@@ -139,13 +217,14 @@ class MotionHypotheses:
             dt = (observation.stamp - stamp) * 1e-9
             way = se2.between(then, odometry)
             moved = bool((np.abs(se2.between(there, pose)) > MOVED).any())
-            is_open = stamp != last[0] or (moved and not observation.motion.delta.any())
+            stands = not observation.motion.delta.any()
+            is_open = stamp != last[0] or (stands and moved) or self._is_guessed
             agrees = is_open and self._agrees(observation, way, dt, there, last[1])
             self._agreed = self._agreed + 1 if agrees else 0
             if is_open and dt < LONGEST and self._agreed < CONFIRM:
                 return
         self._trusted = (observation.stamp, pose, np.asarray(odometry))
-        self._agreed = 0
+        self._agreed, self._is_guessed = 0, False
 
     def _agrees(
         self, observation: Observation, way: Array, dt: float, there: Array, last: Array
@@ -165,13 +244,35 @@ class MotionHypotheses:
         )
 
 
-def _is_odd(motion: Motion, velocity: Array, dt: float) -> bool:
-    """Whether the odometry stands exactly still at a speed, or moves suddenly."""
-    goes_on = np.abs(se2.exp(velocity * dt))
-    if not motion.delta.any():
-        return bool((goes_on > SAME).any())
-    # of a burst of stamps, the times say nothing of the speed
-    return dt >= SHORTEST and _penalty(motion.delta, velocity, dt) > 0.5
+def _onward(velocity: Array, dt: float) -> Motion:
+    """The motion in ``dt`` [s] of a robot that goes on at a velocity (3,)."""
+    sigma = ACCELERATION * max(dt, SHORTEST) * dt
+    cov = np.diag(sigma**2 + (0.5 * SAME) ** 2)
+    return Motion(se2.exp(velocity * dt), cov, known=False)
+
+
+def _is_free(
+    motions: list[Array], found: list[Found], alike: NDArray[np.bool_], before: bool
+) -> bool:
+    """Whether motions (3,) that fit alike lead to poses about as far apart as they are.
+
+    As it was ``before`` where they are too close to each other for this.
+    """
+    says = False
+    for a, b in itertools.combinations(np.flatnonzero(alike).tolist(), 2):
+        one, other = found[a], found[b]
+        if one is None or other is None:
+            return True
+        apart = np.abs(se2.between(motions[a], motions[b]))
+        if (np.abs(se2.between(one[1], other[1])) > 0.25 * SAME + 0.5 * apart).any():
+            return True
+        says = says or bool((apart > MOVED).any())
+    return before and not says and bool(alike.sum() > 1)
+
+
+def _goes_on(velocity: Array | None, dt: float) -> bool:
+    """Whether a robot is not where it was, if it goes on as it went."""
+    return velocity is not None and bool((np.abs(se2.exp(velocity * dt)) > SAME).any())
 
 
 def _penalty(delta: Array, velocity: Array | None, dt: float) -> float:

@@ -25,7 +25,7 @@ from rlml_slam.sensing.deskew import sweep_time
 from rlml_slam.sensing.velocity_deskew import Sweep
 from rlml_slam.slam.front_end.constant_velocity import ConstantVelocity
 from rlml_slam.slam.front_end.joint_state import STANDING, JointState, begin_sweep, end_sweep
-from rlml_slam.slam.front_end.motion_hypotheses import FRESH, Hypothesis, MotionHypotheses
+from rlml_slam.slam.front_end.motion_hypotheses import FRESH, Fit, MotionHypotheses
 from rlml_slam.slam.front_end.scan_update import relative
 from rlml_slam.types import Motion, Observation
 
@@ -65,14 +65,14 @@ class MotionTerm:
         # of the newest observation's sweep: its time [s], and the covariance of its motion
         self._sweep: tuple[float, Array] | None = None
 
-    def hypotheses(self, observation: Observation) -> list[Hypothesis]:
-        """What may have happened since the last observation, the odometry's motion first."""
+    def likeliest(self, observation: Observation, fit: Fit) -> Observation:
+        """The observation with the motion since the last one by which it has the best fit."""
         velocity = self.velocity if self._is_velocity_known else None
         if self.stamp is not None:
             dt = (observation.stamp - self.stamp) * 1e-9
             observation = self._odometry_noise.scaled(observation, dt)
         self._odometry = observation.motion.delta
-        return self._hypotheses.of(observation, velocity)
+        return self._hypotheses.likeliest(observation, velocity, fit)
 
     def predict(self, state: JointState, observation: Observation) -> None:
         """Move the pose to the stamp of the observation (eq. 5 to 9)."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -21,7 +19,6 @@ from rlml_slam.se2 import Array
 from rlml_slam.sensing.velocity_deskew import Sweep, deskewed
 from rlml_slam.slam.front_end.degeneracy import Degeneracy
 from rlml_slam.slam.front_end.joint_state import JointState
-from rlml_slam.slam.front_end.motion_hypotheses import Hypothesis
 from rlml_slam.slam.front_end.motion_term import MotionTerm
 from rlml_slam.slam.front_end.scan_update import fuse, prior_of, relative
 from rlml_slam.slam.front_end.submaps import Submaps
@@ -38,9 +35,7 @@ FAR = 3.0  # [sigma] half width of a search without odometry
 # [m] 1 sigma in its submap of a robot without odometry, beyond which it starts another submap
 MAX_SIGMA_IN_SUBMAP = 0.5
 NEAR = 0.3  # [m] of a reflector, a detection may be one of it
-PENALTY = 0.1  # share of a fit that a motion loses which no robot has
-DOUBT = 0.02  # by which motions other than the odometry's have to fit better
-OPEN = 0.03  # motions whose fits differ by less are both possible
+DOUBT = 0.02  # by which a fit is better that is where the motion led
 MIN_KNOWN = 0.33  # share of end points in known cells below which a scan cannot contradict
 
 
@@ -86,32 +81,10 @@ class ScanTerm:
         self._fuse(state, found, self._information(submap, points, found), sweep)
         return deskewed(observation, state.velocity, max_range)
 
-    def likeliest(self, hypotheses: Sequence[Hypothesis]) -> Observation:
-        """The observation with the motion that its scan and its reflectors fit best.
+    def fit(self, observation: Observation) -> tuple[float, Array] | None:
+        """How well scan and reflectors fit after a motion, 0 to 1, and the pose (3,) there.
 
-        While several fit about as well, the covariance of the motion is that of their mixture.
-        Where nothing was seen, it is the first one, the odometry's.
-        """
-        if len(hypotheses) == 1:
-            return hypotheses[0].observation
-        seen = [self._fit(h.observation) for h in hypotheses]
-        if seen[0] is None:
-            return hypotheses[0].observation
-        fits = [
-            (fit or 0.0) - PENALTY * h.penalty for fit, h in zip(seen, hypotheses, strict=True)
-        ]
-        fits[0] += DOUBT
-        best = int(np.argmax(fits))
-        chosen = hypotheses[best].observation
-        cov = chosen.motion.cov.copy()
-        for fit, other in zip(fits, hypotheses, strict=True):
-            if fit > fits[best] - OPEN:
-                away = se2.between(chosen.motion.delta, other.observation.motion.delta)
-                cov += np.outer(away, away)
-        return replace(chosen, motion=replace(chosen.motion, cov=cov))
-
-    def _fit(self, observation: Observation) -> float | None:
-        """How well scan and reflectors fit after a motion: 0 to 1, None without any.
+        None without any.
 
         A motion is searched for as it will be: a fast turn of the wheels is uncertain. A scan that
         contradicts the map speaks for no motion, however little of it fits by chance.
@@ -134,7 +107,7 @@ class ScanTerm:
             at = se2.transform(state.pose, detections.points)
             away = np.linalg.norm(at[:, None] - landmarks[None], axis=-1).min(axis=1)
             fits.append(float(np.mean(away < NEAR)))
-        return float(np.mean(fits)) if fits else None
+        return (float(np.mean(fits)), state.pose) if fits else None
 
     def update(
         self, observation: Observation, sweep: Sweep, reflectors_agree: bool, maps: bool

@@ -136,3 +136,72 @@ def test_pose_that_was_moved_is_not_compared_with_the_one_before():
     drive.go()
     drive.hypotheses.forget()
     assert len(drive.go(np.zeros(3))) == 1
+
+
+class Corridor:
+    """A robot that drives .9 m/s in a bare corridor, where the scan fits wherever it is."""
+
+    def __init__(self):
+        self.hypotheses, self.velocity = MotionHypotheses(PARAMS), np.zeros(3)
+        self.stamp, self.true, self.odometry, self.pose = 10**9, 0.0, 0.0, np.zeros(3)
+        self.var = 0.0
+
+    def go(self, way, measured):
+        self.true, self.odometry = self.true + way, self.odometry + measured
+        motion = motion_of(np.array([measured, 0.0, 0.0]), DT, PARAMS.motion)
+        self.stamp += round(DT * 1e9)
+        seen = Observation(self.stamp, motion, odom_pose=np.array([self.odometry, 0.0, 0.0]))
+        chosen = self.hypotheses.likeliest(seen, self.velocity, self.fit)
+        self.hypotheses.learn(chosen, se2.compose(self.pose, chosen.motion.delta))
+        self.pose = se2.compose(self.pose, chosen.motion.delta)
+        self.velocity, self.var = chosen.motion.delta / DT, self.var + chosen.motion.cov[0, 0]
+
+    def fit(self, observation):
+        return 0.7, se2.compose(self.pose, observation.motion.delta)
+
+    @property
+    def error(self):
+        return self.pose[0] - self.true
+
+
+@pytest.mark.parametrize('lasts', [0.4, 0.8, 1.6])
+def test_stall_in_a_bare_corridor_is_made_good_when_the_odometry_catches_up(lasts):
+    drive, step = Corridor(), 0.9 * DT
+    for _ in range(10):
+        drive.go(step, step)
+    for _ in range(round(lasts / DT)):
+        drive.go(step, 0.0)
+    assert drive.error < -0.3  # nothing says that it drove on
+    assert drive.var < 0.1  # nor is the doubt of each frame another one
+    drive.go(step, step + lasts * 0.9)
+    for _ in range(5):
+        drive.go(step, step)
+    assert abs(drive.error) < 0.03
+
+
+def test_robot_that_starts_fast_in_a_bare_corridor_does_not_stand_for_ever():
+    """What it stood was a guess: no velocity to compare the next motions with, for long."""
+    drive = Corridor()
+    for _ in range(5):
+        drive.go(0.0, 0.0)
+    for _ in range(7):
+        drive.go(0.3, 0.3)
+    before = drive.error
+    for _ in range(10):
+        drive.go(0.3, 0.3)
+    assert abs(drive.error - before) < 0.01
+
+
+def test_scan_that_fits_at_one_place_says_how_fast_the_robot_goes_on_during_a_stall():
+    drive, step = Corridor(), 0.9 * DT
+    drive.fit = lambda observation: (0.7, np.array([drive.true, 0.0, 0.0]))
+    for k in range(20):
+        drive.go(step, step if k < 10 else 0.0)
+        drive.pose[0] = drive.true
+        drive.velocity = np.array([0.9, 0.0, 0.0])
+    seen = Observation(
+        drive.stamp + round(DT * 1e9), motion_of(np.zeros(3), DT, PARAMS.motion),
+        odom_pose=np.array([drive.odometry, 0.0, 0.0]),
+    )  # fmt: skip
+    found = [h.observation.motion.delta[0] for h in drive.hypotheses.of(seen, drive.velocity)]
+    np.testing.assert_allclose(found[-1], step, atol=1e-6)

@@ -46,6 +46,10 @@ def observation(k, delta, cov):
     )  # fmt: skip
 
 
+def no_fit(_):
+    raise AssertionError('there is one motion only')
+
+
 def estimate(rng, is_used, steps=60):
     """Errors (n, 3) and their NEES (n,), of a robot whose scans are de-skewed by its wheels."""
     params = Parameters(motion=SYSTEMATIC_OFF)
@@ -55,8 +59,8 @@ def estimate(rng, is_used, steps=60):
     for k in range(1, steps):
         # of the motion until here; what it errs by in this sweep is a part of the next one
         truth = se2.compose(truth, went + noise)
-        (seen,) = motion.hypotheses(observation(k, went, SWEEP_COV))
-        motion.predict(state, seen.observation)
+        seen = motion.likeliest(observation(k, went, SWEEP_COV), no_fit)
+        motion.predict(state, seen)
         noise = rng.multivariate_normal(np.zeros(3), SWEEP_COV)
         found = se2.compose(truth, 0.5 * noise) + rng.multivariate_normal(np.zeros(3), MATCH_COV)
         sweep = motion.sweep if is_used else Sweep()
@@ -65,7 +69,7 @@ def estimate(rng, is_used, steps=60):
             state.x, state.P, found, information, 30.0, NOTHING, information, sweep.half,
             sweep.velocity,
         )  # fmt: skip
-        motion.corrected(state, seen.observation)
+        motion.corrected(state, seen)
         e = se2.between(truth, state.pose)
         P = se2.rotate_cov(state.pose_cov, -truth[2])
         out.append((*e, e @ np.linalg.solve(P, e)))
@@ -99,8 +103,7 @@ def follow(*observations, is_asked=True):
     state, motion = JointState(np.zeros(3), 1e-6 * np.eye(3), 0.0), MotionTerm(Parameters())
     for k, one in enumerate(observations):
         if is_asked or not k:
-            (hypothesis,) = motion.hypotheses(one)
-            one = hypothesis.observation
+            one = motion.likeliest(one, no_fit)
         motion.predict(state, one)
         if not k:
             sweep, W = motion.sweep, np.linalg.inv(MATCH_COV)
