@@ -46,7 +46,7 @@ def test_closures_of_a_building_are_right(capsys):
 
 
 def test_odometry_that_stalls_in_bare_corridors_is_not_lost(capsys):
-    """The robot stood still for seconds after each stall: 7.4 m, 7.8 % of the poses OK and wrong."""
+    """The robot stood still after each stall: 7.4 m off, 7.8 % of the poses OK and wrong."""
     row = row_of(capsys, size=60.0, rate=5.0, speed=0.9, stall=0.8, every=60.0, first=22)
     before_closing, rms, ok_and_wrong = float(row[3]), float(row[4]), row[9]
     assert before_closing < 3.0
