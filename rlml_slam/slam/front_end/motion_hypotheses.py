@@ -90,7 +90,6 @@ class MotionHypotheses:
             return hypotheses[0].observation
         found = [fit(h.observation) for h in hypotheses]
         if found[0] is None:
-            self._is_guessed = True
             return hypotheses[0].observation
         scores = np.array([0.0 if f is None else f[0] for f in found])
         likely = scores - PENALTY * np.array([h.penalty for h in hypotheses])
@@ -98,7 +97,8 @@ class MotionHypotheses:
         motions = [h.observation.motion.delta for h in hypotheses]
         alike = scores > scores[best] - OPEN
         before = self._is_guessed
-        self._is_guessed = _is_free(motions, found, alike, before)
+        may_stall = before or not observation.motion.delta.any()
+        self._is_guessed = may_stall and _is_free(motions, found, alike, before)
         chosen = hypotheses[best].observation
         if self._is_guessed and (before or chosen.motion.known):
             return chosen  # the same doubt again, or one that ends when the odometry catches up
@@ -254,7 +254,7 @@ def _onward(velocity: Array, dt: float) -> Motion:
 def _is_free(
     motions: list[Array], found: list[Found], alike: NDArray[np.bool_], before: bool
 ) -> bool:
-    """Whether motions (3,) that fit alike lead to poses about as far apart as they are.
+    """Whether motions (3,) that fit alike lead to poses that are apart by more than a quarter of it.
 
     As it was ``before`` where they are too close to each other for this.
     """
@@ -264,7 +264,7 @@ def _is_free(
         if one is None or other is None:
             return True
         apart = np.abs(se2.between(motions[a], motions[b]))
-        if (np.abs(se2.between(one[1], other[1])) > 0.25 * SAME + 0.5 * apart).any():
+        if (np.abs(se2.between(one[1], other[1])) > 0.25 * (SAME + apart)).any():
             return True
         says = says or bool((apart > MOVED).any())
     return before and not says and bool(alike.sum() > 1)
