@@ -64,7 +64,7 @@ class Hypothesis:
 
 
 class MotionHypotheses:
-    """The last frame at which odometry was trusted: its stamp [ns], pose and raw odometry (3,)."""
+    """Keeps the last frame at which odometry was trusted, with its pose and raw odometry (3,)."""
 
     def __init__(self, params: Parameters) -> None:
         self._p = params
@@ -86,7 +86,7 @@ class MotionHypotheses:
         Where nothing was seen, it is the first one, the odometry's.
         """
         hypotheses = self.of(observation, velocity)
-        if len(hypotheses) == 1:  # a guess stays one until the odometry is trusted again
+        if len(hypotheses) == 1:  # which decides nothing: a guess stays one
             return hypotheses[0].observation
         found = [fit(h.observation) for h in hypotheses]
         if found[0] is None:
@@ -142,6 +142,8 @@ class MotionHypotheses:
         is_odd = sudden > 0.5 and dt >= SHORTEST
         if not plain.delta.any():
             is_odd = _goes_on(velocity, dt)
+        if not _goes_on(velocity, dt):  # that it stood may be what a stall made of it
+            sudden = 0.0
         out = [(plain, sudden)]
         if since is not None:
             a, b = (GUESSED, 0.0) if self._is_guessed else (0.0, SINCE)
@@ -209,6 +211,8 @@ class MotionHypotheses:
         was missing, only when what it says is where the scans are.
         """
         last, self._last = self._last, (observation.stamp, pose)
+        if self._trusted is not None and observation.stamp - self._trusted[0] > LONGEST * 1e9:
+            self._is_guessed = False
         self._last_odometry = odometry = observation.odom_pose
         if odometry is None:
             return
@@ -254,7 +258,7 @@ def _onward(velocity: Array, dt: float) -> Motion:
 def _is_free(
     motions: list[Array], found: list[Found], alike: NDArray[np.bool_], before: bool
 ) -> bool:
-    """Whether motions (3,) that fit alike lead to poses that are apart by more than a quarter of it.
+    """Whether motions (3,) that fit alike lead to poses more than a quarter as far apart.
 
     As it was ``before`` where they are too close to each other for this.
     """

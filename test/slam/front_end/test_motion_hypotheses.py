@@ -179,6 +179,43 @@ def test_stall_in_a_bare_corridor_is_made_good_when_the_odometry_catches_up(last
     assert abs(drive.error) < 0.03
 
 
+def test_robot_that_starts_fast_in_a_bare_corridor_does_not_stand_for_ever():
+    drive = Corridor()
+    for _ in range(5):
+        drive.go(0.0, 0.0)
+    for _ in range(10):
+        drive.go(0.3, 0.3)
+    assert abs(drive.error) < 0.01
+
+
+@pytest.mark.parametrize(('lasts', 'acceleration'), [(4, 1.0), (8, 0.5), (8, 1.0)])
+def test_robot_that_starts_during_a_stall_is_where_the_odometry_says(lasts, acceleration):
+    drive, way = Corridor(), 0.0
+    for _ in range(5):
+        drive.go(0.0, 0.0)
+    for k in range(lasts):
+        step = min(acceleration * (k + 1) * DT, 0.9) * DT
+        drive.go(step, 0.0)
+        way += step
+    drive.go(0.9 * DT, way + 0.9 * DT)
+    for _ in range(20):
+        drive.go(0.9 * DT, 0.9 * DT)
+    assert abs(drive.error) < 0.03
+
+
+def test_guess_ends_where_the_odometry_goes_missing():
+    drive, step = Corridor(), 0.9 * DT
+    for k in range(16):
+        drive.go(step, step if k < 10 else 0.0)
+    assert drive.hypotheses._is_guessed
+    for _ in range(30):
+        drive.stamp += round(DT * 1e9)
+        drive.hypotheses.learn(
+            Observation(drive.stamp, Motion(np.zeros(3), np.eye(3), False)), drive.pose
+        )
+    assert not drive.hypotheses._is_guessed
+
+
 def test_scan_that_fits_at_one_place_says_how_fast_the_robot_goes_on_during_a_stall():
     drive, step = Corridor(), 0.9 * DT
     drive.fit = lambda observation: (0.7, np.array([drive.true, 0.0, 0.0]))
