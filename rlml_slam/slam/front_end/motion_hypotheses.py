@@ -78,6 +78,7 @@ class MotionHypotheses:
         self._agreed = 0  # frames in a row, since it is open, at which odometry agreed
         self._velocity: tuple[int, Array] | None = None  # the last one known, and its stamp
         self._is_guessed = False  # the newest motion: neither odometry nor scan says it
+        self._rests = False  # the robot, by its velocity before the newest motion
 
     def likeliest(self, observation: Observation, velocity: Array | None, fit: Fit) -> Observation:
         """The observation with the motion that fits best; ``velocity`` (3,) as in :meth:`of`.
@@ -98,7 +99,10 @@ class MotionHypotheses:
         alike = scores > scores[best] - OPEN
         before = self._is_guessed
         may_stall = before or not observation.motion.delta.any()
-        self._is_guessed = may_stall and _is_free(motions, found, alike, before)
+        is_free = _is_free(motions, found, alike, before)
+        self._is_guessed = may_stall and is_free
+        if is_free and alike[0] and self._rests:  # what a stall may have made of it
+            best = 0
         chosen = hypotheses[best].observation
         if self._is_guessed and (before or chosen.motion.known):
             return chosen  # the same doubt again, or one that ends when the odometry catches up
@@ -142,8 +146,7 @@ class MotionHypotheses:
         is_odd = sudden > 0.5 and dt >= SHORTEST
         if not plain.delta.any():
             is_odd = _goes_on(velocity, dt)
-        if not _goes_on(velocity, dt):  # that it stood may be what a stall made of it
-            sudden = 0.0
+        self._rests = velocity is not None and not _goes_on(velocity, dt)
         out = [(plain, sudden)]
         if since is not None:
             a, b = (GUESSED, 0.0) if self._is_guessed else (0.0, SINCE)
