@@ -98,10 +98,11 @@ class MotionHypotheses:
         motions = [h.observation.motion.delta for h in hypotheses]
         alike = scores > scores[best] - OPEN
         before = self._is_guessed
-        may_stall = before or not observation.motion.delta.any()
+        known = observation.motion.known
+        may_stall = before or (known and not observation.motion.delta.any())
         is_free = _is_free(motions, found, alike, before)
         self._is_guessed = may_stall and is_free
-        if is_free and alike[0] and self._rests:  # what a stall may have made of it
+        if is_free and alike[0] and known and self._rests:  # as a stall may have made of it
             best = 0
         chosen = hypotheses[best].observation
         if self._is_guessed and (before or chosen.motion.known):
