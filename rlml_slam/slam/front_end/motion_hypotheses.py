@@ -86,6 +86,8 @@ class MotionHypotheses:
         While several fit about as well, the covariance of the motion is that of their mixture.
         Where nothing was seen, it is the first one, the odometry's.
         """
+        if self._trusted is None or observation.stamp - self._trusted[0] > LONGEST * 1e9:
+            self._is_guessed = False
         hypotheses = self.of(observation, velocity)
         if len(hypotheses) == 1:  # which decides nothing: a guess stays one
             return hypotheses[0].observation
@@ -215,8 +217,6 @@ class MotionHypotheses:
         was missing, only when what it says is where the scans are.
         """
         last, self._last = self._last, (observation.stamp, pose)
-        if self._trusted is not None and observation.stamp - self._trusted[0] > LONGEST * 1e9:
-            self._is_guessed = False
         self._last_odometry = odometry = observation.odom_pose
         if odometry is None:
             return

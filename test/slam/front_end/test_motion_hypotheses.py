@@ -203,16 +203,17 @@ def test_robot_that_starts_during_a_stall_is_where_the_odometry_says(lasts, acce
     assert abs(drive.error) < 0.03
 
 
-def test_guess_ends_where_the_odometry_goes_missing():
+@pytest.mark.parametrize(('frames', 'pause'), [(30, DT), (1, 30.0)], ids=['frames', 'a gap'])
+def test_guess_ends_where_the_odometry_goes_missing(frames, pause):
     drive, step = Corridor(), 0.9 * DT
     for k in range(16):
         drive.go(step, step if k < 10 else 0.0)
     assert drive.hypotheses._is_guessed
-    for _ in range(30):
-        drive.stamp += round(DT * 1e9)
-        drive.hypotheses.learn(
-            Observation(drive.stamp, Motion(np.zeros(3), np.eye(3), False)), drive.pose
-        )
+    for _ in range(frames):
+        drive.stamp += round(pause * 1e9)
+        unknown = Observation(drive.stamp, Motion(np.zeros(3), np.eye(3), known=False))
+        chosen = drive.hypotheses.likeliest(unknown, drive.velocity, drive.fit)
+        drive.hypotheses.learn(chosen, drive.pose)
     assert not drive.hypotheses._is_guessed
 
 
