@@ -26,7 +26,8 @@ CLOUD = 'sensor_msgs/msg/PointCloud2'
 DEEP = QoSProfile(depth=2000)
 LOGS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LATEST = 50  # frames before its end, the robot slows down while anything is to be decided
-SLOWER = 1.0  # [s] of the wall clock between two frames then: a search has its time
+SLOWER = 1.0  # [s] of the wall clock between two frames at most, where the robot waits
+BEHIND = 10  # frames that a loaded machine may be behind, before the robot waits for it
 COMMANDS = {'rlml/session_start': DEEP, 'rlml/localization_map': LATCHED}
 TALK = {'front_end': 'rlml/frames', 'back_end': 'rlml/session_start'}
 SENSORS = ('scan', 'odom', 'reflectors')
@@ -36,7 +37,8 @@ class ByProcesses(Driver):
     """Front end and back end as executables, which a restart ends and starts.
 
     Services are asked while the robot drives on. It waits for a reset, which is of a moment, and
-    for a process to start. Near its end it slows down while anything is to be decided.
+    for a process to start, and where the machine is too slow for its pace. Near its end it slows
+    down while anything is to be decided.
     """
 
     make = staticmethod(make_rclpy)
@@ -44,7 +46,7 @@ class ByProcesses(Driver):
     def __init__(self, scenario, folder, live, start, monkeypatch):
         super().__init__(scenario, folder)
         self._live, self._process = live, start
-        self._commands, self._asked, self._newest, self._met = [], [], 0, 0
+        self._commands, self._asked, self._newest, self._met = [], [], EPOCH - 1, 0
         monkeypatch.setenv(DELAY, str(scenario.delay / PACE))
         self._hear('rlml/frames', DEEP, self._heard)
         for topic, qos in COMMANDS.items():
@@ -129,12 +131,18 @@ class ByProcesses(Driver):
             return
         self._due += STEP / 1e9 / PACE
         self._spin(self._due - time.monotonic())
+        due = self.now - BEHIND * STEP
+        if self._newest < due:
+            self._wait(lambda: self._newest >= due)
         s = self.scenario
         if self.now - self.shift >= EPOCH + (len(s.poses) - LATEST) * STEP:
-            end = time.monotonic() + SLOWER
-            while not self._is_decided() and (left := end - time.monotonic()) > 0.0:
-                self._live.executor.spin_once(timeout_sec=left)
-            self._due = max(self._due, time.monotonic())
+            self._wait(self._is_decided)
+
+    def _wait(self, true):
+        end = time.monotonic() + SLOWER
+        while not true() and (left := end - time.monotonic()) > 0.0:
+            self._live.executor.spin_once(timeout_sec=left)
+        self._due = max(self._due, time.monotonic())
 
     def _is_decided(self):
         return len(decisions(self._commands)) >= len(self.scenario.decisions)
