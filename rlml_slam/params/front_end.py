@@ -41,6 +41,13 @@ class MotionNoise(Group, prefix='motion.'):
         0.0,
         1.0,
     )
+    scale_error_sigma_without_lidar: tuple[float, ...] = param(
+        (0.03, 0.1),
+        'the same until the first scan: from one reflector to the next, only odometry leads',
+        '',
+        0.0,
+        1.0,
+    )
     drift_sigma: float = param(
         0.03,
         'turn per distance that the wheels do not measure, 1 sigma; 0: not modelled',

@@ -60,8 +60,8 @@ class JointState:
         self.P[BIAS, BIAS] = bias_sigma**2
         self._unknown = np.diag(np.array(speeds) ** 2)
         self.P[MOVING, MOVING] = self._unknown
-        self._wheels2 = np.array(wheels) ** 2
-        self.P[WHEELS, WHEELS] = np.diag(self._wheels2)
+        self.wheels2 = np.array(wheels) ** 2
+        self.P[WHEELS, WHEELS] = np.diag(self.wheels2)
         self.extra = 0
         self.tied = np.zeros(0, dtype=np.int64)
 
@@ -127,7 +127,7 @@ class JointState:
             )
         predict(
             self.x, self.P, motion.delta, motion.cov, motion.bias_gain, motion.turn_gain,
-            motion.drift_gain, went, walk, kept, self._wheels2,
+            motion.drift_gain, went, walk, kept, self.wheels2,
         )  # fmt: skip
 
     def corrected(self, motion: Motion) -> Motion:
@@ -341,6 +341,15 @@ def predict(
             P[e] *= kept
             P[:, e] *= kept
             P[e, e] += (1.0 - kept * kept) * wheels2[k]
+
+
+def limit_wheels(state: JointState, wheels: Sequence[float]) -> None:
+    """What the wheels err by has the sigmas ``wheels`` (3,) at most from now on."""
+    state.wheels2 = np.minimum(state.wheels2, np.square(wheels))
+    variances = np.maximum(np.diag(state.P)[WHEELS], 1e-18)
+    scale = np.ones(len(state.P))
+    scale[WHEELS] = np.sqrt(np.minimum(state.wheels2 / variances, 1.0))
+    state.P *= np.outer(scale, scale)
 
 
 def begin_sweep(state: JointState, cov: Array) -> None:

@@ -4,13 +4,20 @@ import pytest
 from made_worlds import SECOND, STEP
 
 from rlml_slam import se2
-from rlml_slam.params import MotionNoise
-from rlml_slam.slam.front_end.joint_state import WHEELS, JointState
-from rlml_slam.slam.front_end.motion_term import expected_motion
-from rlml_slam.types import Motion
+from rlml_slam.params import MotionNoise, Parameters
+from rlml_slam.slam.front_end.joint_state import (
+    SPEED,
+    TURN,
+    WHEELS,
+    JointState,
+    limit_wheels,
+)
+from rlml_slam.slam.front_end.motion_term import MotionTerm, expected_motion
+from rlml_slam.types import Motion, Observation
 
 NOISE = MotionNoise()
 ERRORS = (*NOISE.scale_error_sigma, NOISE.drift_sigma)
+WITHOUT_LIDAR = (*NOISE.scale_error_sigma_without_lidar, NOISE.drift_sigma)
 SIGMA = np.array([0.01, 0.01, 0.001])  # of a pose that is measured
 DT = STEP / SECOND
 
@@ -79,6 +86,33 @@ def test_noise_of_the_wheels_is_not_taken_for_a_share():
     x, P, _ = drive(np.random.default_rng(2), (0.0, 0.0, 0.0), 2000, turning=0.0)
     assert abs(x[1]) < 0.01
     assert P[1, 1] == pytest.approx(NOISE.scale_error_sigma[1] ** 2, rel=0.02)
+
+
+def test_from_the_first_scan_on_the_wheels_err_less():
+    """Until then only odometry leads from one reflector to the next; what is known is kept."""
+    state = JointState(np.zeros(3), np.zeros((3, 3)), 0.0, wheels=WITHOUT_LIDAR)
+    term = MotionTerm(Parameters())
+    standing = Motion(np.zeros(3), 1e-8 * np.eye(3))
+    term.predict(state, Observation(0, standing, odom_pose=np.zeros(3)))
+    np.testing.assert_allclose(np.sqrt(np.diag(state.P)[WHEELS]), WITHOUT_LIDAR)
+
+    scan = np.array([[1.0, 0.0], [0.0, 1.0]])
+    term.predict(state, Observation(STEP, standing, scan, np.zeros(2), odom_pose=np.zeros(3)))
+    np.testing.assert_allclose(np.sqrt(np.diag(state.P)[WHEELS]), ERRORS)
+    for k in range(2, 100):  # as wide as it becomes
+        term.predict(state, Observation(k * 60 * SECOND, standing, odom_pose=np.zeros(3)))
+    np.testing.assert_allclose(np.sqrt(np.diag(state.P)[WHEELS]), ERRORS, rtol=1e-6)
+
+
+def test_a_limit_keeps_what_is_known_better():
+    state = JointState(np.zeros(3), np.zeros((3, 3)), 0.0, wheels=WITHOUT_LIDAR)
+    state.P[0, 0], state.P[0, TURN], state.P[TURN, 0] = 1.0, 0.05, 0.05
+    state.P[SPEED, SPEED] = 1e-4
+    limit_wheels(state, ERRORS)
+    sigma = np.sqrt(np.diag(state.P))
+    np.testing.assert_allclose(sigma[WHEELS], (0.01, *ERRORS[1:]))
+    assert sigma[0] == 1.0
+    assert state.P[0, TURN] / (sigma[0] * sigma[TURN]) == pytest.approx(0.5)
 
 
 def test_what_may_be_no_way_at_all_tells_nothing():
