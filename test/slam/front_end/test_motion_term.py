@@ -4,7 +4,8 @@ import pytest
 from made_worlds import SECOND, STEP
 
 from rlml_slam import se2
-from rlml_slam.params import MotionNoise, Parameters
+from rlml_slam.params import MotionNoise, Parameters, from_mapping
+from rlml_slam.slam.front_end.front_end import FrontEnd
 from rlml_slam.slam.front_end.joint_state import (
     SPEED,
     TURN,
@@ -102,6 +103,13 @@ def test_from_the_first_scan_on_the_wheels_err_less():
     for k in range(2, 100):  # as wide as it becomes
         term.predict(state, Observation(k * 60 * SECOND, standing, odom_pose=np.zeros(3)))
     np.testing.assert_allclose(np.sqrt(np.diag(state.P)[WHEELS]), ERRORS, rtol=1e-6)
+
+
+def test_larger_errors_with_a_lidar_hold_without_one_too():
+    p = from_mapping({'motion.scale_error_sigma': (0.2, 0.3)}, Parameters)
+    front_end = FrontEnd(p)
+    np.testing.assert_allclose(np.sqrt(front_end.state.wheels2), (0.2, 0.3, NOISE.drift_sigma))
+    np.testing.assert_allclose(np.sqrt(FrontEnd(Parameters()).state.wheels2), WITHOUT_LIDAR)
 
 
 def test_a_limit_keeps_what_is_known_better():
