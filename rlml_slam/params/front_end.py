@@ -42,11 +42,7 @@ class MotionNoise(Group, prefix='motion.'):
         1.0,
     )
     scale_error_sigma_without_lidar: tuple[float, ...] = param(
-        (0.03, 0.1),
-        'the same until the first scan: from one reflector to the next, only odometry leads',
-        '',
-        0.0,
-        1.0,
+        (0.03, 0.1), 'the same until the first scan, where these are larger', '', 0.0, 1.0
     )
     drift_sigma: float = param(
         0.03,
@@ -88,6 +84,11 @@ class MotionNoise(Group, prefix='motion.'):
     constant_velocity_stamp_sigma: float = param(
         0.02, 'without odometry: error of the stamps of the scans, 1 sigma', 's', 0.0, 1.0
     )
+
+    @property
+    def first_scale_errors(self) -> tuple[float, ...]:
+        """Sigmas (2,) of the scale errors of speed and turn rate until the first scan."""
+        return tuple(map(max, self.scale_error_sigma, self.scale_error_sigma_without_lidar))
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ CLOUD = 'sensor_msgs/msg/PointCloud2'
 DEEP = QoSProfile(depth=2000)
 LOGS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LATEST = 50  # frames before its end, the robot slows down while anything is to be decided
-SLOWER = 1.0  # [s] of the wall clock between two frames at most, where the robot waits
+SLOWER = 1.0  # [s] of the wall clock between two frames then: a search has its time
 BEHIND = 10  # frames that a loaded machine may be behind, before the robot waits for it
 COMMANDS = {'rlml/session_start': DEEP, 'rlml/localization_map': LATCHED}
 TALK = {'front_end': 'rlml/frames', 'back_end': 'rlml/session_start'}
@@ -133,16 +133,14 @@ class ByProcesses(Driver):
         self._spin(self._due - time.monotonic())
         due = self.now - BEHIND * STEP
         if self._newest < due:
-            self._wait(lambda: self._newest >= due)
+            self._live.spin_until(lambda: self._newest >= due, PATIENCE, 'no frame')
+            self._due = time.monotonic()
         s = self.scenario
         if self.now - self.shift >= EPOCH + (len(s.poses) - LATEST) * STEP:
-            self._wait(self._is_decided)
-
-    def _wait(self, true):
-        end = time.monotonic() + SLOWER
-        while not true() and (left := end - time.monotonic()) > 0.0:
-            self._live.executor.spin_once(timeout_sec=left)
-        self._due = max(self._due, time.monotonic())
+            end = time.monotonic() + SLOWER
+            while not self._is_decided() and (left := end - time.monotonic()) > 0.0:
+                self._live.executor.spin_once(timeout_sec=left)
+            self._due = max(self._due, time.monotonic())
 
     def _is_decided(self):
         return len(decisions(self._commands)) >= len(self.scenario.decisions)

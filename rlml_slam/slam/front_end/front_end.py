@@ -46,8 +46,7 @@ class FrontEnd:
     def reset(self, pose: Array, cov: Array) -> None:
         """Drop all state and start at a pose (3,) of the map with covariance (3, 3)."""
         m = self._p.motion
-        sigmas = np.maximum(m.scale_error_sigma, m.scale_error_sigma_without_lidar)
-        wheels = (*sigmas.tolist(), m.drift_sigma)
+        wheels = (*m.first_scale_errors, m.drift_sigma)
         self.state = JointState(pose, cov, m.imu_bias_sigma, m.constant_velocity_sigma, wheels)
         self._motion = MotionTerm(self._p)
         self._reflectors = ReflectorTerm(self._p, self.state)

@@ -343,13 +343,15 @@ def predict(
             P[e, e] += (1.0 - kept * kept) * wheels2[k]
 
 
-def limit_wheels(state: JointState, wheels: Sequence[float]) -> None:
-    """What the wheels err by has the sigmas ``wheels`` (3,) at most from now on."""
-    state.wheels2 = np.minimum(state.wheels2, np.square(wheels))
-    variances = np.maximum(np.diag(state.P)[WHEELS], 1e-18)
-    scale = np.ones(len(state.P))
-    scale[WHEELS] = np.sqrt(np.minimum(state.wheels2 / variances, 1.0))
-    state.P *= np.outer(scale, scale)
+def narrow_scale_errors(state: JointState, sigmas: Sequence[float]) -> None:
+    """Replace the prior of the scale errors by one of ``sigmas`` (2,), where that is narrower."""
+    # the ratio of two such Gaussians is a Gaussian of mean 0, which is fused
+    for k, new in enumerate(np.square(sigmas).tolist()):
+        old, row = float(state.wheels2[k]), SPEED + k
+        if new < old:
+            R = np.array([[new * old / (old - new)]])
+            state.apply(np.array([row]), np.eye(1), R, -state.x[row : row + 1])
+            state.wheels2[k] = new
 
 
 def begin_sweep(state: JointState, cov: Array) -> None:

@@ -29,7 +29,7 @@ from rlml_slam.slam.front_end.joint_state import (
     JointState,
     begin_sweep,
     end_sweep,
-    limit_wheels,
+    narrow_scale_errors,
 )
 from rlml_slam.slam.front_end.motion_hypotheses import FRESH, Fit, MotionHypotheses
 from rlml_slam.slam.front_end.scan_update import relative
@@ -59,7 +59,7 @@ class MotionTerm:
         self._odometry = STANDING  # the newest motion that it measured
         self.stamp: int | None = None
         self.interval = 0.0
-        self.has_odometry = self.is_constant_velocity = self._has_lidar = False
+        self.has_odometry = self.is_constant_velocity = False
         self.forget_velocity()
 
     def forget_velocity(self) -> None:
@@ -83,9 +83,8 @@ class MotionTerm:
     def predict(self, state: JointState, observation: Observation) -> None:
         """Move the pose to the stamp of the observation (eq. 5 to 9)."""
         last, self.stamp = self.stamp, observation.stamp
-        if observation.points is not None and not self._has_lidar:
-            limit_wheels(state, (*self._p.scale_error_sigma, self._p.drift_sigma))
-            self._has_lidar = True
+        if observation.points is not None:
+            narrow_scale_errors(state, self._p.scale_error_sigma)
         self.has_odometry |= observation.odom_pose is not None
         self.is_constant_velocity = not self.has_odometry and last is not None
         self.interval = dt = 0.0 if last is None else (observation.stamp - last) * 1e-9

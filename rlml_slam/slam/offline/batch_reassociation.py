@@ -108,8 +108,7 @@ class BatchReassociation:
     def _start(self) -> Start:
         """First pose, which defines the map, and the prior of bias and scale errors."""
         m = self._p.motion
-        wheels = np.maximum(m.scale_error_sigma, m.scale_error_sigma_without_lidar)
-        sigma = np.array([0.0, 0.0, 0.0, m.imu_bias_sigma, *wheels])
+        sigma = np.array([0.0, 0.0, 0.0, m.imu_bias_sigma, *m.first_scale_errors])
         return Start(np.append(self._p.node.map_start_pose, np.zeros(3)), np.diag(sigma**2))
 
     def _sights(

@@ -4,21 +4,16 @@ import pytest
 from made_worlds import SECOND, STEP
 
 from rlml_slam import se2
+from rlml_slam.motion import STILL
 from rlml_slam.params import MotionNoise, Parameters, from_mapping
 from rlml_slam.slam.front_end.front_end import FrontEnd
-from rlml_slam.slam.front_end.joint_state import (
-    SPEED,
-    TURN,
-    WHEELS,
-    JointState,
-    limit_wheels,
-)
+from rlml_slam.slam.front_end.joint_state import SPEED, WHEELS, JointState, narrow_scale_errors
 from rlml_slam.slam.front_end.motion_term import MotionTerm, expected_motion
 from rlml_slam.types import Motion, Observation
 
 NOISE = MotionNoise()
 ERRORS = (*NOISE.scale_error_sigma, NOISE.drift_sigma)
-WITHOUT_LIDAR = (*NOISE.scale_error_sigma_without_lidar, NOISE.drift_sigma)
+WITHOUT_LIDAR = (*NOISE.first_scale_errors, NOISE.drift_sigma)
 SIGMA = np.array([0.01, 0.01, 0.001])  # of a pose that is measured
 DT = STEP / SECOND
 
@@ -107,20 +102,37 @@ def test_from_the_first_scan_on_the_wheels_err_less():
 
 def test_larger_errors_with_a_lidar_hold_without_one_too():
     p = from_mapping({'motion.scale_error_sigma': (0.2, 0.3)}, Parameters)
-    front_end = FrontEnd(p)
-    np.testing.assert_allclose(np.sqrt(front_end.state.wheels2), (0.2, 0.3, NOISE.drift_sigma))
-    np.testing.assert_allclose(np.sqrt(FrontEnd(Parameters()).state.wheels2), WITHOUT_LIDAR)
+    assert p.motion.first_scale_errors == (0.2, 0.3)
+    np.testing.assert_allclose(np.sqrt(FrontEnd(p).state.wheels2), (0.2, 0.3, NOISE.drift_sigma))
 
 
-def test_a_limit_keeps_what_is_known_better():
-    state = JointState(np.zeros(3), np.zeros((3, 3)), 0.0, wheels=WITHOUT_LIDAR)
-    state.P[0, 0], state.P[0, TURN], state.P[TURN, 0] = 1.0, 0.05, 0.05
-    state.P[SPEED, SPEED] = 1e-4
-    limit_wheels(state, ERRORS)
-    sigma = np.sqrt(np.diag(state.P))
-    np.testing.assert_allclose(sigma[WHEELS], (0.01, *ERRORS[1:]))
-    assert sigma[0] == 1.0
-    assert state.P[0, TURN] / (sigma[0] * sigma[TURN]) == pytest.approx(0.5)
+def test_a_front_end_that_begins_again_has_not_seen_its_lidar():
+    front_end = FrontEnd(Parameters())
+    np.testing.assert_allclose(np.sqrt(front_end.state.wheels2), WITHOUT_LIDAR)
+    front_end.process(Observation(0, STILL, np.eye(2), np.zeros(2), odom_pose=np.zeros(3)))
+    np.testing.assert_allclose(np.sqrt(front_end.state.wheels2), ERRORS)
+    front_end.reset(np.zeros(3), np.zeros((3, 3)))
+    np.testing.assert_allclose(np.sqrt(front_end.state.wheels2), WITHOUT_LIDAR)
+
+
+@pytest.mark.parametrize('sigmas', [NOISE.scale_error_sigma, (0.01, 0.02), (0.0, 0.0), (0.3, 0.4)])
+def test_a_narrower_prior_is_as_if_it_had_been_there_from_the_start(sigmas):
+    """To mean and covariance, with all that was measured before."""
+    rng = np.random.default_rng(3)
+    wide = np.array(WITHOUT_LIDAR[:2])
+    H, measured = rng.normal(size=(5, 2)), 0.02 * rng.normal(size=5)
+    states = []
+    for prior in (wide, np.minimum(wide, sigmas)):
+        state = JointState(np.zeros(3), 0.01 * np.eye(3), 0.0, wheels=(*prior, 0.03))
+        columns = np.array([0, 1, SPEED, SPEED + 1])
+        J = np.hstack([np.ones((5, 2)), H])
+        state.apply(columns, J, 1e-3 * np.eye(5), measured)
+        states.append(state)
+    assert abs(states[0].x[WHEELS]).max() > 1e-3
+    narrow_scale_errors(states[0], sigmas)
+    np.testing.assert_allclose(states[0].x, states[1].x, atol=1e-12)
+    np.testing.assert_allclose(states[0].P, states[1].P, atol=1e-12)
+    np.testing.assert_allclose(states[0].wheels2, states[1].wheels2)
 
 
 def test_what_may_be_no_way_at_all_tells_nothing():
