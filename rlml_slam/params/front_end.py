@@ -42,7 +42,7 @@ class MotionNoise(Group, prefix='motion.'):
         1.0,
     )
     scale_error_sigma_without_lidar: tuple[float, ...] = param(
-        (0.03, 0.1), 'the same until the first scan, where these are larger', '', 0.0, 1.0
+        (0.03, 0.1), 'the same until the first scan; the larger of both holds', '', 0.0, 1.0
     )
     drift_sigma: float = param(
         0.03,

@@ -27,8 +27,8 @@ DEEP = QoSProfile(depth=2000)
 LOGS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LATEST = 50  # frames before its end, the robot slows down while anything is to be decided
 SLOWER = 1.0  # [s] of the wall clock between two frames then: a search has its time
-# frames that a loaded machine may be behind, before the robot waits for it: more than the front end
-# holds back while it awaits the transform of a sensor
+# frames that a loaded machine may be behind, before the robot waits for it: more than those that
+# the front end holds back while it awaits the transform of a sensor
 BEHIND = 20
 COMMANDS = {'rlml/session_start': DEEP, 'rlml/localization_map': LATCHED}
 TALK = {'front_end': 'rlml/frames', 'back_end': 'rlml/session_start'}

@@ -149,8 +149,8 @@ class JointState:
         self.P[MOVING, MOVING] = self._unknown
 
     def take_systematic_errors(self, other: JointState) -> None:
-        """Take gyro bias and scale errors, with their covariance, of another state."""
-        self.x[SYSTEMATIC] = other.x[SYSTEMATIC]
+        """Take gyro bias and scale errors, with their covariance and prior, of another state."""
+        self.x[SYSTEMATIC], self.wheels2 = other.x[SYSTEMATIC], other.wheels2.copy()
         self.P[SYSTEMATIC, SYSTEMATIC] = other.P[SYSTEMATIC, SYSTEMATIC]
 
     def widen(self, cov: Array) -> None:
@@ -345,7 +345,8 @@ def predict(
 
 def narrow_scale_errors(state: JointState, sigmas: Sequence[float]) -> None:
     """Replace the prior of the scale errors by one of ``sigmas`` (2,), where that is narrower."""
-    # the ratio of two such Gaussians is a Gaussian of mean 0, which is fused
+    # the ratio of two such Gaussians is a Gaussian of mean 0, which is fused; by how much they
+    # varied until now is not taken back
     for k, new in enumerate(np.square(sigmas).tolist()):
         old, row = float(state.wheels2[k]), SPEED + k
         if new < old:

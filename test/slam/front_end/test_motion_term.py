@@ -9,7 +9,7 @@ from rlml_slam.params import MotionNoise, Parameters, from_mapping
 from rlml_slam.slam.front_end.front_end import FrontEnd
 from rlml_slam.slam.front_end.joint_state import SPEED, WHEELS, JointState, narrow_scale_errors
 from rlml_slam.slam.front_end.motion_term import MotionTerm, expected_motion
-from rlml_slam.types import Motion, Observation
+from rlml_slam.types import Motion, Observation, Reflectors
 
 NOISE = MotionNoise()
 ERRORS = (*NOISE.scale_error_sigma, NOISE.drift_sigma)
@@ -85,7 +85,7 @@ def test_noise_of_the_wheels_is_not_taken_for_a_share():
 
 
 def test_from_the_first_scan_on_the_wheels_err_less():
-    """Until then only odometry leads from one reflector to the next; what is known is kept."""
+    """Until then only odometry leads from one reflector to the next."""
     state = JointState(np.zeros(3), np.zeros((3, 3)), 0.0, wheels=WITHOUT_LIDAR)
     term = MotionTerm(Parameters())
     standing = Motion(np.zeros(3), 1e-8 * np.eye(3))
@@ -115,9 +115,32 @@ def test_a_front_end_that_begins_again_has_not_seen_its_lidar():
     np.testing.assert_allclose(np.sqrt(front_end.state.wheels2), WITHOUT_LIDAR)
 
 
+@pytest.mark.parametrize('turn', [NOISE.scale_error_sigma[1], 0.0])
+def test_relocation_in_a_saved_map_keeps_what_is_known_of_the_wheels(turn):
+    """The scan that follows replaces no prior for the second time."""
+    p = from_mapping({'motion.scale_error_sigma': (0.03, turn)}, Parameters)
+    front_end = FrontEnd(p)
+    seen = np.zeros(1, dtype=np.int64)
+    cov = 1e-4 * np.eye(2)[None]
+    front_end.use_map(Reflectors(seen, np.array([[3.0, 1.0]]), cov, seen, seen, np.zeros(1)))
+
+    def scan(k):
+        still = Observation(k * STEP, STILL, np.eye(2), np.zeros(2), odom_pose=np.zeros(3))
+        front_end.process(still)
+        return front_end.state.x[WHEELS].copy(), front_end.state.P[WHEELS, WHEELS].copy()
+
+    scan(0)
+    front_end.state.x[SPEED + 1] = turn
+    before = scan(1)
+    front_end.relocate(np.array([1.0, 1.0, 0.0]), 1e-2 * np.eye(3))
+    for value, expected in zip(scan(2), before, strict=True):
+        np.testing.assert_allclose(value, expected, rtol=0.01, atol=1e-9)
+    np.testing.assert_allclose(np.sqrt(front_end.state.wheels2), (0.03, turn, NOISE.drift_sigma))
+
+
 @pytest.mark.parametrize('sigmas', [NOISE.scale_error_sigma, (0.01, 0.02), (0.0, 0.0), (0.3, 0.4)])
 def test_a_narrower_prior_is_as_if_it_had_been_there_from_the_start(sigmas):
-    """To mean and covariance, with all that was measured before."""
+    """To mean and covariance, with all that was measured before, where nothing varied."""
     rng = np.random.default_rng(3)
     wide = np.array(WITHOUT_LIDAR[:2])
     H, measured = rng.normal(size=(5, 2)), 0.02 * rng.normal(size=5)

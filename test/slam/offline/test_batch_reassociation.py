@@ -10,7 +10,7 @@ import pytest
 from made_worlds import ROOM, TinyWorld, detections_of, drive, errors, observations
 
 from rlml_slam import se2
-from rlml_slam.params import Parameters
+from rlml_slam.params import MotionNoise, Parameters
 from rlml_slam.slam.offline import batch_reassociation
 from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.store import map_file
@@ -77,6 +77,8 @@ def among_groups(seed, apart, sigma):
     smooth = batch_reassociation.smooth
 
     def spy(start, steps, *args):
+        sigmas = np.sqrt(np.diag(start.P)[4:])
+        np.testing.assert_allclose(sigmas, MotionNoise().first_scale_errors)
         sights = [q for s in steps for q in s.sights]
         before.least.append(min(q.R[0, 0] for q in sights))
         return smooth(start, steps, *args)
