@@ -83,7 +83,7 @@ def _over_dds(args: argparse.Namespace) -> list[str]:
     dirty = over_dds.drive(args.dds, args.rate, args.seed, args.log / 'mutated', seconds)
     (r0, e0), (r1, e1) = over_dds.figures(clean), over_dds.figures(dirty)
     text = f'poses {r0:.2f} -> {r1:.2f} Hz, error {e0:.4f} -> {e1:.4f} m'
-    print(f'over DDS: {dirty.sent} messages at {args.rate:g} Hz, {text}')
+    print(f'over DDS: {dirty.sent} messages at {dirty.rate:.0f} Hz, {text}')
     for name, value in sorted(dirty.refused.items()):
         if 'refused' in name or 'invalid' in name or 'future' in name:
             print(f'  {name}: {value}')
