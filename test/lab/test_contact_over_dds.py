@@ -3,6 +3,10 @@
 
 from types import SimpleNamespace
 
+import pytest
+
+pytest.importorskip('rclpy', reason='messages over DDS need rclpy')
+
 from rlml_lab.contact.over_dds import _run
 
 
