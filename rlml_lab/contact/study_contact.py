@@ -15,10 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from rlml_lab.contact import in_process, over_dds
+from rlml_slam.errors import RlmlError
+from rlml_slam.params.simulator import Laser
 
 SHARE, WORSE = 0.95, 2.0  # of the clean poses, and of their error
 GROWTH = 20.0  # [MB]
 RATIO = 0.5  # mutated messages for each good one of the sensors
+SCANS = Laser().rate  # [Hz] of the simulator
 FLOOR = 0.02  # [m] of error that is no change
 
 
@@ -36,6 +39,8 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Figures of each part; 1 where a bound is not kept."""
+    if args.rate <= 0.0:
+        raise RlmlError(f'--rate is {args.rate:g} Hz; it must be above 0')
     bad: list[str] = []
     if args.messages:
         before = Path.cwd()
@@ -83,7 +88,7 @@ def _over_dds(args: argparse.Namespace) -> list[str]:
     dirty = over_dds.drive(args.dds, args.rate, args.seed, args.log / 'mutated', seconds)
     (r0, e0), (r1, e1) = over_dds.figures(clean), over_dds.figures(dirty)
     text = f'poses {r0:.2f} -> {r1:.2f} Hz, error {e0:.4f} -> {e1:.4f} m'
-    print(f'over DDS: {dirty.sent} messages at {dirty.rate:.0f} Hz, {text}')
+    print(f'over DDS: {dirty.sent} messages at {dirty.rate:.3g} of {args.rate:g} Hz, {text}')
     for name, value in sorted(dirty.refused.items()):
         if 'refused' in name or 'invalid' in name or 'future' in name:
             print(f'  {name}: {value}')
@@ -91,5 +96,7 @@ def _over_dds(args: argparse.Namespace) -> list[str]:
     print(f'  {grown}')
     kept = r1 >= SHARE * r0 and e1 <= max(WORSE * e0, FLOOR)
     bad = [] if kept else [f'over DDS: {text}']
+    if r0 < SHARE * SCANS or dirty.rate < SHARE * args.rate:
+        bad.append('over DDS: the machine is too slow for the rate, so the figures say little')
     # the map grows in both
     return bad if dirty.growth - clean.growth <= GROWTH else [*bad, f'over DDS: {grown}']
