@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 import dataclasses
-import time
+from functools import partial
 from itertools import islice
 
 import numpy as np
 import pytest
+from calls import count_calls
 from differences import central_differences
 
 from rlml_lab.carrier.carrier import simulate_carrier, true_features
@@ -140,19 +141,21 @@ def test_covariances_account_for_the_errors(kind):
 
 
 def test_cost_and_memory_stay_constant():
-    """Nothing grows over 40 s of a conveyor whose features come and go."""
+    """Nothing grows over 40 s of a conveyor whose features come and go.
+
+    The time of an update, at most 10 ms, is a claim of ``rlml-lab study deformable --window``.
+    """
     run = steps(400, kind='conveyor', ids=False, false_detections=0.05)
     window = DeformableWindow(Deformable(), Reflector())
-    sizes, seconds = [], []
+    sizes, calls = [], []
     for s in run:
-        started = time.process_time()
-        window.update(s.stamp, s.motion, s.detections, CarrierVelocity(s.linear, s.angular))
-        seconds.append(time.process_time() - started)
+        velocity = CarrierVelocity(s.linear, s.angular)
+        update = partial(window.update, s.stamp, s.motion, s.detections, velocity)
+        calls.append(count_calls(update))
         sizes.append(sum(a.nbytes for a in (*window._w, *window._prior, window._cov)))
     assert sizes[-1] == sizes[200]
-    early, late = np.median(seconds[100:200]), np.median(seconds[300:])
-    assert late < 1.5 * early + 1e-3
-    assert np.percentile(seconds[100:], 99) < 0.01  # the issue's 10 ms; some 3 ms of CPU measured
+    assert np.median(calls[300:]) < 1.1 * np.median(calls[100:200])
+    assert max(calls) < 1000  # some 600
 
 
 def test_anonymous_features_are_followed_among_ghosts():

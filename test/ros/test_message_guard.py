@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from types import SimpleNamespace
 
 import pytest
@@ -68,15 +67,13 @@ def test_error_that_nobody_expected_is_in_the_log_however_many_refusals_are(node
     assert len(said.errors) == MAX_LOGGED
 
 
-def test_large_message_is_refused_before_anything_is_made_of_it(node):
+def test_large_message_is_refused_before_anything_is_made_of_it(node, monkeypatch):
     used = []
     data = serialize_message(PoseArray(poses=[Pose()] * 20_000))
     heard = listener(node, used.append, PoseArray)
-    began = time.perf_counter()
+    monkeypatch.setattr('rclpy.serialization.deserialize_message', used.append)
     for _ in range(100):
         heard.receive(data)
-    # to read one takes 0.4 s
-    assert time.perf_counter() - began < 0.4
     assert used == []
     assert guard_of(node).refused == {'scan': 100}
     assert 'more than 65536 of a PoseArray' in guard_of(node).last
