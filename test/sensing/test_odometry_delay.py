@@ -4,10 +4,11 @@
 import numpy as np
 import pytest
 
-from rlml_slam.motion import SECOND, MotionBuffer
-from rlml_slam.params import MotionNoise
+from rlml_slam.motion import SECOND, STILL, MotionBuffer
+from rlml_slam.params import MotionNoise, Parameters
 from rlml_slam.sensing.synchronization.odometry_delay import OdometryDelay
-from rlml_slam.types import Odometry
+from rlml_slam.sensing.synchronization.synchronizer import Synchronizer
+from rlml_slam.types import Frame, Observation, Odometry, Status
 
 START = 1_700_000_000 * SECOND
 
@@ -122,3 +123,41 @@ def test_motion_is_that_of_odometry_stamped_right():
     buffers[1].forget_odometry_after(end + delay)
     buffers[0].forget_odometry_after(end)
     assert buffers[1].newest == buffers[0].newest
+
+
+def followed(delay, measured, seconds=120.0):
+    """The delay [s] found of poses of which every second one was ``measured``.
+
+    The others are those of the odometry as it is used, delay and all.
+    """
+    synchronizer = Synchronizer(Parameters())
+    last = moved = heading(-delay)
+    for k in range(round(seconds * 20)):
+        t = k / 20.0
+        sample = np.array([0.0, 0.0, heading(t - delay)])
+        stamp = START + round(t * SECOND)
+        synchronizer.add_odometry(Odometry(stamp, sample))
+        if k % 4:
+            continue
+        is_measured = k % 8 == 0
+        used = heading(t - delay + synchronizer.delay.now / SECOND)
+        last = heading(t) if is_measured else last + used - moved
+        moved = used
+        status = Status.USED if is_measured and measured == 'reflectors' else Status.NEW
+        pose = np.array([0.0, 0.0, last])
+        frame = Frame(
+            stamp, Observation(stamp, STILL), pose, np.eye(3), pose, np.eye(3), np.array([0]),
+            np.array([status]), scan_used=is_measured and measured == 'scan',
+        )  # fmt: skip
+        synchronizer.follow(frame)
+    return synchronizer.delay.now / SECOND
+
+
+@pytest.mark.parametrize('delay', [0.2, -0.2, 0.0])
+@pytest.mark.parametrize('measured', ['scan', 'reflectors'])
+def test_poses_of_the_odometry_itself_say_nothing_of_its_delay(delay, measured):
+    assert abs(followed(delay, measured) - delay) < 0.016
+
+
+def test_where_nothing_is_measured_no_delay_is_found():
+    assert followed(0.2, 'nothing') == 0.0

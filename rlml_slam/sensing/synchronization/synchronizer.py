@@ -30,7 +30,7 @@ from rlml_slam.sensing.synchronization.sensor_kinds import SensorKinds
 from rlml_slam.sensing.synchronization.stamp_check import CONFIRM, StampCheck
 from rlml_slam.sensing.synchronization.stamp_jitter import StampJitter
 from rlml_slam.sensing.synchronization.waiting_queue import WaitingQueue
-from rlml_slam.types import Detections, Frame, Imu, Observation, Odometry, Scan
+from rlml_slam.types import Detections, Frame, Imu, Observation, Odometry, Scan, Status
 
 MEASURED = ('scan', 'reflectors')  # streams that give observations
 LARGEST_VIEW = 2.2 * math.pi  # [rad] some drivers repeat beams at the end of a turn
@@ -166,8 +166,12 @@ class Synchronizer:
         return self._release()
 
     def follow(self, frame: Frame) -> None:
-        """Correct the stamps of odometry by what the pose of an observation says of its delay."""
-        if not self._node.estimate_odometry_delay:
+        """Correct the stamps of odometry by what the pose of an observation says of its delay.
+
+        A pose that neither scan nor reflectors corrected is that of the odometry itself.
+        """
+        is_measured = frame.scan_used or (frame.statuses == Status.USED).any()
+        if not self._node.estimate_odometry_delay or not is_measured:
             return
         before = self.delay.now
         self.delay.add_pose(frame.stamp, frame.T_local_base[2])

@@ -4,10 +4,16 @@ import pytest
 from made_worlds import SECOND, STEP
 
 from rlml_slam import se2
-from rlml_slam.motion import STILL
+from rlml_slam.motion import STILL, compose_motion
 from rlml_slam.params import MotionNoise, Parameters, from_mapping
 from rlml_slam.slam.front_end.front_end import FrontEnd
-from rlml_slam.slam.front_end.joint_state import SPEED, WHEELS, JointState, narrow_scale_errors
+from rlml_slam.slam.front_end.joint_state import (
+    SPEED,
+    WHEELS,
+    JointState,
+    narrow_scale_errors,
+    predict_unseen,
+)
 from rlml_slam.slam.front_end.motion_term import MotionTerm, expected_motion
 from rlml_slam.types import Motion, Observation, Reflectors
 
@@ -16,6 +22,25 @@ ERRORS = (*NOISE.scale_error_sigma, NOISE.drift_sigma)
 WITHOUT_LIDAR = (*NOISE.first_scale_errors, NOISE.drift_sigma)
 SIGMA = np.array([0.01, 0.01, 0.001])  # of a pose that is measured
 DT = STEP / SECOND
+
+
+def measured(rng, shares, v, w):
+    """A step at ``v`` [m/s] and ``w`` [rad/s] by odometry that errs by these shares."""
+    sigma_v = NOISE.speed_noise * v + NOISE.speed_noise_floor
+    sigma_w = NOISE.turn_noise * abs(w) + NOISE.turn_noise_floor
+    sigma = np.array([sigma_v, sigma_w]) * DT
+    wheels = np.array([v, w - shares[2] * v]) / (1.0 + shares[:2])
+    way, turn = wheels * DT + sigma * rng.standard_normal(2)
+    delta = np.array([way * np.cos(0.5 * turn), way * np.sin(0.5 * turn), turn])
+    by_heading = np.array([-0.5 * delta[1], 0.5 * delta[0], 1.0])  # of the end of an arc
+    cov = np.diag([sigma[0], 1e-4, 0.0]) ** 2
+    cov += sigma[1] ** 2 * np.outer(by_heading, by_heading)
+    return Motion(delta, cov, turn_gain=turn * by_heading, drift_gain=way * by_heading)
+
+
+def varied(rng, shares, kept, sigmas=ERRORS):
+    """The shares some time later."""
+    return kept * shares + np.sqrt(1.0 - kept**2) * np.array(sigmas) * rng.standard_normal(3)
 
 
 def drive(rng, shares, steps, turning=0.6):
@@ -30,28 +55,15 @@ def drive(rng, shares, steps, turning=0.6):
         v, w = 1.0, turning * (-1.0) ** (k // 100)
         true = se2.exp(np.array([v, 0.0, w]) * DT)
         pose = se2.compose(pose, true)
-        sigma_v = NOISE.speed_noise * v + NOISE.speed_noise_floor
-        sigma_w = NOISE.turn_noise * abs(w) + NOISE.turn_noise_floor
-        sigma = np.array([sigma_v, sigma_w]) * DT
-        wheels = np.array([v, w - shares[2] * v]) / (1.0 + shares[:2])
-        measured = wheels * DT + sigma * rng.standard_normal(2)
-        half = 0.5 * measured[1]
-        delta = np.array([measured[0] * np.cos(half), measured[0] * np.sin(half), measured[1]])
-        by_heading = np.array([-0.5 * delta[1], 0.5 * delta[0], 1.0])  # of the end of an arc
-        cov = np.diag([sigma[0], 1e-4, 0.0]) ** 2
-        cov += sigma[1] ** 2 * np.outer(by_heading, by_heading)
-        by_turn = measured[1] * by_heading
+        motion = measured(rng, shares, v, w)
         before = state.pose
-        by_way = measured[0] * by_heading
-        motion = Motion(delta, cov, turn_gain=by_turn, drift_gain=by_way)
         state.predict(motion, 0.0, kept, expected_motion(velocity, DT, NOISE))
         z = pose + SIGMA * rng.standard_normal(3)
         error = z - state.pose
         error[2] = se2.wrapped(error[2])
         state.apply(np.arange(3), np.eye(3), np.diag(SIGMA**2), error)
         velocity = se2.log(se2.between(before, state.pose)) / DT
-        innovation = np.sqrt(1.0 - kept**2) * np.array(ERRORS)
-        shares = kept * shares + innovation * rng.standard_normal(3)
+        shares = varied(rng, shares, kept)
     return state.x[WHEELS], state.P[WHEELS, WHEELS], shares
 
 
@@ -163,3 +175,44 @@ def test_what_may_be_no_way_at_all_tells_nothing():
     assert expected_motion(np.array([1.0, 0.0, 0.1]), 0.5, NOISE).all()
     for velocity, dt in (((1.0, 0.0, 0.1), 5.0), ((50.0, 0.0, 0.1), 0.5), ((1.0, 0.0, 50.0), 0.5)):
         assert not expected_motion(np.array(velocity), dt, NOISE).any()
+
+
+@pytest.mark.parametrize(
+    ('v', 'turning', 'steps'), [(0.1, 0.0, 300), (0.2, 0.05, 300), (0.5, 0.2, 100)]
+)
+def test_way_unseen_is_as_uncertain_as_scale_errors_make_it(v, turning, steps):
+    """Up to half a minute between two sightings: much more than the noise of the odometry."""
+    rng = np.random.default_rng(4)
+    runs, nees, without = 60, [], []
+    kept = np.exp(-DT / NOISE.first_scale_error_time)
+    for _ in range(runs):
+        shares = rng.normal(0.0, WITHOUT_LIDAR)
+        state = JointState(np.zeros(3), 1e-8 * np.eye(3), 0.0, wheels=WITHOUT_LIDAR)
+        term, pose, motion = MotionTerm(Parameters()), np.zeros(3), STILL
+        term.predict(state, Observation(0, STILL, odom_pose=np.zeros(3)))
+        for _ in range(steps):
+            pose = se2.compose(pose, se2.exp(np.array([v, 0.0, turning]) * DT))
+            motion = compose_motion(motion, measured(rng, shares, v, turning))
+            shares = varied(rng, shares, kept, WITHOUT_LIDAR)
+        term.predict(state, Observation(steps * STEP, motion, odom_pose=motion.delta))
+        e = pose - state.pose
+        e[2] = se2.wrapped(e[2])
+        nees.append(e @ np.linalg.solve(state.pose_cov, e))
+        without.append(e @ np.linalg.solve(motion.cov, e))
+    assert np.mean(nees) == pytest.approx(3.0, abs=4.0 * np.sqrt(6.0 / runs))
+    assert np.mean(without) > 7.0
+
+
+def test_what_the_wheels_err_by_stays_tied_to_where_they_led():
+    """A sighting after a long way says what turned the robot."""
+    state = JointState(np.zeros(3), 1e-8 * np.eye(3), 0.0, wheels=WITHOUT_LIDAR)
+    arc = Motion(np.array([2.0, 1.0, 1.5]), 1e-6 * np.eye(3), turn_gain=np.array([-0.7, 1.0, 1.5]))
+    predict_unseen(state, arc, 0.0, 1.0)
+    J = np.array([[2.0, -0.7, 0.0], [1.0, 1.0, 0.0], [0.0, 1.5, 0.0]])
+    wheels = np.diag(np.square(WITHOUT_LIDAR))
+    np.testing.assert_allclose(state.P[:3, WHEELS], J @ wheels, atol=1e-9)
+    np.testing.assert_allclose(state.P[:3, :3], J @ wheels @ J.T, atol=2e-6)
+    np.testing.assert_allclose(state.P, state.P.T, atol=1e-12)
+    error = np.array([1.65 - state.x[2]])  # it turned by a tenth more than its wheels said
+    state.apply(np.array([2]), np.eye(1), 1e-8 * np.eye(1), error)
+    assert state.x[SPEED + 1] == pytest.approx(0.1, rel=0.01)
