@@ -155,7 +155,7 @@ def test_cost_and_memory_stay_constant():
         sizes.append(sum(a.nbytes for a in (*window._w, *window._prior, window._cov)))
     assert sizes[-1] == sizes[200]
     assert np.median(calls[300:]) < 1.1 * np.median(calls[100:200])
-    assert max(calls) < 1000  # some 600
+    assert max(calls[100:]) < 1000  # some 600
 
 
 def test_anonymous_features_are_followed_among_ghosts():
