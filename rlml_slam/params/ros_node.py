@@ -63,7 +63,7 @@ class Node(Group, prefix=''):
         True, 'remove the jitter of the stamps of sensors with a constant rate'
     )
     estimate_odometry_delay: bool = param(
-        True, 'correct the stamps of odometry by how late they are against the scans'
+        True, 'correct the stamps of odometry by how late they are against scans and reflectors'
     )
     leave_out_robot_parts: bool = param(
         True, 'leave out beams that see the robot itself: their range stays the same as it moves'

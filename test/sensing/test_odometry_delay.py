@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The delay of odometry is found from turns, and where there is none, none is said."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -125,8 +127,8 @@ def test_motion_is_that_of_odometry_stamped_right():
     assert buffers[1].newest == buffers[0].newest
 
 
-def followed(delay, measured, seconds=120.0):
-    """The delay [s] found of poses of which every second one was ``measured``.
+def followed(delay, measured, seconds=120.0, until=math.inf):
+    """The delay [s] found of poses of which every second one was ``measured``, for a while.
 
     The others are those of the odometry as it is used, delay and all.
     """
@@ -139,7 +141,7 @@ def followed(delay, measured, seconds=120.0):
         synchronizer.add_odometry(Odometry(stamp, sample))
         if k % 4:
             continue
-        is_measured = k % 8 == 0
+        is_measured = k % 8 == 0 and t < until
         used = heading(t - delay + synchronizer.delay.now / SECOND)
         last = heading(t) if is_measured else last + used - moved
         moved = used
@@ -150,14 +152,17 @@ def followed(delay, measured, seconds=120.0):
             np.array([status]), scan_used=is_measured and measured == 'scan',
         )  # fmt: skip
         synchronizer.follow(frame)
-    return synchronizer.delay.now / SECOND
+    return synchronizer.delay
 
 
 @pytest.mark.parametrize('delay', [0.2, -0.2, 0.0])
 @pytest.mark.parametrize('measured', ['scan', 'reflectors'])
 def test_poses_of_the_odometry_itself_say_nothing_of_its_delay(delay, measured):
-    assert abs(followed(delay, measured) - delay) < 0.016
+    assert abs(followed(delay, measured).now / SECOND - delay) < 0.016
 
 
-def test_where_nothing_is_measured_no_delay_is_found():
-    assert followed(0.2, 'nothing') == 0.0
+def test_where_nothing_is_measured_nothing_is_compared():
+    short, long = followed(0.2, 'scan', 60.0), followed(0.2, 'scan', 300.0, until=60.0)
+    assert abs(long.now / SECOND - 0.2) < 0.016
+    assert long._num == pytest.approx(short._num, abs=1.5)
+    assert followed(0.2, 'nothing')._num == 0.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How late odometry is stamped against the scans, from turns that both have measured.
+"""How late odometry is stamped against scans and reflectors, from turns that both measured.
 
 A driver that stamps what a controller sent some time ago is late; one that stamps a scan when all
 of it has arrived makes odometry early. Where the turn rate changes, the turn between two poses of

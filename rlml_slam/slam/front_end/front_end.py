@@ -211,11 +211,11 @@ class FrontEnd:
         cov = se2.rotate_cov(cov, T_local_map[2])
         saved = self._map.saved
         if saved is not None:
-            before, stamp, T_map_local = self.state, self._motion.stamp, self.T_map_local
+            before, motion, T_map_local = self.state, self._motion, self.T_map_local
             self.reset(pose, cov)
             self.use_map(saved.reflectors, saved.grid)
             self.state.take_systematic_errors(before)
-            self._motion.stamp = stamp
+            self._motion.stamp, self._motion.has_lidar = motion.stamp, motion.has_lidar
         else:
             self.state.place(pose, cov)
             self._scans.start_new_submaps()

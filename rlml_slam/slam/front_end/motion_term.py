@@ -58,7 +58,7 @@ class MotionTerm:
         self._odometry_noise = OdometryNoise(params.motion)
         self._predicted: tuple[Array, Array] | None = None  # pose in the submap, covariance
         self._odometry = STANDING  # the newest motion that it measured
-        self._has_lidar = False
+        self.has_lidar = False
         self.stamp: int | None = None
         self.interval = 0.0
         self.has_odometry = self.is_constant_velocity = False
@@ -87,7 +87,7 @@ class MotionTerm:
         last, self.stamp = self.stamp, observation.stamp
         if observation.points is not None:
             narrow_scale_errors(state, self._p.scale_error_sigma)
-            self._has_lidar = True
+            self.has_lidar = True
         self.has_odometry |= observation.odom_pose is not None
         self.is_constant_velocity = not self.has_odometry and last is not None
         self.interval = dt = 0.0 if last is None else (observation.stamp - last) * 1e-9
@@ -95,12 +95,12 @@ class MotionTerm:
         if self.is_constant_velocity:
             self._constant_velocity.predict(state, dt, motion)
             return
-        lasting = p.scale_error_time if self._has_lidar else p.first_scale_error_time
+        lasting = p.scale_error_time if self.has_lidar else p.first_scale_error_time
         walk, kept = p.imu_bias_walk**2 * dt, math.exp(-dt / lasting)
         heading, cov = float(state.x[2]), self._sweep_within(motion, dt)
         if cov is not None:
             motion = replace(motion, cov=positive(motion.cov - cov))
-        if motion.known and dt > FRESH and not self._has_lidar:
+        if motion.known and dt > FRESH and not self.has_lidar:
             predict_unseen(state, motion, walk, kept)
         else:
             expected = expected_motion(self.velocity, dt, p) if motion.known else STANDING
