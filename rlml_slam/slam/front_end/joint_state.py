@@ -358,24 +358,19 @@ def narrow_scale_errors(state: JointState, sigmas: Sequence[float]) -> None:
 def predict_unseen(state: JointState, motion: Motion, walk: float, kept: float) -> None:
     """:meth:`JointState.predict` over a long way on which nothing was seen (eq. 64).
 
-    The odometry says how far the robot went: its noise is small beside the way. The way has the
-    scale errors and the drift of its middle.
+    The odometry says how far the robot went: its noise is small beside the way. All of the way has
+    the scale errors and the drift of its end, so they vary first.
     """
-    _vary_scale_errors(state, math.sqrt(kept))
+    state.x[WHEELS] *= kept
+    state.P[WHEELS, :] *= kept
+    state.P[:, WHEELS] *= kept
+    state.P[WHEELS, WHEELS] += np.diag((1.0 - kept**2) * state.wheels2)
     speed = np.array([*motion.delta[:2], 0.0])
     J = np.stack([speed, motion.turn_gain, motion.drift_gain], axis=-1)
     J = se2.rotation3(state.x[2]) @ J
     state.predict(motion, walk)
     state.P[:3, :] += J @ state.P[WHEELS, :]
     state.P[:, :3] += state.P[:, WHEELS] @ J.T
-    _vary_scale_errors(state, math.sqrt(kept))
-
-
-def _vary_scale_errors(state: JointState, kept: float) -> None:
-    state.x[WHEELS] *= kept
-    state.P[WHEELS, :] *= kept
-    state.P[:, WHEELS] *= kept
-    state.P[WHEELS, WHEELS] += np.diag((1.0 - kept**2) * state.wheels2)
 
 
 def begin_sweep(state: JointState, cov: Array) -> None:

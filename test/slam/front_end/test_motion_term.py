@@ -218,29 +218,6 @@ def test_what_the_wheels_err_by_stays_tied_to_where_they_led():
     assert state.x[SPEED + 1] == pytest.approx(0.1, rel=0.01)
 
 
-def test_a_way_unseen_leaves_the_scale_errors_as_uncertain_as_they_are():
-    """Those at its end are not those of the way, after which the pose is measured."""
-    rng = np.random.default_rng(5)
-    runs, steps, nees = 60, 300, []
-    kept = np.exp(-DT / NOISE.first_scale_error_time)
-    for _ in range(runs):
-        shares = rng.normal(0.0, WITHOUT_LIDAR)
-        state = JointState(np.zeros(3), 1e-8 * np.eye(3), 0.0, wheels=WITHOUT_LIDAR)
-        pose, motion = np.zeros(3), STILL
-        for _ in range(steps):
-            pose = se2.compose(pose, se2.exp(np.array([0.2, 0.0, 0.05]) * DT))
-            motion = compose_motion(motion, measured(rng, shares, 0.2, 0.05))
-            shares = varied(rng, shares, kept, WITHOUT_LIDAR)
-        predict_unseen(state, motion, 0.0, kept**steps)
-        z = pose + SIGMA * rng.standard_normal(3)
-        error = z - state.pose
-        error[2] = se2.wrapped(error[2])
-        state.apply(np.arange(3), np.eye(3), np.diag(SIGMA**2), error)
-        e = shares - state.x[WHEELS]
-        nees.append(e**2 / np.diag(state.P)[WHEELS])
-    assert (np.mean(nees, axis=0) < 1.0 + 4.0 * np.sqrt(2.0 / runs)).all()
-
-
 def test_a_robot_with_a_lidar_has_it_after_a_relocation_in_a_saved_map():
     front_end, seen = FrontEnd(Parameters()), np.zeros(1, dtype=np.int64)
     cov = 1e-4 * np.eye(2)[None]
