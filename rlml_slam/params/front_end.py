@@ -54,9 +54,6 @@ class MotionNoise(Group, prefix='motion.'):
     scale_error_time: float = param(
         600.0, 'correlation time of these errors: load, floor, tyres', 's', 1.0, 1e6
     )
-    scale_error_time_without_lidar: float = param(
-        120.0, 'the same until the first scan; the shorter of both holds', 's', 1.0, 1e6
-    )
     noise_interval: float = param(
         0.1, 'control interval for which the noises above are given', 's', 1e-3, 10.0
     )
@@ -92,11 +89,6 @@ class MotionNoise(Group, prefix='motion.'):
     def first_scale_errors(self) -> tuple[float, ...]:
         """Sigmas (2,) of the scale errors of speed and turn rate until the first scan."""
         return tuple(map(max, self.scale_error_sigma, self.scale_error_sigma_without_lidar))
-
-    @property
-    def first_scale_error_time(self) -> float:
-        """Correlation time [s] of these until then."""
-        return min(self.scale_error_time, self.scale_error_time_without_lidar)
 
 
 @dataclass(frozen=True)

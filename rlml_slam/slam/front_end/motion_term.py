@@ -95,8 +95,7 @@ class MotionTerm:
         if self.is_constant_velocity:
             self._constant_velocity.predict(state, dt, motion)
             return
-        lasting = p.scale_error_time if self.has_lidar else p.first_scale_error_time
-        walk, kept = p.imu_bias_walk**2 * dt, math.exp(-dt / lasting)
+        walk, kept = p.imu_bias_walk**2 * dt, math.exp(-dt / p.scale_error_time)
         heading, cov = float(state.x[2]), self._sweep_within(motion, dt)
         if cov is not None:
             motion = replace(motion, cov=positive(motion.cov - cov))

@@ -64,7 +64,7 @@ class BatchReassociation:
             return
         m = self._p.motion
         dt = 1e-9 * (frame.stamp - self._frames[-1].stamp) if self._frames else 0.0
-        walk, kept = m.imu_bias_walk**2 * dt, math.exp(-dt / m.first_scale_error_time)
+        walk, kept = m.imu_bias_walk**2 * dt, math.exp(-dt / m.scale_error_time)
         self._steps.append(Step(observation.motion, walk, kept))
         # as measured: what the front end grants the detections of a group is no noise in the end
         measured = dataclasses.replace(frame.observation, detections=observation.detections)

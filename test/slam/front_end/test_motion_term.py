@@ -184,7 +184,7 @@ def test_way_unseen_is_as_uncertain_as_scale_errors_make_it(v, turning, steps):
     """Up to half a minute between two sightings: much more than the noise of the odometry."""
     rng = np.random.default_rng(4)
     runs, nees, without = 60, [], []
-    kept = np.exp(-DT / NOISE.first_scale_error_time)
+    kept = np.exp(-DT / NOISE.scale_error_time)
     for _ in range(runs):
         shares = rng.normal(0.0, WITHOUT_LIDAR)
         state = JointState(np.zeros(3), 1e-8 * np.eye(3), 0.0, wheels=WITHOUT_LIDAR)
