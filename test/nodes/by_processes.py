@@ -25,8 +25,8 @@ PATIENCE = 60.0  # [s] for a process to come, or for what it has to say
 CLOUD = 'sensor_msgs/msg/PointCloud2'
 DEEP = QoSProfile(depth=2000)
 LOGS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-LATEST = 50  # frames before its end, the robot slows down while anything is to be decided
-SLOWER = 1.0  # [s] of the wall clock between two frames then: a search has its time
+LATEST = 50  # frames before its end, after the last event, the robot waits for decisions
+SLOWER = 0.4  # [s] of the wall clock between two frames then: a search has 20 s
 # frames that a loaded machine may be behind, before the robot waits for it: more than those that
 # the front end holds back while it awaits the transform of a sensor
 BEHIND = 20
@@ -138,7 +138,8 @@ class ByProcesses(Driver):
             self._live.spin_until(lambda: self._newest >= due, PATIENCE, 'no frame')
             self._due = time.monotonic()
         s = self.scenario
-        if self.now - self.shift >= EPOCH + (len(s.poses) - LATEST) * STEP:
+        last = max([len(s.poses) - LATEST, *(at for at, _, _ in s.events)])
+        if self.now - self.shift >= EPOCH + last * STEP:
             end = time.monotonic() + SLOWER
             while not self._is_decided() and (left := end - time.monotonic()) > 0.0:
                 self._live.executor.spin_once(timeout_sec=left)
