@@ -89,6 +89,7 @@ setup(
         (f'share/{NAME}/launch', sorted(glob('launch/*.launch.py'))),
     ],
     install_requires=[
+        'apsw',
         'argcomplete',
         'bokeh',
         'matplotlib',

@@ -124,6 +124,10 @@ COMMANDS: Table = {
             'fuzz-files': Command(
                 'rlml_lab.contact.study_fuzz_files', 'mutated files of every format that is read'
             ),
+            'broken-bags': Command(
+                'rlml_lab.contact.study_broken_bags',
+                'what can be read of bags that are cut off or damaged',
+            ),
             'kills': Command(
                 'rlml_lab.contact.study_kills', 'processes that are killed while they map, live'
             ),

@@ -209,6 +209,20 @@ def test_sqlite_of_large_messages_cut_off_gives_what_came_before(tmp_path):
     assert set(got) <= set(whole)
 
 
+def test_sqlite_cut_off_within_a_page_gives_no_message_that_ends_in_zeros(tmp_path):
+    file = storage_file(write(tmp_path / 'bag', 'sqlite3', n=2000))
+    with BagReader(file) as bag:
+        whole = set(bag.serialized())
+    data, cut, most = file.read_bytes(), tmp_path / 'cut.db3', 0
+    for k in range(60):
+        cut.write_bytes(data[: len(data) - 4096 * 30 + 2003 * k])
+        with BagReader(cut) as bag:
+            got = set(bag.serialized())
+        assert got <= whole
+        most = max(most, len(got))
+    assert most > 0.9 * len(whole)
+
+
 @pytest.mark.parametrize('column', ['type', 'name'])
 def test_sqlite_topic_without_a_name_or_type_costs_itself_alone(tmp_path, column):
     file = storage_file(write(tmp_path / 'bag', 'sqlite3'))

@@ -8,8 +8,8 @@ the file. The one use is ``BagRecovery(path)`` in bag.py, in place of the librar
 
 from __future__ import annotations
 
+import contextlib
 import os
-import sqlite3
 import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
@@ -19,6 +19,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
 
+import apsw
 from rosbags.interfaces import (
     Connection,
     ConnectionExtRosbag1,
@@ -34,6 +35,7 @@ from rosbags.typesys.msg import normalize_msgtype
 MCAP = b'\x89MCAP0\r\n'
 ROSBAG1 = b'#ROSBAG V2.0\n'
 SQLITE = b'SQLite format 3\0'
+SMALLEST_PAGE = 512  # [bytes] of SQLite
 # a connection when it is met, a message (connection id, log time [ns], raw), or what is broken
 Found: TypeAlias = Connection | tuple[int, int, bytes] | str
 _FORMATS = {
@@ -257,20 +259,64 @@ def _connection(number: int, header: Header, about: Header, owner: Any) -> Conne
 # --- SQLite --------------------------------------------------------------------------------
 
 
+def _pages(file: Path) -> tuple[int, int]:
+    """Size of a page [bytes], and their number as the header has it."""
+    with file.open('rb') as source:
+        header = source.read(32)
+    if len(header) < 32:
+        return SMALLEST_PAGE, 1
+    size = int.from_bytes(header[16:18], 'big')
+    return max(size, SMALLEST_PAGE) if size != 1 else 1 << 16, int.from_bytes(header[28:], 'big')
+
+
+class _WholePages(apsw.VFS):
+    """Shows SQLite the whole pages of a file, and a header that says so.
+
+    What is missing at the end of a page, or of the file, SQLite would read as zeros: a message
+    would end in zeros that were never recorded.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.name = f'whole pages {id(self)}'
+        super().__init__(self.name, '')
+        size, pages = _pages(file)
+        self._size, self._pages = size, min(pages, file.stat().st_size // size)
+
+    def xOpen(self, name: Any, flags: list[int]) -> apsw.VFSFile:
+        """The one file that is opened."""
+        size, pages = self._size, self._pages
+
+        class File(apsw.VFSFile):
+            def xFileSize(self) -> int:
+                return size * pages
+
+            def xRead(self, amount: int, offset: int) -> bytes:
+                data = bytearray(super().xRead(amount, offset))
+                if offset <= 28 and len(data) >= 32 - offset:
+                    data[28 - offset : 32 - offset] = pages.to_bytes(4, 'big')
+                return bytes(data)
+
+        return File('', name, flags)
+
+
+def _definitions(base: apsw.Connection) -> dict[str, MessageDefinition]:
+    """Of the types of messages; recorders write them last, and the types are known mostly."""
+    found: dict[str, MessageDefinition] = {}
+    with contextlib.suppress(apsw.Error):
+        for name, encoding, text in base.execute(
+            'SELECT topic_type, encoding, encoded_message_definition FROM message_definitions'
+        ):
+            form = _FORMATS.get(encoding, MessageDefinitionFormat.NONE)
+            found[name] = MessageDefinition(form, text)
+    return found
+
+
 def _sqlite(file: Path, first: int, owner: Any) -> Iterator[Found]:
-    with closing(sqlite3.connect(f'file:{file}?mode=ro&immutable=1', uri=True)) as base:
+    pages = _WholePages(file)
+    flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
+    with closing(apsw.Connection(f'file:{file}?immutable=1', flags, pages.name)) as base:
         try:
-            # or SQLite refuses a file that is shorter than its header says
-            base.execute('PRAGMA writable_schema=ON')
-            definitions: dict[str, MessageDefinition] = {}
-            tables = {row[0] for row in base.execute('SELECT name FROM sqlite_master')}
-            if 'message_definitions' in tables:
-                for name, encoding, text in base.execute(
-                    'SELECT topic_type, encoding, encoded_message_definition '
-                    'FROM message_definitions'
-                ):
-                    form = _FORMATS.get(encoding, MessageDefinitionFormat.NONE)
-                    definitions[name] = MessageDefinition(form, text)
+            definitions = _definitions(base)
             none = MessageDefinition(MessageDefinitionFormat.NONE, '')
             # the rows of a broken page read as NULL, or as values of any type
             for number, topic, kind in base.execute(
@@ -286,5 +332,5 @@ def _sqlite(file: Path, first: int, owner: Any) -> Iterator[Found]:
                 "AND typeof(data) = 'blob' ORDER BY id"
             ):
                 yield first + number, time, data
-        except (sqlite3.DatabaseError, MemoryError) as e:
+        except (apsw.Error, MemoryError) as e:
             yield f'{file.name} is broken: {e or "a row longer than memory"}'
