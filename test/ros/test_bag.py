@@ -270,6 +270,19 @@ def test_scratched_sqlite_gives_what_comes_before_the_scratch(tmp_path):
     assert len(got) > 0.2 * len(whole)
 
 
+def test_sqlite_with_broken_definitions_of_messages_is_read(tmp_path):
+    file = storage_file(write(tmp_path / 'bag', 'sqlite3', n=50))
+    whole, _ = readable(file)
+    with closing(sqlite3.connect(file)) as base:
+        where = "SELECT rootpage FROM sqlite_master WHERE name = 'message_definitions'"
+        (page,) = base.execute(where).fetchone()
+    data = bytearray(file.read_bytes())
+    data[(page - 1) * 4096 : page * 4096] = bytes(4096)
+    file.write_bytes(data)
+    bag = BagRecovery(file)
+    assert len(list(bag.messages(bag.connections))) == len(whole)
+
+
 @pytest.mark.parametrize('storage', STORAGES)
 def test_folder_that_lost_its_metadata_is_read(tmp_path, storage):
     folder = write(tmp_path / 'bag', storage)

@@ -300,7 +300,7 @@ class _WholePages(apsw.VFS):
 
 
 def _definitions(base: apsw.Connection) -> dict[str, MessageDefinition]:
-    """Of the types of messages; recorders write them last, and the types are known mostly."""
+    """Of the types of messages; most types are known without."""
     found: dict[str, MessageDefinition] = {}
     with contextlib.suppress(apsw.Error):
         for name, encoding, text in base.execute(
