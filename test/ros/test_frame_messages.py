@@ -71,6 +71,23 @@ def a_frame(stamp=SECOND, seed=0, n=3):
     )  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ('field', 'value'),
+    [
+        ('bias_var', 0.0), ('bias_var', -1.0), ('bias_var', 5e-324), ('bias_var', np.nan),
+        ('bias', np.nan), ('bias_gain', np.array([0.0, np.inf, 0.0])),
+    ],
+)  # fmt: skip
+def test_bias_that_cannot_be_is_refused(field, value):
+    frame = a_frame()
+    motion = dataclasses.replace(frame.observation.motion, **{field: value})
+    observation = dataclasses.replace(frame.observation, motion=motion)
+    frame = dataclasses.replace(frame, observation=observation)
+    msg = build_record(make_bag, SessionFrame(1, frame, 8, 9), 'local')
+    with pytest.raises(InputError, match=f'rlml/frames: {field}'):
+        read_record(msg)
+
+
 def send(join, frame, session=1, parts='pdr'):
     """Give a frame's messages to the join in the order of ``parts``; what came out."""
     out = []

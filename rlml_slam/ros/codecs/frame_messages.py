@@ -25,6 +25,7 @@ from rlml_slam.slam.conversation import SessionFrame
 from rlml_slam.slam.front_end.submaps import FAR
 from rlml_slam.types import Frame, Health, Level, Motion, Observation
 
+LEAST_VARIANCE = 1e-18  # [rad^2/s^2] of a bias
 MAX_BEHIND = 20  # frames that may overtake one whose points or detections are still on their way
 
 # x, y, z for RViz; odom_pose is NaN without odometry; the health's reasons are on /diagnostics
@@ -80,12 +81,14 @@ def build_record(make: Make, record: SessionFrame, local_frame: str) -> Any:
 def read_record(msg: Any, topic: str = 'rlml/frames') -> Record:
     """The inverse of build_record; InputError if it is another kind of cloud."""
     r, time = read_table(msg, RECORD, topic, one=True)[0], stamp(msg, topic)
-    for name in ('T_local_base', 'T_map_base', 'delta'):
+    for name in ('T_local_base', 'T_map_base', 'delta', 'bias_gain', 'bias'):
         bounded(r[name], f'{topic}: {name}')
     for name in ('cov_local', 'cov_map', 'cov'):
         covariances(r[name].reshape(3, 3), f'{topic}: {name}')
     for name in ('odom_pose', 'origin'):
         bounded(np.nan_to_num(r[name]), f'{topic}: {name}')
+    if not r['bias_var'] >= LEAST_VARIANCE:  # infinite without an IMU
+        raise InputError(f'{topic}: bias_var {r["bias_var"]} is no variance')
     if r['level'] > max(Level):
         raise InputError(f'{topic}: {r["level"]} is no level of health')
 
