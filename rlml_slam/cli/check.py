@@ -6,12 +6,13 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from rlml_slam.cli.support.robot_setup import Finding, RobotSetup
-from rlml_slam.cli.support.service_call import asking
+from rlml_slam.cli.support.service_call import asking, others
 from rlml_slam.cli.support.text_table import aligned
 from rlml_slam.params import Node, Parameters, from_mapping, read_yaml
 from rlml_slam.ros.sensor_input import STREAMS
@@ -46,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     with asking() as node:
         topics = topics_of(node, params.node)
         listen(node, setup, topics, args.seconds)
-        findings = [*of_publishers(node, setup, topics), *setup.findings()]
+        findings = [*of_names(node), *of_publishers(node, setup, topics), *setup.findings()]
         rows = [row(node, stream, topic, setup) for stream, (topic, _) in topics.items()]
     wrong = [f for f in findings if f.is_wrong]
     if args.json:
@@ -95,6 +96,16 @@ def listen(
         if not is_simulated and node.count_publishers('/clock'):
             node.set_parameters([Parameter('use_sim_time', value=True)])
             is_simulated = True
+
+
+def of_names(node: Any) -> Iterator[Finding]:
+    """Nodes that have one name, of which services reach any."""
+    for name, count in Counter(full for full, _, _ in others(node)).items():
+        if count > 1:
+            yield Finding(
+                f'{count} nodes have the name {name}: is it started twice?',
+                'stop one, or -r __ns:=/r2 for a second robot',
+            )
 
 
 def of_publishers(

@@ -85,6 +85,9 @@ def sides(args: argparse.Namespace) -> tuple[RunFolder, RunFolder]:
             ours = args.ours or next((t for t in OURS if t in bag.topics), OURS[0])
             path = poses_of(bag, ours)
             return _other(args, bag, path), RunFolder(ours, {LIVE: path})
+    for path in (args.a, args.b):
+        if not path.exists():
+            raise ParameterError(f'compare: {path}: no such file or folder')
     kinds = _kind(args.a), _kind(args.b)
     if kinds == ('bag', 'bag'):
         raise ParameterError('compare: of two bags at least one has to be replayed first')

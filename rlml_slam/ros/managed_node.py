@@ -18,7 +18,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 
-from rlml_slam.errors import RlmlError
+from rlml_slam.errors import ParameterError, RlmlError
 from rlml_slam.params import Parameters
 from rlml_slam.ros.declare import Check, declare
 from rlml_slam.ros.kernels import prepare
@@ -202,7 +202,14 @@ class ManagedNode(LifecycleNode):
     ) -> Any:
         """A subscription; in shadow mode, to the other end in shadow mode."""
         name = self._name(topic) if topic.startswith(OURS) else topic
-        return super().create_subscription(msg_type, name, callback, qos_profile, **options)
+        try:
+            return super().create_subscription(msg_type, name, callback, qos_profile, **options)
+        except RCLError as e:
+            full = self.resolve_topic_name(name)
+            raise ParameterError(
+                f'{name}: {full} cannot be heard as {msg_type.__name__}: this process has it with '
+                'another type; two inputs must not be on one topic'
+            ) from e
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Any, **options: Any) -> Any:
         """A service, which answers while the node is inactive as well."""

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from rclpy._rclpy_pybind11 import UnknownROSArgsError
 from rclpy.utilities import remove_ros_args
 
 from rlml_slam.params import NODES, Parameters, declarations
@@ -17,13 +18,17 @@ from rlml_slam.version import __version__
 
 def answered(factory: Callable[[], Any], argv: Sequence[str]) -> int | None:
     """Exit code where the words asked for help or are wrong; None where the node is to run."""
-    words = remove_ros_args(list(argv))[1:]
-    if not words:
-        return None
     name = Path(inspect.getsourcefile(factory) or 'node').stem
-    if {'-h', '--help'} & set(words):
+    if {'-h', '--help'} & set(argv[1:]):  # after --ros-args as well
         print(help_text(name, inspect.getmodule(factory).__doc__ or ''))
         return 0
+    try:
+        words = remove_ros_args(list(argv))[1:]
+    except UnknownROSArgsError:
+        known = {'-p', '-r', '--params-file', '--ros-args', '--remap', '--param', '--log-level'}
+        words = [w for w in argv[1:] if w.startswith('-') and w not in known]
+    if not words:
+        return None
     if '--version' in words:
         print(f'rlml_slam {__version__}')
         return 0

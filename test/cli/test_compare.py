@@ -245,6 +245,11 @@ def test_run_is_compared_with_a_trajectory_and_with_amcl_in_a_bag(both, tmp_path
     assert 'replayed first' in capsys.readouterr().err
 
 
+def test_file_that_is_not_there_is_named(both, capsys):
+    assert main(['compare', both, 'nowhere']) == 2
+    assert 'compare: nowhere: no such file or folder' in capsys.readouterr().err
+
+
 def test_what_is_no_run_is_named(tmp_path, capsys):
     assert main(['compare', str(tmp_path), str(tmp_path)]) == 2
     assert 'not the folder of a replay' in capsys.readouterr().err

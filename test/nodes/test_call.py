@@ -16,6 +16,7 @@ from live import DOMAIN
 from rlml_slam.cli.main import main
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.nodes.back_end import BackEndNode
+from rlml_slam.nodes.front_end import FrontEndNode
 from rlml_slam.ros.back_end.map_folder import MapFolder
 from rlml_slam.types import Reflectors
 
@@ -79,11 +80,28 @@ def test_wrong_argument_is_one_line(words, why, capsys):
     assert why in capsys.readouterr().err
 
 
-def test_absent_node_is_reported_at_once_with_those_that_are_there(live, command, tmp_path):
+def test_absent_node_is_reported_with_those_that_are_there(live, command, tmp_path):
     live.start(BackEndNode, map_directory=str(tmp_path))
     code, out, err = command('save_map', '--node', '/nobody')
     assert (code, out) == (1, '')
-    assert '/nobody: no such node; --node /back_end has the service save_map' in err
+    assert '/nobody: no such node; the service save_map is of /back_end' in err
+
+
+def test_node_that_dds_finds_late_is_called_all_the_same(live, command, tmp_path, monkeypatch):
+    """Others are seen before it."""
+    live.start(FrontEndNode)
+    spin, late = live.spin_until, []
+
+    def spin_until(done, timeout):
+        end = time.monotonic() + 3.0
+        spin(lambda: done() or time.monotonic() > end, timeout=10.0)
+        late.append(live.start(BackEndNode, map_directory=str(tmp_path)))
+        spin(done, timeout)
+
+    monkeypatch.setattr(live, 'spin_until', spin_until)
+    code, _, err = command('save_map', '--node', 'back_end')
+    assert code == 1
+    assert 'nothing to save' in err or 'there is no map yet' in err
 
 
 @pytest.mark.parametrize('delay', [0.0, 0.4, 1.5])

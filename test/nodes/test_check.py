@@ -150,6 +150,15 @@ def test_a_clock_that_is_off_by_three_seconds(checked):
     assert 'behind the clock' in wrong[0]['text']
 
 
+def test_node_that_is_started_twice(live, checked):
+    from rclpy.node import Node
+
+    for _ in range(2):
+        live.add(Node('twin', context=live.context))
+    _, wrong = checked()
+    assert [f['text'] for f in wrong] == ['2 nodes have the name /twin: is it started twice?']
+
+
 def test_two_publishers_of_odometry(checked):
     def another(node):
         node.create_publisher(rclpy_class('nav_msgs/msg/Odometry'), 'odom', 10)

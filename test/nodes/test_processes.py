@@ -122,6 +122,20 @@ def test_user_mistake_of_the_player_is_told_without_a_traceback(start, args, mes
     assert message in out
 
 
+@pytest.mark.parametrize(
+    ('words', 'code', 'said'),
+    [
+        (['--help'], 0, 'usage: front_end'),
+        (['--verbose'], 2, "what is '--verbose'?"),
+        (['-r', 'odom:=/imu'], 1, '/imu cannot be heard as Imu'),
+    ],
+)
+def test_words_after_ros_args_are_answered_without_a_traceback(start, words, code, said):
+    found, out = ended(start('front_end', '--ros-args', *words))
+    assert (found, said in out) == (code, True), out
+    assert 'Traceback' not in out
+
+
 def test_missing_map_refuses_to_localize(start, tmp_path):
     args = ['-p', 'mode:=localization', '-p', f'map_directory:={tmp_path}']
     code, out = ended(start('back_end', '--ros-args', *args))

@@ -283,6 +283,14 @@ def test_sqlite_with_broken_definitions_of_messages_is_read(tmp_path):
     assert len(list(bag.messages(bag.connections))) == len(whole)
 
 
+@pytest.mark.parametrize('metadata', [None, '- 1'])
+def test_folder_without_files_of_a_bag_is_named(tmp_path, metadata):
+    if metadata is not None:
+        (tmp_path / 'metadata.yaml').write_text(metadata)
+    with pytest.raises(BagError, match='no bag: there is no recording in this folder'):
+        BagReader(tmp_path)
+
+
 @pytest.mark.parametrize('storage', STORAGES)
 def test_folder_that_lost_its_metadata_is_read(tmp_path, storage):
     folder = write(tmp_path / 'bag', storage)

@@ -181,7 +181,7 @@ SERVICES = (
             'localize in another map of `map_directory`, or while mapping go on with it; where it '
             'is refused, `map.header.frame_id` of the answer says why'),
     Service('back_end', '~/reset', 'std_srvs/Trigger',
-            'forget the map and begin at `map_start_pose`'),
+            'begin at `map_start_pose`: in a new map, or, where it localizes, in the same'),
     Service('back_end', '~/closures', 'std_srvs/Trigger',
             'all loop closures: why each was accepted, its residual and weight, its state'),
     Service('back_end', '~/reflectors', 'std_srvs/Trigger',

@@ -11,8 +11,8 @@ from typing import Any
 
 from rlml_slam.errors import InputError
 
-PATIENCE = 2.0  # [s] in which a running node is found,
-ALONE = 6.0  # and where none at all has been found so far, on a busy machine
+PATIENCE = 2.0  # [s] in which a node that runs shows its services,
+ALONE = 6.0  # and in which it is seen at all: DDS finds nodes one after the other
 WORK = 120.0  # [s] in which it answers: to save or to search a large map takes its time
 
 
@@ -63,11 +63,15 @@ def answer_of(asker: Any, node: str, service: str, kind: Any, fields: dict[str, 
     """The same of the node that asks."""
     import rclpy
 
+    node = '/' + node.strip('/')
     client = asker.create_client(kind, f'{node}/{service}')
     began = time.monotonic()
     while not client.wait_for_service(PATIENCE):
-        if _others(asker) or time.monotonic() - began > ALONE:
-            raise InputError(_absent(asker, node, service))
+        late = time.monotonic() - began > ALONE
+        if late or any(full == node for full, _, _ in others(asker)):
+            why = _absent(asker, node, service)
+            if late or why:
+                raise InputError(why or f'{node}: {service} does not answer')
     future = client.call_async(kind.Request(**fields))
     rclpy.spin_until_future_complete(asker, future, timeout_sec=WORK)
     if not future.done() or future.result() is None:
@@ -76,22 +80,24 @@ def answer_of(asker: Any, node: str, service: str, kind: Any, fields: dict[str, 
 
 
 def _absent(asker: Any, node: str, service: str) -> str:
-    """Why a service was not found: which nodes there are, and which of them has it."""
+    """Why a service was not found: which nodes there are, and which have it; empty if it came."""
     running, having = [], []
-    for full, name, namespace in _others(asker):
+    for full, name, namespace in others(asker):
         running.append(full)
         offered = asker.get_service_names_and_types_by_node(name, namespace)
         if f'{full}/{service}' in (offer for offer, _ in offered):
             having.append(full)
-    if having:
-        return f'{node}: no such node; --node {having[0]} has the service {service}'
+    if node in having:
+        return ''
     if node in running:
         return f'{node} runs, and has no service {service}'
+    if having:  # of several robots, perhaps
+        return f'{node}: no such node; the service {service} is of {", ".join(sorted(having))}'
     nodes = f'there are {", ".join(sorted(running))}' if running else 'no node is running'
     return f'{node}: no such node; {nodes} (in ROS_DOMAIN_ID {_domain()})'
 
 
-def _others(asker: Any) -> list[tuple[str, str, str]]:
+def others(asker: Any) -> list[tuple[str, str, str]]:
     """Full name, name and namespace of the nodes that are seen."""
     seen = [(f'{s.rstrip("/")}/{n}', n, s) for n, s in asker.get_node_names_and_namespaces()]
     own = asker.get_fully_qualified_name()

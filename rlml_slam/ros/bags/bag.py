@@ -61,6 +61,8 @@ class BagReader:
         self._todays: dict[str, bool] = {}
         if not self.path.exists():
             raise BagError(f'{path}: no such bag')
+        if self.path.is_dir() and all(f.name == 'metadata.yaml' for f in self.path.iterdir()):
+            raise BagError(f'{path}: no bag: there is no recording in this folder')
         self.is_ros1 = self.path.suffix == '.bag' and not self.path.is_dir()
         self._reader = self._open()
         self.topics = {
