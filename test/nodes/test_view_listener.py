@@ -61,7 +61,7 @@ def send_frame(queues, stamp, x):
     seen = Detections(
         stamp, 'base_link', np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, int), np.zeros(0)
     )
-    motion = Motion(np.zeros(3), np.eye(3), True, np.zeros(3), 0.0, 0.0)
+    motion = Motion(np.zeros(3), np.eye(3))
     observation = Observation(stamp, motion, points, np.zeros(2), seen)
     T, none = np.array([x, 0.0, 0.0]), np.zeros(0, int)
     frame = Frame(stamp, observation, T, np.eye(3), T, np.eye(3), none, none, Health(Level.OK))
