@@ -270,6 +270,19 @@ def test_scratched_sqlite_gives_what_comes_before_the_scratch(tmp_path):
     assert len(got) > 0.2 * len(whole)
 
 
+@pytest.mark.parametrize('at', [24, 28])
+def test_sqlite_whose_header_does_not_know_the_number_of_pages_is_read(tmp_path, at):
+    """An old SQLite wrote 0, or left the number as it was and changed the counter alone."""
+    file = storage_file(write(tmp_path / 'bag', 'sqlite3', n=50))
+    whole, _ = readable(file)
+    data = bytearray(file.read_bytes())
+    data[at : at + 4] = bytes(4) if at == 28 else b'\x00\x00\x77\x77'
+    data[28:32] = bytes(4) if at == 28 else (3).to_bytes(4, 'big')
+    file.write_bytes(data)
+    bag = BagRecovery(file)
+    assert len(list(bag.messages(bag.connections))) == len(whole)
+
+
 def test_sqlite_with_broken_definitions_of_messages_is_read(tmp_path):
     file = storage_file(write(tmp_path / 'bag', 'sqlite3', n=50))
     whole, _ = readable(file)

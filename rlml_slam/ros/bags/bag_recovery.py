@@ -260,13 +260,15 @@ def _connection(number: int, header: Header, about: Header, owner: Any) -> Conne
 
 
 def _pages(file: Path) -> tuple[int, int]:
-    """Size of a page [bytes], and their number as the header has it."""
+    """Size of a page [bytes], and the number of whole ones that the header knows of."""
     with file.open('rb') as source:
-        header = source.read(32)
-    if len(header) < 32:
-        return SMALLEST_PAGE, 1
+        header = source.read(96)
     size = int.from_bytes(header[16:18], 'big')
-    return max(size, SMALLEST_PAGE) if size != 1 else 1 << 16, int.from_bytes(header[28:], 'big')
+    size = 1 << 16 if size == 1 else max(size, SMALLEST_PAGE)
+    whole = file.stat().st_size // size
+    # as SQLite does: the header's number holds where its counters agree
+    known = int.from_bytes(header[28:32], 'big') if header[24:28] == header[92:96] else 0
+    return size, min(whole, known or whole)
 
 
 class _WholePages(apsw.VFS):
@@ -279,8 +281,7 @@ class _WholePages(apsw.VFS):
     def __init__(self, file: Path) -> None:
         self.name = f'whole pages {id(self)}'
         super().__init__(self.name, '')
-        size, pages = _pages(file)
-        self._size, self._pages = size, min(pages, file.stat().st_size // size)
+        self._size, self._pages = _pages(file)
 
     def xOpen(self, name: Any, flags: list[int]) -> apsw.VFSFile:
         """The one file that is opened."""
