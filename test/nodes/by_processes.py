@@ -26,7 +26,7 @@ CLOUD = 'sensor_msgs/msg/PointCloud2'
 DEEP = QoSProfile(depth=2000)
 LOGS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LATEST = 50  # frames before its end, after the last event, the robot waits for decisions
-SLOWER = 0.4  # [s] of the wall clock between two frames then: a search has 20 s
+SLOWER = 1.0  # [s] of the wall clock between two frames then: a search has its time
 # frames that a loaded machine may be behind, before the robot waits for it: more than those that
 # the front end holds back while it awaits the transform of a sensor
 BEHIND = 20
