@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
 import sys
 from collections.abc import Callable, Sequence
@@ -24,9 +25,8 @@ def answered(factory: Callable[[], Any], argv: Sequence[str]) -> int | None:
         return 0
     try:
         words = remove_ros_args(list(argv))[1:]
-    except UnknownROSArgsError:
-        known = {'-p', '-r', '--params-file', '--ros-args', '--remap', '--param', '--log-level'}
-        words = [w for w in argv[1:] if w.startswith('-') and w not in known]
+    except UnknownROSArgsError as e:  # whose text is the list of them
+        words = ast.literal_eval(str(e))
     if not words:
         return None
     if '--version' in words:

@@ -5,14 +5,12 @@ from __future__ import annotations
 
 import contextlib
 import os
-import time
 from collections.abc import Iterator
 from typing import Any
 
 from rlml_slam.errors import InputError
 
-PATIENCE = 2.0  # [s] in which a node that runs shows its services,
-ALONE = 6.0  # and in which it is seen at all: DDS finds nodes one after the other
+PATIENCE = 6.0  # [s] in which a service is found: DDS finds nodes one after the other
 WORK = 120.0  # [s] in which it answers: to save or to search a large map takes its time
 
 
@@ -65,13 +63,8 @@ def answer_of(asker: Any, node: str, service: str, kind: Any, fields: dict[str, 
 
     node = '/' + node.strip('/')
     client = asker.create_client(kind, f'{node}/{service}')
-    began = time.monotonic()
-    while not client.wait_for_service(PATIENCE):
-        late = time.monotonic() - began > ALONE
-        if late or any(full == node for full, _, _ in others(asker)):
-            why = _absent(asker, node, service)
-            if late or why:
-                raise InputError(why or f'{node}: {service} does not answer')
+    if not client.wait_for_service(PATIENCE):
+        raise InputError(_absent(asker, node, service))
     future = client.call_async(kind.Request(**fields))
     rclpy.spin_until_future_complete(asker, future, timeout_sec=WORK)
     if not future.done() or future.result() is None:
@@ -80,7 +73,7 @@ def answer_of(asker: Any, node: str, service: str, kind: Any, fields: dict[str, 
 
 
 def _absent(asker: Any, node: str, service: str) -> str:
-    """Why a service was not found: which nodes there are, and which have it; empty if it came."""
+    """Why a service was not found: which nodes there are, and which have it."""
     running, having = [], []
     for full, name, namespace in others(asker):
         running.append(full)
@@ -88,7 +81,7 @@ def _absent(asker: Any, node: str, service: str) -> str:
         if f'{full}/{service}' in (offer for offer, _ in offered):
             having.append(full)
     if node in having:
-        return ''
+        return f'{node}: its service {service} came only now, try again'
     if node in running:
         return f'{node} runs, and has no service {service}'
     if having:  # of several robots, perhaps

@@ -292,10 +292,10 @@ class _WholePages(apsw.VFS):
                 return size * pages
 
             def xRead(self, amount: int, offset: int) -> bytes:
-                data = bytearray(super().xRead(amount, offset))
-                if offset <= 28 and len(data) >= 32 - offset:
-                    data[28 - offset : 32 - offset] = pages.to_bytes(4, 'big')
-                return bytes(data)
+                data = super().xRead(amount, offset)
+                if offset > 28 or len(data) < 32 - offset:
+                    return data
+                return data[: 28 - offset] + pages.to_bytes(4, 'big') + data[32 - offset :]
 
         return File('', name, flags)
 
