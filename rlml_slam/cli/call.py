@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``rlml call``: the services of a running node, where no ``ros2`` is installed."""
+"""``rlml call``: services and ``initialpose`` of a running node, where there is no ROS."""
 
 from __future__ import annotations
 
 import argparse
 import importlib
+import time
 from typing import Any
 
-from rlml_slam.cli.support.service_call import answer_of, asking, message_of
+import numpy as np
+
+from rlml_slam.cli.support.service_call import PATIENCE, answer_of, asking, message_of
 from rlml_slam.errors import InputError
 
-PATIENCE = 3.0  # [s] for the next diagnostics, which come once a second
+POSE = 'initialpose'
+RVIZ = np.diag([0.25, 0.25, 0.0685])  # [m², m², rad²]: covariance of its "2D Pose Estimate"
 SWITCH = {'on': True, 'off': False}
 # service -> type, and the field of its request that takes the argument
 SERVICES = {
@@ -31,20 +35,25 @@ def add_parser(subparsers: Any) -> None:
         help='a service of a running node: save_map, relocalize and so on',
         description='Calls a service of a running node and prints its answer.',
     )
-    parser.add_argument('service', metavar='SERVICE', choices=SERVICES, help=', '.join(SERVICES))
+    names = [*SERVICES, POSE]
+    parser.add_argument('service', metavar='SERVICE', choices=names, help=', '.join(names))
     parser.add_argument(
         'argument', metavar='ARGUMENT', nargs='?',
         help='of load_map the name of a map, which save_map takes as well, to save under another '
-        'one; of the two that switch something on or off',
+        'one; of the two that switch something on or off; of initialpose x,y,angle [m, degrees]',
     )  # fmt: skip
     parser.add_argument(
         '--node', metavar='NAME',
-        help='the running node (default: /back_end, of save_incident /front_end)',
+        help='the running node (default: /back_end, of save_incident and initialpose '
+        '/front_end)',
     )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
     """Call it and print what it says."""
+    if args.service == POSE:
+        print(give_pose(args.node or '/front_end', args.argument or ''))
+        return 0
     package, name, field = SERVICES[args.service]
     fields = {} if field is None else {field: value_of(args.service, field, args.argument)}
     if field is None and args.argument is not None and args.service != 'save_map':
@@ -62,6 +71,35 @@ def run(args: argparse.Namespace) -> int:
         else:
             print(f'{args.argument}: loaded')
     return 0
+
+
+def give_pose(node: str, argument: str) -> str:
+    """Publish where the robot is; InputError where it is no pose, or nobody listens."""
+    from rclpy.duration import Duration
+
+    from rlml_slam.ros.codecs.encode import pose_with_covariance
+    from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
+
+    try:
+        x, y, degrees = (float(word) for word in argument.split(','))
+    except ValueError:
+        x = y = degrees = np.nan
+    if not np.isfinite([x, y, degrees]).all():
+        raise InputError(f'{POSE}: {argument!r} is no x,y,angle [m, degrees]')
+    message = pose_with_covariance(make_rclpy, 0, '', np.array([x, y, np.radians(degrees)]), RVIZ)
+    topic = '/'.join(['', *node.strip('/').split('/')[:-1], POSE])
+    with asking() as asker:
+        publisher = asker.create_publisher(
+            rclpy_class('geometry_msgs/msg/PoseWithCovarianceStamped'), topic, 10
+        )
+        end = time.monotonic() + PATIENCE
+        while not publisher.get_subscription_count():
+            if time.monotonic() > end:
+                raise InputError(f'{topic}: nobody listens')
+            time.sleep(0.05)
+        publisher.publish(message)
+        publisher.wait_for_all_acked(Duration(seconds=PATIENCE))
+    return f'{topic}: x = {x:g} m, y = {y:g} m, {degrees:g} degrees: sent'
 
 
 def rename(asker: Any, node: str, name: str) -> None:

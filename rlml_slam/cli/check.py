@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from rlml_slam.cli.support.robot_setup import Finding, RobotSetup
-from rlml_slam.cli.support.service_call import asking, others
+from rlml_slam.cli.support.service_call import asking, domain, others
 from rlml_slam.cli.support.text_table import aligned
 from rlml_slam.params import Node, Parameters, from_mapping, read_yaml
 from rlml_slam.ros.sensor_input import STREAMS
@@ -30,11 +30,12 @@ def add_parser(subparsers: Any) -> None:
         'type. Turn the robot meanwhile: then the mounting of the laser is checked as well. '
         'Exit code 0: nothing is wrong, 1: something is.',
     )
-    parser.add_argument('--seconds', type=float, default=10.0, metavar='S')
+    parser.add_argument('--seconds', type=float, default=10.0, metavar='S', help='to listen')
     parser.add_argument('--config', type=Path, metavar='YAML', help='ROS parameter file')
     parser.add_argument(
         '--scan', metavar='TOPIC', help='of the scans (default: the parameter scan_topic)'
     )
+    parser.add_argument('--namespace', metavar='NS', help='of the topics (default: none)')
     parser.add_argument('--json', action='store_true', help='print one JSON object and no more')
 
 
@@ -44,10 +45,14 @@ def run(args: argparse.Namespace) -> int:
     values |= {'scan_topic': args.scan} if args.scan else {}
     params: Parameters = from_mapping(values)
     setup = RobotSetup(params)
-    with asking() as node:
+    with asking(args.namespace) as node:
         topics = topics_of(node, params.node)
         listen(node, setup, topics, args.seconds)
-        findings = [*of_names(node), *of_publishers(node, setup, topics), *setup.findings()]
+        findings = [*of_nobody(node, setup)] or [
+            *of_names(node),
+            *of_publishers(node, setup, topics),
+            *setup.findings(),
+        ]
         rows = [row(node, stream, topic, setup) for stream, (topic, _) in topics.items()]
     wrong = [f for f in findings if f.is_wrong]
     if args.json:
@@ -96,6 +101,15 @@ def listen(
         if not is_simulated and node.count_publishers('/clock'):
             node.set_parameters([Parameter('use_sim_time', value=True)])
             is_simulated = True
+
+
+def of_nobody(node: Any, setup: RobotSetup) -> Iterator[Finding]:
+    """Nothing runs here, or is seen from here."""
+    if not others(node) and not setup.heard:
+        yield Finding(
+            f'no node is seen in ROS_DOMAIN_ID {domain()}',
+            'start the robot; or export ROS_DOMAIN_ID=<as on the robot>',
+        )
 
 
 def of_names(node: Any) -> Iterator[Finding]:

@@ -43,7 +43,7 @@ def add_parser(subparsers: Any) -> None:
         description='Looks for reflectors with the automatic threshold, and says in words what '
         'it sees and which parameters of reflector_detector fit.',
     )
-    parser.add_argument('bag', type=Path, metavar='BAG')
+    parser.add_argument('bag', type=Path, metavar='BAG', help='with scans that have intensities')
     parser.add_argument('--topic', default='', metavar='NAME', help='of the scans')
     parser.add_argument('--config', type=Path, metavar='YAML', help="the detector's parameters")
     parser.add_argument('--out', type=Path, metavar='PNG', help='picture to be written')

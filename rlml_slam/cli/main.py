@@ -190,7 +190,16 @@ def _add_commands(
         else:
             module = _load(name, entry)
             module.add_parser(subparsers)
+            _state_defaults(subparsers.choices[name])
     return module
+
+
+def _state_defaults(parser: argparse.ArgumentParser) -> None:
+    """Add to the help of each number what it is unless given."""
+    for action in parser._actions:
+        is_number = type(action.default) in (int, float) and action.nargs != 0
+        if is_number and 'default' not in (action.help or ''):
+            action.help = f'{action.help or ""} (default: %(default)s)'.lstrip()
 
 
 def _load(name: str, command: Command) -> Any:

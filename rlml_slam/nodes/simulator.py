@@ -45,6 +45,8 @@ class SimulatorNode(Node):
         if n.drive == 'cmd_vel':
             Listener(self, Twist, 'cmd_vel', self.on_cmd_vel, RELIABLE)
         prepare(self)
+        first = f'waits for {n.wait_for_subscribers} subscribers of scan'
+        self.get_logger().info(f'world {n.world}, rate {n.rate:g}: {first}')
         # steady timers: with use_sim_time, a ROS timer would wait for this node's own clock
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(0.005, self.tick, clock=steady)

@@ -12,6 +12,7 @@ import difflib
 import math
 import sys
 from collections.abc import Callable, Mapping
+from itertools import pairwise
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -22,8 +23,16 @@ from rcl_interfaces.msg import (
 )
 from rclpy.parameter import Parameter
 
-from rlml_slam.errors import RlmlError
-from rlml_slam.params import NODES, ROS_OWN, Declaration, Parameters, declarations, from_mapping
+from rlml_slam.errors import FileFormatError, RlmlError
+from rlml_slam.params import (
+    NODES,
+    ROS_OWN,
+    Declaration,
+    Parameters,
+    declarations,
+    from_mapping,
+    read_yaml,
+)
 
 Check = Callable[[Any], object]
 
@@ -48,6 +57,7 @@ def declare(
             near = difflib.get_close_matches(name, known, n=1)
             hint = f'is {near[0]!r} meant?' if near else '--help lists those that have one'
             node.get_logger().warning(f'unknown parameter {name!r} has no effect; {hint}')
+    _warn_of_files(node, of)
     for d in known.values():
         value = getattr(getattr(parameters, d.group), d.field)
         node.declare_parameter(d.name, _ros_value(value), descriptor(d), ignore_override=True)
@@ -55,6 +65,16 @@ def declare(
         lambda given: _change(node, parameters, known, given, {} if checks is None else checks)
     )
     return parameters
+
+
+def _warn_of_files(node: Any, of: type[Any]) -> None:
+    """Name parameter files of the command line without a section for this node: ROS does not."""
+    for word, file in pairwise(sys.argv):
+        if word == '--params-file' and node.get_name() in NODES[of]:
+            try:
+                read_yaml(file, of)
+            except FileFormatError as e:
+                node.get_logger().warning(f'{e}: this file has no effect here')
 
 
 def _change(

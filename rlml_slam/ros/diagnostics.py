@@ -25,8 +25,8 @@ WATCH = 0.1  # [s] between two looks whether the input has fallen silent
 class HealthPublisher:
     """Publishes the health of the newest frame; without new frames, that they are missing.
 
-    It is on ~/health with every frame and at once when it changes, and on /diagnostics with all
-    figures every PERIOD.
+    It is on ~/health with every frame and at once when it changes, on /diagnostics with all
+    figures every PERIOD, and in the log where its level is another one than PERIOD before.
     """
 
     def __init__(
@@ -36,7 +36,8 @@ class HealthPublisher:
         figures: Callable[[], dict[str, object]] = dict,
         problems: Callable[[], tuple[str, ...]] = tuple,
     ) -> None:
-        self._guard = guard_of(node)
+        self._guard, self._logger = guard_of(node), node.get_logger()
+        self._logged = Level.DEGRADED  # as it is without input
         self._problems = problems
         self._name = node.get_fully_qualified_name().lstrip('/')
         self._sensors = sensors
@@ -120,6 +121,13 @@ class HealthPublisher:
         )
         self._publisher.publish(message)
         self._publish_health()
+        if health.level != self._logged:
+            self._logged = health.level
+            text = ': '.join([f'health is {health.level.name}', *health.reasons[:1]])
+            if health.level is Level.OK:  # a line of its own: ROS allows one severity for each
+                self._logger.info(text)
+            else:
+                self._logger.warning(text)
 
 
 def map_id(saved: SavedMap | None) -> str:

@@ -101,4 +101,6 @@ def _spin(executor: Any, nodes: list[Any], signals: _Signals) -> None:
 
 def _cause(error: Exception) -> str:
     """The first line of rcl's message, which names the argument or the file."""
-    return str(error).strip().splitlines()[0].split(', at ')[0]
+    cause = str(error).strip().splitlines()[0].split(', at ')[0]
+    mixed = 'same type' in cause
+    return f'{cause}; write all numbers alike, such as [0.2, 0.0, 0.0]' if mixed else cause

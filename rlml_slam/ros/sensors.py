@@ -268,7 +268,8 @@ class Sensors:
             if len(seen) >= self._topics[stream] or self._may_come(sensor, _stamp(msg)):
                 self._count_invalid(stream, f'{stream}: {why}')
                 return
-            self._logger.warning(f'{why}: the parameter laser_pose is used')
+            place = list(self._p.node.laser_pose)
+            self._logger.warning(f'{why}: laser_pose is used, which is {place}')
         if len(seen) < MAX_SENSORS:
             seen.add(sensor)
         self._use(stream, msg)

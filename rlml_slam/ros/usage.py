@@ -7,6 +7,7 @@ import ast
 import inspect
 import sys
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,10 @@ def answered(factory: Callable[[], Any], argv: Sequence[str]) -> int | None:
     if {'-h', '--help'} & set(argv[1:]):  # after --ros-args as well
         print(help_text(name, inspect.getmodule(factory).__doc__ or ''))
         return 0
+    for option, value in pairwise(argv):
+        if option in ('-p', '--param') and ':=' not in value:
+            print(f'{name}: -p {value}: a parameter is given as NAME:=VALUE', file=sys.stderr)
+            return 2
     try:
         words = remove_ros_args(list(argv))[1:]
     except UnknownROSArgsError as e:  # whose text is the list of them

@@ -40,6 +40,12 @@ def test_help_imports_no_command():
         assert name in done.stdout
 
 
+def test_numbers_say_their_default(capsys):
+    with pytest.raises(SystemExit):
+        main(['check', '--help'])
+    assert 'to listen (default: 10.0)' in ' '.join(capsys.readouterr().out.split())
+
+
 def test_module_runs_as_the_command():
     done = subprocess.run(
         [sys.executable, '-m', 'rlml_slam', '--version'], capture_output=True, text=True

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import gc
 import re
+from concurrent.futures import Future
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -331,6 +333,22 @@ def test_place_that_cannot_be_told_is_told_as_such(live):
     assert lost.message.startswith('not found: there is no map')
     assert 'initialpose' in lost.message
     live.call(Empty, 'reinitialize_global_localization', Empty.Request())
+
+
+def test_search_without_an_answer_is_logged_whether_it_finds_or_not(live, monkeypatch):
+    services = start(live)[1].map_services
+    live.listen('/rosout', 'rcl_interfaces/msg/Log', 100)
+    live.spin_until(lambda: live.ear.count_publishers('/rosout') > 2)
+    for found in (False, True, False):
+        answer = Future()
+        monkeypatch.setattr(services._requests, 'relocalize', lambda answer=answer: answer)
+        services.reinitialize(None, None)
+        answer.set_result(SimpleNamespace(success=found, text=f'found: {found}'))
+
+    def said():
+        return [m.msg[-11:].strip() for m in live.heard['/rosout'] if 'reinitialize' in m.msg]
+
+    live.spin_until(lambda: len(said()) == 3, what='not all answers are in the log')
 
 
 def test_map_in_the_making_does_not_jump(live):

@@ -11,8 +11,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from live import DOMAIN
+from live import DOMAIN, overrides
 
+from rlml_slam.cli import call
 from rlml_slam.cli.main import main
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.nodes.back_end import BackEndNode
@@ -73,6 +74,8 @@ def test_services_answer_in_words_and_refuse_in_words(live, command, tmp_path):
         (['load_map'], 'load_map needs an argument'),
         (['reset', 'hall'], 'reset takes no argument'),
         (['set_localization_mode', 'yes'], "'yes' is neither on nor off"),
+        (['initialpose', '1,2'], "'1,2' is no x,y,angle [m, degrees]"),
+        (['initialpose', '1,nan,3'], "'1,nan,3' is no x,y,angle [m, degrees]"),
     ],
 )
 def test_wrong_argument_is_one_line(words, why, capsys):
@@ -85,6 +88,25 @@ def test_absent_node_is_reported_with_those_that_are_there(live, command, tmp_pa
     code, out, err = command('save_map', '--node', '/nobody')
     assert (code, out) == (1, '')
     assert '/nobody: no such node; the service save_map is of /back_end' in err
+
+
+def test_pose_is_given_to_the_front_end(live, command, monkeypatch):
+    other = FrontEndNode(context=live.context, namespace='r2', parameter_overrides=overrides())
+    session, given = live.add(other).control.session, []
+    monkeypatch.setattr(session, 'start_at', lambda *of: given.append(of) or of[1])
+    code, out, _ = command('initialpose', '1.5,-2,90', '--node', '/r2/front_end')
+    assert (code, out) == (0, '/r2/initialpose: x = 1.5 m, y = -2 m, 90 degrees: sent\n')
+    live.spin_until(lambda: given)
+    ((_, pose, cov),) = given
+    np.testing.assert_allclose(pose, [1.5, -2.0, np.pi / 2])
+    np.testing.assert_allclose(cov, call.RVIZ)
+
+
+def test_pose_for_nobody_is_refused(live, command, monkeypatch):
+    monkeypatch.setattr(call, 'PATIENCE', 0.5)
+    code, out, err = command('initialpose', '0,0,0')
+    assert (code, out) == (1, '')
+    assert '/initialpose: nobody listens' in err
 
 
 def test_node_that_dds_finds_late_is_called_all_the_same(live, command, tmp_path, monkeypatch):

@@ -14,6 +14,7 @@ from live import BEST_EFFORT, DOMAIN, LATCHED, room
 from rclpy.qos import QoSProfile
 
 from rlml_slam.cli.main import main
+from rlml_slam.cli.support.processes import free_domain
 from rlml_slam.ros.codecs import decode, encode
 from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
 
@@ -245,6 +246,21 @@ def test_scans_on_another_topic(checked):
     _, wrong = checked(front, edit=remapped)
     texts = {f['text']: f['line'] for f in wrong}
     assert texts['scans are on /front/scan, not on /scan'] == '-p scan_topic:=/front/scan'
+
+
+def test_nothing_runs_at_all(monkeypatch, capsys):
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(free_domain()))
+    assert main(['check', '--seconds', '1']) == 1
+    said = capsys.readouterr().out
+    assert said.count('WRONG') == 1
+    assert 'WRONG: no node is seen in ROS_DOMAIN_ID' in said
+
+
+def test_topics_of_a_namespace(live, monkeypatch, capsys):
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(DOMAIN))
+    assert main(['check', '--seconds', '1', '--namespace', 'r2', '--json']) == 1
+    found = {row['topic'] for row in json.loads(capsys.readouterr().out)['topics']}
+    assert {'/r2/scan', '/r2/odom', '/tf'} <= found
 
 
 def test_nobody_is_there(live, monkeypatch, capsys):

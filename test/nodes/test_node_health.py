@@ -6,7 +6,9 @@ from __future__ import annotations
 import runpy
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
@@ -53,6 +55,21 @@ def test_each_scan_has_its_health_at_once(live, node):
             wanted = f'{node.last.stamp // 10**9}.{node.last.stamp % 10**9:09d}'
             live.spin_until(partial(has_stamp, live, wanted), timeout=2.0)
     assert poses > 20
+
+
+def test_level_is_logged_where_it_changes(live, node):
+    live.listen('/rosout', 'rcl_interfaces/msg/Log', 100)
+    live.spin_until(lambda: live.ear.count_publishers('/rosout') > 1)
+    frame = SimpleNamespace(stamp=1, statuses=np.zeros(0, int), wall_ms=1.0)
+    for health in (Health(), Health(), Health(Level.LOST, ('nothing fits', 'slow'))):
+        frame.health = health
+        node.health.update(frame)
+        node.health._found = ()
+        node.health._problems = tuple
+        node.health.publish()
+    live.spin_until(lambda: [m.msg for m in live.heard['/rosout'] if 'health' in m.msg][1:])
+    said = [(m.level, m.msg) for m in live.heard['/rosout'] if 'health' in m.msg]
+    assert said == [(20, 'health is OK'), (30, 'health is LOST: nothing fits')]
 
 
 def test_another_publisher_of_the_pose_is_a_problem(live, node, monkeypatch):

@@ -127,6 +127,8 @@ def test_user_mistake_of_the_player_is_told_without_a_traceback(start, args, mes
     [
         (['--help'], 0, 'usage: front_end'),
         (['--verbose'], 2, "what is '--verbose'?"),
+        (['-p', 'mode=mapping'], 2, '-p mode=mapping: a parameter is given as NAME:=VALUE'),
+        (['-p', 'laser_pose:=[0.2, 0, 0]'], 1, 'write all numbers alike'),
         (['-r', 'odom:=/imu'], 1, '/imu cannot be heard as Imu'),
     ],
 )
@@ -134,6 +136,15 @@ def test_words_after_ros_args_are_answered_without_a_traceback(start, words, cod
     found, out = ended(start('front_end', '--ros-args', *words))
     assert (found, said in out) == (code, True), out
     assert 'Traceback' not in out
+
+
+def test_parameter_file_of_other_nodes_is_named(start, tmp_path):
+    """ROS reads it, and nobody uses what is in it."""
+    file = tmp_path / 'my.yaml'
+    file.write_text('slam:\n  ros__parameters:\n    use_imu: false\n', encoding='utf-8')
+    words = ['--params-file', str(file), '-p', 'mode:=localization', '-p', 'map_file_name:=absent']
+    _, out = ended(start('back_end', '--ros-args', *words))
+    assert 'my.yaml: no section for front_end or back_end or /**: this file has no effect' in out
 
 
 def test_missing_map_refuses_to_localize(start, tmp_path):

@@ -219,8 +219,8 @@ class RobotSetup:
         if n.map_frame in self._parents[n.odom_frame]:
             out.append(
                 Finding(
-                    f'{n.map_frame} to {n.odom_frame} is on /tf already: a localization runs',
-                    'stop it, or -p shadow:=true beside it', False,
+                    f'{n.map_frame} to {n.odom_frame} is on /tf: a localization runs',
+                    'start no other one, or with -p shadow:=true', False,
                 )
             )  # fmt: skip
         for child, several in self._parents.items():

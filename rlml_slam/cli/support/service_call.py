@@ -32,13 +32,13 @@ def message_of(answer: Any) -> str:
 
 
 @contextlib.contextmanager
-def asking() -> Iterator[Any]:
+def asking(namespace: str | None = None) -> Iterator[Any]:
     """A node that asks. KeyboardInterrupt where a signal ended ROS meanwhile."""
     import rclpy
 
     rclpy.init()
     try:
-        asker = rclpy.create_node('rlml_ask')
+        asker = rclpy.create_node('rlml_ask', namespace=namespace)
         try:
             yield asker
         finally:
@@ -87,7 +87,7 @@ def _absent(asker: Any, node: str, service: str) -> str:
     if having:  # of several robots, perhaps
         return f'{node}: no such node; the service {service} is of {", ".join(sorted(having))}'
     nodes = f'there are {", ".join(sorted(running))}' if running else 'no node is running'
-    return f'{node}: no such node; {nodes} (in ROS_DOMAIN_ID {_domain()})'
+    return f'{node}: no such node; {nodes} (in ROS_DOMAIN_ID {domain()})'
 
 
 def others(asker: Any) -> list[tuple[str, str, str]]:
@@ -97,5 +97,6 @@ def others(asker: Any) -> list[tuple[str, str, str]]:
     return [node for node in seen if node[0] != own and not node[1].startswith('_')]
 
 
-def _domain() -> str:
+def domain() -> str:
+    """Number of the ROS domain of this process."""
     return os.environ.get('ROS_DOMAIN_ID', '0')

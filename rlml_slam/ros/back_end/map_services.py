@@ -129,8 +129,11 @@ class MapServices:
 
         def log(answer: Any) -> None:
             found = answer.result()
-            report = logger.info if found.success else logger.warning
-            report(f'reinitialize_global_localization: {found.text}')
+            text = f'reinitialize_global_localization: {found.text}'
+            if found.success:  # a line of its own: ROS allows one severity for each
+                logger.info(text)
+            else:
+                logger.warning(text)
 
         return self._relocalize(log)
 

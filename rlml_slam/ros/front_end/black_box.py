@@ -69,7 +69,7 @@ class BlackBox:
         self._map_id = map_id
         self._p, self._logger = params, node.get_logger()
         self._i = params.incident
-        self._folder = Path(params.node.map_directory) / FOLDER
+        self._folder = Path(params.node.map_directory).absolute() / FOLDER
         self._received: deque[Received] = deque()
         self._static: deque[Received] = deque(maxlen=MAX_STATIC)
         self._published: deque[Published] = deque()
