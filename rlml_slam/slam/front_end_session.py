@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections import OrderedDict
 from collections.abc import Callable
 
@@ -43,9 +42,9 @@ class FrontEndSession:
 
     def __init__(self, params: Parameters, new_session: Callable[[], int] | None = None) -> None:
         self._p = params
-        self._new_session = new_session or itertools.count(1).__next__
+        self._new_session = new_session
         self.front_end = FrontEnd(params)
-        self.session = self._new_session()
+        self.session = self._next(0)
         self.request, self.mode = RESTARTED, 0
         self.map: SavedMap | None = None
         self.last: Frame | None = None
@@ -54,6 +53,9 @@ class FrontEndSession:
         self._lost_since: int | None = None  # stamp of the first of the lost frames
         # stamp -> T_local_base (3,) and its covariance (3, 3)
         self._recent: OrderedDict[int, tuple[Array, Array]] = OrderedDict()
+
+    def _next(self, session: int) -> int:
+        return session + 1 if self._new_session is None else self._new_session()
 
     def process(self, observation: Observation) -> SessionFrame:
         """The frame of one observation."""
@@ -172,7 +174,7 @@ class FrontEndSession:
             self.front_end.use_map(self.map.reflectors, self.map.grid)
         self._recent.clear()
         self._lost_since = None
-        self.session, self.request = self._new_session(), request
+        self.session, self.request = self._next(self.session), request
 
 
 def is_lost(frame: Frame) -> bool:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 from typing import TypeVar
 
@@ -22,14 +21,13 @@ class Requests:
 
     def __init__(self, first: int = FIRST_REQUEST) -> None:
         self._first = max(first, FIRST_REQUEST)
-        self._numbers = itertools.count(self._first)
-        self._newest = 0
+        self._newest = self._first - 1
         self._since: int | None = None  # stamp of the first frame after the pending request
         self.pending: StartSession | Relocate | None = None
 
     def new_number(self) -> int:
         """The next number."""
-        self._newest = next(self._numbers)
+        self._newest += 1
         return self._newest
 
     def ask(self, command: Request) -> Request:

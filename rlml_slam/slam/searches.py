@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from enum import Enum
 
@@ -38,7 +37,7 @@ class Searches:
     """``take`` gives what a number stands for, once."""
 
     def __init__(self) -> None:
-        self._numbers = itertools.count(1)
+        self._newest = 0
         self._pending: dict[int, Pending] = {}
 
     def is_pending(self, *purposes: Purpose) -> bool:
@@ -53,7 +52,8 @@ class Searches:
         complete: bool = True,
     ) -> Search | DrawMap:
         """The command for a search in a map; without one, to draw the map in the making first."""
-        number, area = next(self._numbers), None
+        number = self._newest = self._newest + 1
+        area = None
         is_unfinished = saved is None or not complete
         if purpose is Purpose.RECOVER and is_unfinished and record is not None:
             area = search_area(record.frame)

@@ -198,16 +198,21 @@ def test_inactive_back_end_is_reported_by_the_front_end_beside_it(live):
 
 
 def test_cleanup_saves_the_map_and_frees_it(live, tmp_path):
+    gc.unfreeze()
+    gc.collect()
+    own = gc.get_freeze_count()  # of the interpreter: some in Python 3.12
     front, back = pair(live)
     feed(front, 0.0, 8.0)
     live.spin_until(lambda: back.mapper.worker.backlog == 0)
     keys = len(back.mapper.back_end.keyframes)
     assert keys > 5
+    gc.freeze()  # as the run of the executable does
     for name in ('deactivate', 'cleanup'):
         assert change(live, back, name)[0]
     (saved,) = (tmp_path / 'maps').glob('*.rlml')
     assert len(map_file.load(saved).arrays['pose']) == keys
-    assert gc.get_freeze_count() == 0
+    gc.collect()
+    assert gc.get_freeze_count() <= own
     for name in ('configure', 'activate'):
         assert change(live, back, name)[0]
     assert back.mapper.back_end.keyframes == []
