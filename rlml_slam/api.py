@@ -8,6 +8,7 @@ docs/examples/notebook.py.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,8 +23,10 @@ from rlml_slam.evaluation.ate import trajectory_errors
 from rlml_slam.evaluation.metrics import metrics
 from rlml_slam.evaluation.relations import Relations, read_relations, relation_errors
 from rlml_slam.evaluation.run_record import FrameLog, Run
-from rlml_slam.maps import map_container, nav2_map, reflector_file, saved_map
+from rlml_slam.maps import map_container, reflector_file, saved_map
+from rlml_slam.maps.atomic_file import set_aside
 from rlml_slam.maps.map_container import Content
+from rlml_slam.maps.nav2_map import save_grid
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Node, Parameters, from_mapping, read_yaml
@@ -166,9 +169,9 @@ def save_map(map_: Map, path: File) -> Path:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise MapError(f'{path}: cannot be written: {e.strerror or e}') from e
+    set_aside(path / 'map.rlml')  # of another map, which would be read in the place of this one
     reflector_file.save(map_.reflectors, path / 'reflectors.csv')
-    if map_.grid is not None:
-        nav2_map.save(map_.grid, path / 'map')
+    save_grid(map_.grid, path)
     return path
 
 
@@ -292,7 +295,7 @@ class Slam:
         if not self._log.stamps:
             why = self._system.synchronizer.inputs.last_error or 'no scan and no detections came'
             raise InputError(f'{name}: no measurement could be used: {why}')
-        run = collect(self._system, self._log, name, None)
+        run = collect(self._system, copy.deepcopy(self._log), name, None)  # it may go on
         if not self._is_localizing:
             run.stored = map_file.content_of(self._system.back_end, self.parameters, run.grid)
         run.inputs = self._system.counts

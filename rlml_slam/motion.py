@@ -38,6 +38,9 @@ GYRO_GAP = 0.75  # [s] between turn rates: beyond it the wheels know better how 
 # less than a tick in all, and adds up to no walk. A larger one lets the noise of the first scan
 # turn the whole map, while the robot stands and could well average it out.
 STANDING = 0.02
+# a robot moves sideways where it does so by this share of a way [m]; odometry of robots that
+# cannot has up to .08 of half a metre in public logs, from rounding
+ASIDE, WAY = 0.2, 0.5
 
 
 @brief
@@ -185,6 +188,7 @@ class _Noise(NamedTuple):
     max_gap: float
     max_speed: float
     max_turn_rate: float
+    moves_sideways: float  # 1: the robot can, or its base is not on the axle; 0: it cannot
 
 
 @brief
@@ -241,13 +245,15 @@ def _drive(
         sigma_v, sigma_w = n.max_speed / 5.0, n.max_turn_rate / 5.0
         if known:
             speed, turn = twists[at, 0], twists[at, 2]
-            moved = _share_moved(abs(speed), abs(turn), n) if gap > n.max_gap else 1.0
-            fast, quick, long_interval_noise = abs(speed) / moved, abs(turn) / moved, 0.0
+            sideways = n.moves_sideways * twists[at, 1]
+            way = math.hypot(speed, sideways)
+            moved = _share_moved(way, abs(turn), n) if gap > n.max_gap else 1.0
+            fast, quick, long_interval_noise = way / moved, abs(turn) / moved, 0.0
             if gap > 2.0 * n.noise_interval:
                 # when inside a long interval the motion happened is uncertain; what is left of it
                 # at the end is less than what was driven: at least as fast as before, and no arc
                 long_interval_noise = n.long_interval_noise
-                before = _speed_before(at - 1, stamps, twists, n.noise_interval)
+                before = _speed_before(at - 1, stamps, twists, n.noise_interval, n)
                 fast, quick = max(fast, before[0]), max(quick, before[1])
                 # a constant twist leads along an arc, which is longer than its chord
                 half = 0.5 * turn * (cuts[k + 1] - cuts[k]) / SECOND
@@ -258,7 +264,7 @@ def _drive(
             sigma_v, sigma_w = math.sqrt(moved) * sigma_v, math.sqrt(moved) * sigma_w
             if gap > n.max_gap:
                 # eq. 61: it went as far as at its speed before, wherever that led
-                usual = min(fast, _speed_before(at - 1, stamps, twists, RECENT)[0])
+                usual = min(fast, _speed_before(at - 1, stamps, twists, RECENT, n)[0])
                 way2 = ((moved * usual) ** 2 - speed**2 - sideways**2) * dt**2
                 beside2 += max(way2, 0.0) * sigma_w**2 * n.noise_interval * dt / 6.0
         # the wheels do not turn: so does the robot not, and the IMU shows its bias
@@ -275,7 +281,8 @@ def _drive(
             turn, sigma_w, gyro = rate, sigma_rate, 1.0
         # The noise is given for n.noise_interval; a shorter interval accumulates the same noise.
         # Where the motion is too fast for its interval, the stamps are wrong, not the noise.
-        lasted = max(dt, abs(speed) * dt / n.max_speed, abs(turn) * dt / n.max_turn_rate)
+        way = abs(speed) if n.moves_sideways == 0.0 else math.hypot(speed, sideways)
+        lasted = max(dt, way * dt / n.max_speed, abs(turn) * dt / n.max_turn_rate)
         scale = along = n.noise_interval / lasted
         lateral = n.lateral_noise * math.hypot(speed, sideways)
         if not known:
@@ -284,8 +291,14 @@ def _drive(
             lateral, since = n.max_speed / 5.0, _since(middle, stamps, at)
             along = max(n.noise_interval, 2.0 * since) / dt
         rows[0, k], rows[1, k], rows[2, k], rows[6, k] = speed, turn, dt, gyro
-        rows[3, k], rows[4, k] = sigma_v**2 * along, sigma_w**2 * scale
-        rows[5, k], rows[7, k] = lateral**2 * along, sideways
+        var, var_aside = sigma_v**2 * along, lateral**2 * along
+        if n.moves_sideways > 0.0 and way > 0.0:  # along and across the way, wherever that leads
+            share = (sideways / way) ** 2
+            var, var_aside = (
+                (1.0 - share) * var + share * var_aside, share * var + (1.0 - share) * var_aside
+            )  # fmt: skip
+        rows[3, k], rows[4, k] = var, sigma_w**2 * scale
+        rows[5, k], rows[7, k] = var_aside, sideways
         if known:
             open2, turned2 = max(open2, unsure**2), max(turned2, (1.0 - gyro) * unsure**2)
         all_known = all_known and known
@@ -317,7 +330,9 @@ def _share_moved(speed: float, turn: float, n: _Noise) -> float:
 
 
 @part
-def _speed_before(at: int, stamps: Stamps, twists: Array, interval: float) -> tuple[float, float]:
+def _speed_before(
+    at: int, stamps: Stamps, twists: Array, interval: float, n: _Noise
+) -> tuple[float, float]:
     """Speed and turn rate in an ``interval`` [s] until sample ``at``, without a jump in it.
 
     Stamps of one burst are too close to divide by.
@@ -325,7 +340,8 @@ def _speed_before(at: int, stamps: Stamps, twists: Array, interval: float) -> tu
     far = turned = lasted = 0.0
     while at > 0 and lasted < interval and not math.isnan(twists[at, 0]):
         dt = (stamps[at] - stamps[at - 1]) / SECOND
-        far, turned = far + abs(twists[at, 0]) * dt, turned + abs(twists[at, 2]) * dt
+        speed = math.hypot(twists[at, 0], n.moves_sideways * twists[at, 1])
+        far, turned = far + speed * dt, turned + abs(twists[at, 2]) * dt
         lasted += dt
         at -= 1
     lasted = max(lasted, min(interval, COAST))
@@ -378,7 +394,9 @@ class MotionBuffer:
 
     def __init__(self, noise: MotionNoise, memory: float) -> None:
         self._noise = noise
-        self._noise_values = _Noise(*(float(getattr(noise, name)) for name in _Noise._fields))
+        values = {name: float(getattr(noise, name, 0.0)) for name in _Noise._fields}
+        self._noise_values = _Noise(**values)
+        self._way = self._aside = 0.0  # [m] since the last look at how the robot moves
         self._memory = int(memory * SECOND)
         self._stamps: list[int] = []
         self._poses: list[Array] = []
@@ -420,6 +438,8 @@ class MotionBuffer:
                 step = np.full(3, np.nan)
             elif self._has_restarted(sample):
                 step = np.full(3, np.nan)
+            else:
+                self._learn_whether_sideways(step, (sample.stamp - self._stamps[-1]) / SECOND)
             self._twists.append(step)
         self._parked = None
         self._stamps.append(sample.stamp)
@@ -439,6 +459,20 @@ class MotionBuffer:
         if not is_possible(step, dt, self._noise):
             return None
         return step / dt
+
+    def _learn_whether_sideways(self, twist: Array, dt: float) -> None:
+        """Find out once whether the base moves across its heading by more than odometry rounds.
+
+        It does where the wheels can, and where it does not sit on their axle.
+        """
+        if dt > 2.0 * self._noise.noise_interval:
+            return  # of long intervals it counts anyway
+        self._way += math.hypot(twist[0], twist[1]) * dt
+        self._aside += float(twist[1]) * dt
+        if self._way > WAY:
+            if abs(self._aside) > ASIDE * self._way:
+                self._noise_values = self._noise_values._replace(moves_sideways=1.0)
+            self._way = self._aside = 0.0
 
     def _has_restarted(self, sample: Odometry) -> bool:
         """Whether odometry is at zero after a long gap and was not before it: it began again."""

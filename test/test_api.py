@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import runpy
 import subprocess
 import sys
@@ -84,10 +85,25 @@ def test_measurement_by_measurement_gives_the_result_of_a_replay(bag, result):
     assert bag.skipped == {}
 
 
+def test_result_stays_as_it_is_while_the_run_goes_on(bag):
+    slam, measurements = rlml_slam.Slam(bag.parameters, bag.sensor_poses), list(bag)
+    for measurement in measurements[:800]:
+        slam.add(measurement)
+    first = slam.finish()
+    n = len(first.live.poses)
+    for measurement in measurements[800:]:
+        slam.add(measurement)
+    assert len(slam.finish().live.poses) > n == len(first.live.poses) == len(first.poses)
+
+
 def test_map_is_saved_loaded_and_localized_in(bag, result, tmp_path):
     whole = rlml_slam.load_map(rlml_slam.save_map(result.map, tmp_path / 'room.rlml'))
     plain = rlml_slam.load_map(rlml_slam.save_map(result.map, tmp_path / 'folder'))
     assert plain.graph is None
+    other = dataclasses.replace(plain, grid=None)
+    result.save(tmp_path / 'folder')
+    again = rlml_slam.load_map(rlml_slam.save_map(other, tmp_path / 'folder'))
+    assert again.graph is again.grid is None  # those of the map before are set aside
     assert len(rlml_slam.load_map(result.save(tmp_path / 'out')).graph.arrays) > 0
     for map_ in (whole, plain):
         np.testing.assert_allclose(map_.reflectors.points, result.map.reflectors.points, atol=1e-6)
@@ -124,6 +140,8 @@ def test_errors_are_those_of_the_files(result, tmp_path):
     (tmp_path / 'relations').write_text(f'{t[0]:.9f} {t[1]:.9f} 0 0 0 0 0 0\n')
     relative = rlml_slam.evaluate(result, relations=tmp_path / 'relations')
     assert relative['relations'] == 1
+    both = rlml_slam.evaluate(result, truth=truth, relations=tmp_path / 'relations')
+    assert (both['unmatched'], both['relations_unmatched']) == (0, 0)
     with pytest.raises(rlml_slam.RlmlError, match='give truth or relations'):
         rlml_slam.evaluate(result.trajectory)
 

@@ -161,6 +161,14 @@ def test_numbers_are_checked_for_length_and_range(name, value, why):
         from_mapping({name: value})
 
 
+@pytest.mark.parametrize('of', NODES)
+def test_names_of_frames_lose_the_slash_that_ros_1_allowed(of):
+    for d in declarations(of):
+        if d.name.endswith('_frame') and isinstance(d.default, str):
+            group = getattr(from_mapping({d.name: f'/{d.default}'}, of), d.group)
+            assert getattr(group, d.field) == d.default
+
+
 def test_whole_number_that_python_does_not_print_is_refused_by_its_name():
     with pytest.raises(ParameterError, match='odom_timeout = a number that is too long to print'):
         from_mapping({'odom_timeout': 1 << 20000})

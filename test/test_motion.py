@@ -240,6 +240,34 @@ def test_motion_follows_the_odometry_at_any_rate(rate, tolerance):
     np.testing.assert_allclose(m.delta, line(0.9, 0.8)(2.444), atol=tolerance)
 
 
+@pytest.mark.parametrize('place', [(1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.3, -0.2, np.pi / 2)])
+def test_motion_is_that_of_any_point_of_the_robot(place):
+    """A base that is not on the axle, or is turned, moves sideways; so do robots with mecanum."""
+    at, spin = np.array(place), se2.exp
+    drive = {'pose_at': lambda t: spin(np.array([0.4 * t, 0.0, 0.5 * t])), 'duration': 8.0}
+    times = T0 + 5 * SECOND, T0 + 7 * SECOND  # it has turned before
+    axle = filled(**drive).motion(*times)
+    buffer = filled(lambda t: se2.compose(drive['pose_at'](t), at), duration=8.0)
+    wanted = se2.between(at, se2.compose(axle.delta, at))
+    np.testing.assert_allclose(buffer.motion(*times).delta, wanted, atol=1e-4)
+
+
+def test_noise_is_along_the_way_whatever_that_is():
+    times = T0 + 3 * SECOND, T0 + 4 * SECOND
+    forward = filled(line(0.5)).motion(*times)
+    aside = filled(lambda t: np.array([0.0, 0.5 * t, 0.0])).motion(*times)
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(aside.delta, turn @ forward.delta, atol=1e-9)
+    np.testing.assert_allclose(aside.cov, turn @ forward.cov @ turn.T, rtol=1e-9, atol=1e-15)
+
+
+def test_rounding_is_no_sideways_motion():
+    """A robot that cannot move sideways is as it was before: exactly."""
+    rng = np.random.default_rng(3)
+    wheels = filled(lambda t: np.round(line(0.5, 0.3)(t) + 2e-4 * rng.standard_normal(3), 3))
+    assert wheels._noise_values.moves_sideways == 0.0
+
+
 def test_covariance_does_not_depend_on_the_rates():
     covs = [
         filled(line(0.9, 0.5), rate=rate).motion(T0 + 500 * MS, T0 + 3500 * MS).cov

@@ -26,7 +26,8 @@ import numpy as np
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.errors import FileFormatError, MapError, ParameterError
 from rlml_slam.maps import map_container
-from rlml_slam.maps.map_container import PREVIOUS, Content
+from rlml_slam.maps.atomic_file import PREVIOUS
+from rlml_slam.maps.map_container import Content
 
 SAVED = 3  # versions that a child saves before it may be killed, at most
 SIDE = 400  # cells of the grid: a save takes some milliseconds

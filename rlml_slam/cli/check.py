@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from rlml_slam.cli.main import between
 from rlml_slam.cli.support.robot_setup import Finding, RobotSetup
 from rlml_slam.cli.support.service_call import asking, domain, others
 from rlml_slam.cli.support.text_table import aligned
@@ -30,7 +31,9 @@ def add_parser(subparsers: Any) -> None:
         'type. Turn the robot meanwhile: then the mounting of the laser is checked as well. '
         'Exit code 0: nothing is wrong, 1: something is.',
     )
-    parser.add_argument('--seconds', type=float, default=10.0, metavar='S', help='to listen')
+    parser.add_argument(
+        '--seconds', type=between(0.1, 1e5), default=10.0, metavar='S', help='to listen'
+    )
     parser.add_argument('--config', type=Path, metavar='YAML', help='ROS parameter file')
     parser.add_argument(
         '--scan', metavar='TOPIC', help='of the scans (default: the parameter scan_topic)'

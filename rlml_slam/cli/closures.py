@@ -46,11 +46,12 @@ def run(args: argparse.Namespace) -> int:
     """List, or revoke."""
     if args.revoke is not None:
         if args.folder is None:
-            print(ask(args.node, 'revoke_closure', str(args.revoke)))
+            said = ask(args.node, 'revoke_closure', str(args.revoke))
         elif args.folder.is_file():
-            print(revoke(args.folder, args.revoke))
+            said = revoke(args.folder, args.revoke)
         else:
             raise InputError('--revoke works in a running back end or a saved map: name its file')
+        print(json.dumps({'revoked': said}) if args.json else said)
         return 0
     rows = read(args.folder) if args.folder else parse(ask(args.node, 'closures'), args.node)
     if args.json:

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from rlml_slam.cli.main import between
 from rlml_slam.datasets import carmen
 from rlml_slam.datasets.text_file import SECOND
 from rlml_slam.datasets.tum import Trajectory
@@ -55,10 +56,16 @@ def add_parser(subparsers: Any) -> None:
     log = kinds.add_parser('carmen', help='CARMEN log: FLASER, ROBOTLASER1, RAWLASER + ODOM')
     log.add_argument('log', metavar='LOG', type=Path, help='.log or .clf, also .gz or .xz')
     log.add_argument(
-        '--max-range', type=float, metavar='M', help='ranges from here on are no returns'
+        '--max-range',
+        type=between(0.0, 1e4),
+        metavar='M',
+        help='ranges from here on are no returns',
     )
     log.add_argument(
-        '--field-of-view', type=float, metavar='DEG', help='span of the beams of FLASER lines'
+        '--field-of-view',
+        type=between(1.0, 360.0),
+        metavar='DEG',
+        help='span of the beams of FLASER lines',
     )
     log.add_argument('--strict', action='store_true', help='fail at the first broken line')
     add_output_arguments(log)

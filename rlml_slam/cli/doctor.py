@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import math
 from pathlib import Path
@@ -26,6 +25,7 @@ from rlml_slam.sensing.reflectors.background_intensity import VENDOR_BIT
 from rlml_slam.sensing.reflectors.reflector_calibration import calibrated
 from rlml_slam.sensing.reflectors.reflector_detector import detect, threshold
 from rlml_slam.sensing.reflectors.scan_reflectors import in_words
+from rlml_slam.sensing.synchronization.synchronizer import invalid_geometry
 from rlml_slam.types import Scan
 
 MOST_SCANS = 500  # looked at, spread over the bag
@@ -91,6 +91,7 @@ def gather(
         on = _on_spots(scan, found.beams, found.widths, np.hypot(*found.points.T))
         with np.errstate(invalid='ignore'):
             valid = (scan.ranges >= scan.range_min) & (scan.ranges <= scan.range_max)
+        valid &= np.isfinite(scan.intensities)
         beams.append(np.stack([scan.ranges, scan.intensities], -1)[valid])
         is_spot.append(on[valid])
         levels.append(level[valid] / detector.contrast)
@@ -109,7 +110,7 @@ def gather(
 
 def scans_of(path: Path, topic: str, given: DetectorParameters, quiet: bool) -> list[Scan]:
     """At most MOST_SCANS of the scans of a bag, spread over it."""
-    seen: list[Scan] = []
+    seen, error = list[Scan](), ''
     with BagReader(path) as bag:
         name = topic or choose_topics(bag.topics, given.node, ('imu', 'odom')).get('scan', '')
         if name not in bag.topics or 'LaserScan' not in bag.topics[name].msgtype:
@@ -120,11 +121,16 @@ def scans_of(path: Path, topic: str, given: DetectorParameters, quiet: bool) -> 
             for k, (_, _, message) in enumerate(bag.messages([name])):
                 if k % stride:
                     continue
-                with contextlib.suppress(InputError):
-                    seen.append(decode.scan(message, name))
+                try:
+                    scan = decode.scan(message, name)
+                    error = invalid_geometry(scan)
+                except InputError as e:
+                    error = str(e)
+                if not error:
+                    seen.append(scan)
                 progress.update(k + 1, '')
     if not seen:
-        raise BagError(f'{path}: {name} has no scan that can be read')
+        raise BagError(f'{path}: {name} has no scan that can be used{error and ": "}{error}')
     return seen
 
 
@@ -197,7 +203,7 @@ def propose(e: Evidence) -> tuple[float, float, float, float]:
         here, there = others[octave == o], e.spots[of_spot == o]
         low = float(np.median(here))
         if len(there) < min(FEW, len(e.spots)):
-            alone.append((float(np.median(r[octave == o])), low))
+            alone += [(float(np.median(r[octave == o])), low)] if low > 0.0 else []
             continue
         high = float(np.quantile(there[:, 1], 0.1))
         at.append(float(np.median(there[:, 0])))

@@ -6,8 +6,10 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Mapping
+from math import inf
 from typing import Any
 
+from rlml_slam.cli.main import between
 from rlml_slam.datasets.tum import read_tum
 from rlml_slam.evaluation.ate import trajectory_errors
 from rlml_slam.evaluation.relations import read_relations, relation_errors
@@ -26,7 +28,7 @@ def add_parser(subparsers: Any) -> None:
     relations.add_argument('trajectory', metavar='TRAJ', help='TUM file (also .gz, .xz)')
     relations.add_argument('relations', metavar='RELATIONS', help='t1 t2 x y z roll pitch yaw')
     relations.add_argument(
-        '--tolerance', type=float, default=1e-3, metavar='S',
+        '--tolerance', type=between(0.0, inf), default=1e-3, metavar='S',
         help='a pose and a stamp farther apart do not match (default: %(default)s)',
     )  # fmt: skip
 
@@ -35,7 +37,7 @@ def add_parser(subparsers: Any) -> None:
     ate.add_argument('truth', metavar='TRUTH', help='TUM file (also .gz, .xz)')
     ate.add_argument('--align', action='store_true', help='fit the trajectory to the truth first')
     ate.add_argument(
-        '--max-gap', type=float, default=0.5, metavar='S',
+        '--max-gap', type=between(0.0, inf), default=0.5, metavar='S',
         help='truth is not interpolated over longer gaps (default: %(default)s)',
     )  # fmt: skip
     for p in (relations, ate):
@@ -47,19 +49,26 @@ def run(args: argparse.Namespace) -> int:
     trajectory = read_tum(args.trajectory)
     if args.kind == 'relations':
         relations = read_relations(args.relations)
-        figures = relation_errors(trajectory, relations, round(args.tolerance * 1e9)).summary()
+        figures = relation_errors(trajectory, relations, nanoseconds(args.tolerance)).summary()
         text = _relations_text(figures)
     else:
         truth = read_tum(args.truth)
-        errors = trajectory_errors(trajectory, truth, args.align, round(args.max_gap * 1e9))
+        errors = trajectory_errors(trajectory, truth, args.align, nanoseconds(args.max_gap))
         figures = errors.summary()
         text = _ate_text(figures, args.align)
     print(json.dumps(figures) if args.json else text)
     return 0
 
 
+def nanoseconds(seconds: float) -> int:
+    """A time [ns]; a century where it has no end."""
+    return round(min(seconds, 3e9) * 1e9)
+
+
 def _relations_text(f: Mapping[str, float]) -> str:
-    lines = [f'{f["relations"]:.0f} relations, {f["unmatched"]:.0f} without a pose at a stamp']
+    lines = [
+        f'{f["relations"]:.0f} relations, {f["relations_unmatched"]:.0f} without a pose at a stamp'
+    ]
     for name, word, unit in (('trans', 'translational', 'm'), ('rot', 'rotational', 'deg')):
         lines.append(
             f'{word:<14} {f[f"{name}_mean_{unit}"]:.4f} ± {f[f"{name}_std_{unit}"]:.4f} {unit}'

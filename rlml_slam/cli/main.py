@@ -14,7 +14,7 @@ import importlib
 import os
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, TypeAlias
@@ -200,6 +200,18 @@ def _state_defaults(parser: argparse.ArgumentParser) -> None:
         is_number = type(action.default) in (int, float) and action.nargs != 0
         if is_number and 'default' not in (action.help or ''):
             action.help = f'{action.help or ""} (default: %(default)s)'.lstrip()
+
+
+def between(low: float, high: float) -> Callable[[str], float]:
+    """The ``type`` of an argument that is a number from ``low`` to ``high``; NaN is none."""
+
+    def number(text: str) -> float:
+        value = float(text)
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f'{text} is not between {low:g} and {high:g}')
+        return value
+
+    return number
 
 
 def _load(name: str, command: Command) -> Any:

@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
         )
     source = source_of(args.bag)
     result.origin = replace(result.origin, command=args.command_line, source=source)
-    figures = write_outputs(result, args.out, not args.no_report)
+    figures = write_outputs(result, args.out, not args.no_report, args.map)
     return print_summary(result, figures, args.out, args.json, not args.no_report)
 
 

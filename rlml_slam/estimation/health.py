@@ -67,9 +67,9 @@ class HealthMonitor:
     def __init__(self, limits: HealthLimits) -> None:
         self._limits = limits
         self._odometry = NEVER
-        self._reflectors_matched = NEVER
+        self._detected = self._reflectors_matched = NEVER
         self._reflectors_seen = NEVER
-        self._scan_matched = NEVER
+        self._scanned = self._scan_matched = NEVER
         self._held_by_reflectors = NEVER
         self._held_by_scan = NEVER
         self._first: int | None = None
@@ -142,11 +142,17 @@ class HealthMonitor:
             self._odometry = stamp
         if step.matched >= 2:
             self._held_by_reflectors = stamp
-        if step.matched > 0 or not step.detections:
+        # frames may be of the scan or of the reflectors alone: one without says nothing of them,
+        # unless there are none any more
+        if step.detections is not None:
+            self._detected = stamp
+        if step.matched > 0 or step.detections == 0 or self._fails(self._detected, stamp):
             self._reflectors_matched = stamp
         if step.expected < FEW or 2 * step.seen > step.expected:
             self._reflectors_seen = stamp
-        if step.scan.used or not step.scan.has_scan:
+        if step.scan.has_scan:
+            self._scanned = stamp
+        if step.scan.used or self._fails(self._scanned, stamp):
             self._scan_matched = stamp
         if step.scan.used and step.scan.open_direction is None:
             self._held_by_scan = stamp

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
+from rlml_slam.errors import InputError
 from rlml_slam.evaluation.ate import TrajectoryErrors, trajectory_errors
 from rlml_slam.evaluation.run_record import Run
 from rlml_slam.se2 import Array
@@ -42,10 +43,11 @@ def run_errors(run: Run) -> RunErrors | None:
     if run.truth is None or not len(run.trajectory) or not run.frames.stamps:
         return None
     truth, aligned = run.truth.trajectory, not run.truth.is_map
-    if truth.stamps[-1] < run.frames.stamps[0] or truth.stamps[0] > run.frames.stamps[-1]:
+    try:
+        optimized = trajectory_errors(run.trajectory, truth, aligned)
+        live = trajectory_errors(run.frames.trajectory(), truth, aligned)
+    except InputError:  # no pose between two of the truth that are near in time
         return None
-    optimized = trajectory_errors(run.trajectory, truth, aligned)
-    live = trajectory_errors(run.frames.trajectory(), truth, aligned)
     unknown = np.full(len(live.errors), np.nan)
     return RunErrors(
         optimized, live, unknown if aligned else nees(live, np.array(run.frames.covs))

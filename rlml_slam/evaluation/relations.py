@@ -42,7 +42,10 @@ class RelationErrors:
     def summary(self) -> dict[str, float]:
         """Mean, standard deviation and maximum of the errors, and of their squares."""
         rot = np.degrees(self.rot)
-        out: dict[str, float] = {'relations': len(self.trans), 'unmatched': self.unmatched}
+        out: dict[str, float] = {
+            'relations': len(self.trans),
+            'relations_unmatched': self.unmatched,
+        }
         for name, unit, e in (('trans', 'm', self.trans), ('rot', 'deg', rot)):
             out[f'{name}_mean_{unit}'] = float(e.mean())
             out[f'{name}_std_{unit}'] = float(e.std())

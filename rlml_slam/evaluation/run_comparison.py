@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from rlml_slam import se2
 from rlml_slam.datasets.tum import Trajectory
 from rlml_slam.errors import ParameterError
 from rlml_slam.evaluation.ate import MAX_GAP, TrajectoryErrors, trajectory_errors
@@ -225,7 +226,8 @@ def _parting(
             return
         k = int(beyond[0])
         stamp = int(errors.stamps[k])
-        x, y = path.poses[errors.indices[k], :2] if len(path) else (0.0, 0.0)
+        pose = path.poses[errors.indices[k]] if len(path) else np.zeros(3)
+        x, y, _ = se2.compose(errors.T_truth_map, pose)
         health = _health_at(a, stamp), _health_at(b, stamp)
         yield Parting(distance, (stamp - start) * 1e-9, stamp, (float(x), float(y)), health)
 

@@ -10,6 +10,8 @@ from pathlib import Path
 
 from rlml_slam.errors import MapError
 
+PREVIOUS = '.previous'
+
 
 def write_atomically(
     path: Path, *parts: bytes | memoryview, before: Callable[[Path], None] = lambda path: None
@@ -35,6 +37,16 @@ def write_atomically(
         _sync_folder(path.parent)
     except OSError as e:
         raise MapError(f'{path}: cannot be written: {e.strerror or e}') from e
+
+
+def set_aside(*paths: Path) -> None:
+    """Give files that are no longer true the name ``path.previous``. Raises MapError."""
+    for path in paths:
+        try:
+            if path.exists():
+                os.replace(path, path.with_name(path.name + PREVIOUS))
+        except OSError as e:
+            raise MapError(f'{path}: cannot be set aside: {e.strerror or e}') from e
 
 
 def _sync_folder(folder: Path) -> None:

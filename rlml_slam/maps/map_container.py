@@ -19,6 +19,7 @@ import io
 import json
 import math
 import os
+import shutil
 import struct
 import tokenize
 import zipfile
@@ -32,14 +33,13 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from rlml_slam.errors import FileFormatError, MapError
-from rlml_slam.maps.atomic_file import write_atomically
+from rlml_slam.maps.atomic_file import PREVIOUS, write_atomically
 from rlml_slam.maps.pieces import Pieces
 
 MAGIC, VERSION = b'RLMLMAP', 1
 HEAD = struct.Struct('<7sBQ32s')
 SIZE = HEAD.size + 16
 DESCRIPTION = 'description.json'
-PREVIOUS = '.previous'
 PACKED = 1 << 16  # bytes; smaller arrays are not worth a compressor's start
 PIECE = 1 << 20  # bytes that are unpacked at a time
 UNPACKED = 1 << 28  # bytes that any file may unpack to,
@@ -107,8 +107,14 @@ def _keep_previous(path: Path) -> None:
         return
     second = path.with_name(f'.{path.name}{PREVIOUS}.{os.getpid()}')
     second.unlink(missing_ok=True)
-    os.link(path, second)
-    os.replace(second, previous)
+    try:
+        try:
+            os.link(path, second)
+        except OSError:  # FAT and some shares have no second names
+            shutil.copy2(path, second)
+        os.replace(second, previous)
+    finally:
+        second.unlink(missing_ok=True)
 
 
 def _is_whole(path: Path) -> bool:

@@ -12,6 +12,7 @@ transparency, of these and the opacity), and p = s where ``negate``, else 1 - s:
 
 from __future__ import annotations
 
+import json
 import math
 import warnings
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.errors import FileFormatError, MapError
-from rlml_slam.maps.atomic_file import write_atomically
+from rlml_slam.maps.atomic_file import set_aside, write_atomically
 from rlml_slam.maps.occupancy import UNKNOWN, OccupancyGrid
 from rlml_slam.plain_yaml import parse_yaml
 
@@ -64,8 +65,9 @@ def save(grid: OccupancyGrid, path: str | Path) -> tuple[Path, Path]:
     rows = len(image)
     columns = image.size // max(rows, 1)
     header = f'P5\n# resolution {grid.resolution:g} m\n{columns} {rows}\n255\n'.encode()
+    name = json.dumps(pgm.name, ensure_ascii=False)  # which is YAML, whatever the name has in it
     text = (
-        f'image: {pgm.name}\nmode: trinary\nresolution: {grid.resolution!r}\n'
+        f'image: {name}\nmode: trinary\nresolution: {grid.resolution!r}\n'
         f'origin: [{grid.origin[0]!r}, {grid.origin[1]!r}, {grid.yaw!r}]\nnegate: 0\n'
         f'occupied_thresh: {OCCUPIED_THRESH}\nfree_thresh: {FREE_THRESH}\n'
     )
@@ -204,3 +206,14 @@ def _decoded(
         used = rgba if mode == 'trinary' else rgba[..., :3]
         return used.sum(axis=-1, dtype=np.uint16), 255 * used.shape[-1], rgba[..., 3] == 255
     return np.asarray(image.convert('RGB')).sum(axis=-1, dtype=np.uint16), 765, None
+
+
+def save_grid(grid: OccupancyGrid | None, folder: Path) -> list[str]:
+    """Write map.pgm and map.yaml of a folder, whose names are returned.
+
+    Without a grid, those of an older map are set aside. Raises MapError.
+    """
+    if grid is not None:
+        return [path.name for path in save(grid, folder / 'map')]
+    set_aside(folder / 'map.pgm', folder / 'map.yaml')
+    return []

@@ -11,6 +11,7 @@ By the suffix of the file's name:
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import re
@@ -27,6 +28,7 @@ from rlml_slam.types import ANONYMOUS
 
 MM = 1e-3
 FARTHEST = 1e7  # [m]
+WIDEST = 2.0  # [m], below which a diameter is
 # what a survey's column may be called, in small letters and without the unit [m]
 COLUMNS = {
     'id': ('id', 'nr', 'no', 'number', 'global_id', 'globalid'),
@@ -54,7 +56,7 @@ def load(path: str | Path) -> Survey:
     """Read a survey. Raises MapError if there is none, FileFormatError saying what is wrong."""
     path = Path(path)
     try:
-        text = path.read_text(encoding='utf-8')
+        text = path.read_text(encoding='utf-8-sig')
     except OSError as e:
         raise MapError(f'{path}: cannot be read: {e.strerror}') from e
     except UnicodeDecodeError as e:
@@ -67,7 +69,7 @@ def load(path: str | Path) -> Survey:
     try:
         for where, row in reader(text):
             rows.append(_checked(where, row))
-    except (ValueError, TypeError, KeyError, RecursionError) as e:
+    except (ValueError, TypeError, KeyError, RecursionError, csv.Error) as e:
         raise FileFormatError(f'{path}: {e}') from e
     if not rows:
         raise FileFormatError(f'{path}: no reflector in it')
@@ -91,6 +93,8 @@ def _checked(where: str, row: Mapping[str, Any]) -> tuple[float, float, float, f
         raise ValueError(f'{where}: {e}') from e
     if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST):
         raise ValueError(f'{where}: the place is not finite, or beyond {FARTHEST:g} m')
+    if not (math.isnan(diameter) or 0.0 < diameter < WIDEST):
+        raise ValueError(f'{where}: a diameter of {diameter:g} m is not in (0, {WIDEST:g})')
     if abs(id_) >= 1 << 53:
         raise ValueError(f'{where}: {id_} is no id')
     return float(id_), x, y, diameter
@@ -98,29 +102,47 @@ def _checked(where: str, row: Mapping[str, Any]) -> tuple[float, float, float, f
 
 def _csv(text: str) -> Iterable[tuple[str, Mapping[str, Any]]]:
     lines = [
-        (number, line.strip().lstrip('\ufeff'))
+        (number, line.rstrip().lstrip(' '))  # an empty first word may precede a tab
         for number, line in enumerate(text.splitlines(), 1)
         if line.strip() and not line.lstrip().startswith('#')
     ]
     if not lines:
         return
     separator = next((s for s in (';', '\t', ',') if s in lines[0][1]), None)
-    rows = [
-        (number, [word.strip().strip('"') for word in line.split(separator)])
-        for number, line in lines
-    ]
+    rows = [(number, _words(line, separator)) for number, line in lines]
     if separator in (';', '\t'):  # then the comma may be that of decimals
         rows = [(number, [word.replace(',', '.') for word in words]) for number, words in rows]
-    names = [_column(word) for word in rows[0][1]]
+    names, width = [_column(word) for word in rows[0][1]], len(rows[0][1])
     if _is_number(rows[0][1][-1]):
         names = _unnamed([words for _, words in rows])
     elif not {'x', 'y'} <= set(names):
         read = ', '.join(rows.pop(0)[1])
         raise ValueError(f'no columns of x and y; the header has {read}')
+    elif twice := [name for name in COLUMNS if names.count(name) > 1]:
+        read = ', '.join(rows[0][1])
+        raise ValueError(f'more than one column of {twice[0]}; the header has {read}')
     else:
         rows = rows[1:]
     for number, words in rows:
-        yield f'line {number}', dict(zip(names, words, strict=False))
+        yield f'line {number}', _row(number, words, names, width)
+
+
+def _words(line: str, separator: str | None) -> list[str]:
+    """The words of a line, without quotes; a separator inside of them is part of the word."""
+    text = line if separator else ' '.join(line.split())
+    (words,) = csv.reader([text], delimiter=separator or ' ', skipinitialspace=True)
+    return [word.strip() for word in words]
+
+
+def _row(number: int, words: list[str], names: list[str], width: int) -> dict[str, str]:
+    """Words by column; ValueError where they may be meant otherwise."""
+    if any(words[width:]):
+        raise ValueError(f'line {number}: {len(words)} values, {width} expected')
+    row = dict(zip(names, words, strict=False))
+    for name in COLUMNS:
+        if ',' in row.get(name, ''):
+            raise ValueError(f'line {number}: {row[name]}: write 1.5, or 1,5 between semicolons')
+    return row
 
 
 def _unnamed(rows: list[list[str]]) -> list[str]:

@@ -54,7 +54,7 @@ class EkfSlamNode(ManagedNode):
 
     def process(self, observation: Observation) -> None:
         """One observation: estimate, publish, and map to odom."""
-        frame = self.estimator.process(observation)
+        frame = self.answers.with_odometry(self.estimator.process(observation))
         self.answers.publish(SessionFrame(ANY, frame))
         self.health.update(frame)
         self.tf.follow(frame)

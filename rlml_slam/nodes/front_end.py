@@ -22,16 +22,14 @@ from rlml_slam.types import Frame, Observation
 
 
 class FrontEndNode(ManagedNode):
-    """Drives a FrontEnd with the robot's sensors; all stamps are those of the input.
-
-    With a back end in the same process, ``take`` gets its frames, ``command`` its commands.
-    """
+    """Drives a FrontEnd with the robot's sensors; all stamps are those of the input."""
 
     def __init__(self, has_back_end: bool = False, **options: Any) -> None:
-        self.take: Callable[[SessionFrame], None] | None = None
+        self.take: Callable[[SessionFrame], None] | None = None  # a back end in the same process
         self._has_back_end = has_back_end
         self.back_end_is_active: Callable[[], bool] = lambda: True
         self._map: LocalizeIn | None = None
+        self._obey: Callable[[FrontEndCommand], None] = lambda _: None  # while there is a control
         super().__init__('front_end', **options)
 
     def build(self) -> None:
@@ -44,6 +42,8 @@ class FrontEndNode(ManagedNode):
         self.sensors = Sensors(self, self.params, STREAMS, self.process, self.control.restart)
         self.sensors.arrange = self.black_box.arrange
         self.health = HealthPublisher(self, self.sensors, self.figures, self.problems)
+        self.exits.callback(setattr, self, '_obey', self._obey)
+        self._obey = self.control.command  # first: the map of another thread may come just now
         if self._map is not None:
             self.control.command(self._map)
 
@@ -51,8 +51,7 @@ class FrontEndNode(ManagedNode):
         """A command of the back end in this process, from any thread."""
         if isinstance(command, LocalizeIn):
             self._map = command  # for a front end that is configured again
-        if self.is_configured:
-            self.control.command(command)
+        self._obey(command)
 
     def figures(self) -> dict[str, object]:
         """Figures for /diagnostics."""

@@ -32,7 +32,8 @@ class BagInputs:
 
     ``topics`` by stream, as ``params`` ask for them, and ``more_scans`` those of further lidars;
     ``tf`` is the topic of transforms, '' without one; ``extrinsics`` knows the static transforms
-    of the whole bag. ``params`` have the frames that the bag has, where it has others.
+    of the whole bag, and those on /tf as far as they are needed. ``params`` have the frames that
+    the bag has, where it has others.
     """
 
     def __init__(self, bag: BagReader, params: Parameters) -> None:
@@ -47,10 +48,14 @@ class BagInputs:
             self._read_tf(None)
             self.params = with_frames_of(self.extrinsics, params)
             n, self.has_odometry_on_tf = self.params.node, bool(self._odometry().path)
+        is_on_tf = self.has_odometry_on_tf
         self.has_odometry_on_tf &= n.use_odom and n.odom_source != 'topic'
         without = ('imu', 'odom') if self.has_odometry_on_tf else ('imu',)
         self.topics = choose_topics(bag.topics, n, without)
         self.more_scans = [self._scans(t) for t in topics_of(n, 'scan')[1:]]
+        self._lidars = self._frames_of_scans()
+        if is_on_tf and self.unplaced():  # else all of /tf has been read
+            self._read_tf(None)
 
     def __iter__(self) -> Iterator[tuple[int, str, Any]]:
         stream_of = {topic: stream for stream, topic in self.topics.items()}
@@ -72,7 +77,21 @@ class BagInputs:
         if self.has_odometry_on_tf:
             other = f'; compared with {out["odom"]}' if 'odom' in out else ''
             out['odom'] = f'{self.tf}, {n.odom_frame} to {n.base_frame}{other}'
+        if unplaced := self.unplaced():
+            why = f'no transform from {n.base_frame} to {", ".join(map(repr, unplaced))}'
+            out['scan'] += f'; {why}: laser_pose is used: {list(n.laser_pose)}'
         return out
+
+    def unplaced(self) -> list[str]:
+        """Frames of scans of which no transform says where they sit on the robot."""
+        base, tree = decode.frame(self.params.node.base_frame), self.extrinsics
+        return [f for f in self._lidars if f != base and tree.up(base, f) is None]
+
+    def _frames_of_scans(self) -> list[str]:
+        """The frame of the first scan of each topic."""
+        scans = (self.topics.get('scan'), *self.more_scans)
+        firsts = (message for topic in scans for message in self._all(topic, 1))
+        return sorted({decode.frame(message.header.frame_id) for message in firsts})
 
     def _transforms(self, name: str) -> str:
         """The topic of transforms of that name, or the only one in a namespace; '' if none."""

@@ -21,7 +21,7 @@ from rlml_slam.maps.survey import Survey
 from rlml_slam.params import EkfParameters, Parameters, changed
 from rlml_slam.recordings.bag_inputs import BagInputs
 from rlml_slam.recordings.estimate_bag import EstimateBag
-from rlml_slam.recordings.products import collect, fates, survey_figures
+from rlml_slam.recordings.products import collect, fates, refused, survey_figures
 from rlml_slam.ros.bags.bag import BagReader, BagWriter
 from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.slam.offline.slam import Slam
@@ -105,7 +105,8 @@ def replay(
             recording.finish(slam, run_errors(result))
     result.wall_s, result.origin = wall, origin
     ended = f'{problem}; the results hold what came before' if problem else ''
-    result.problem = '; '.join(filter(None, (ended, result.problem)))
+    missing = refused(slam.synchronizer.inputs)
+    result.problem = '; '.join(filter(None, (ended, result.problem, missing)))
     return result
 
 

@@ -15,9 +15,14 @@ from rlml_slam.errors import MapError
 from rlml_slam.evaluation.run_record import FrameLog, Run, Truth
 from rlml_slam.evaluation.survey_residuals import compare
 from rlml_slam.ros.sensor_input import counted_as
+from rlml_slam.sensing.synchronization.input_counts import InputCounts
+from rlml_slam.sensing.synchronization.synchronizer import MEASURED
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.closures.closure_table import closure_table
 from rlml_slam.slam.offline.slam import Slam
+
+MANY = 0.4  # of a stream: with a clock of its own, one of two lidars has about half of the scans
+OF_USED = ('no_returns', 'robot_parts', 'waited_out')  # counted among the used ones as well
 
 
 def survey_figures(back_end: BackEnd) -> dict[str, Any]:
@@ -81,6 +86,23 @@ def fates(
         fate['invalid'] += unread[stream]
         out[stream] = fate
     return out
+
+
+def refused(inputs: InputCounts) -> str:
+    """How many scans or reflectors were late or ahead of all others, '' unless they are many.
+
+    Of odometry and the IMU there is more than enough where a recording is merely out of order.
+    """
+    out = []
+    for stream in MEASURED:
+        fate = inputs.counts.get(stream, Counter())
+        wrong, every = fate['late'] + fate['future'], sum(fate.values())
+        every -= sum(fate[what] for what in OF_USED)
+        if wrong > MANY * every:
+            what = 'scans' if stream == 'scan' else 'messages with reflectors'
+            first = inputs.first_errors[stream]
+            out.append(f'{wrong} of {every} {what} were not used; the first: {first}')
+    return '; '.join(out)
 
 
 def sources(topics: Mapping[str, str], more_scans: Iterable[str] = ()) -> dict[str, str]:

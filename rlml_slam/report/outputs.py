@@ -16,7 +16,7 @@ from rlml_slam.evaluation.metrics import RunErrors, metrics, run_errors
 from rlml_slam.evaluation.run_folder import HEALTH, health_table
 from rlml_slam.evaluation.run_record import Run
 from rlml_slam.maps import map_container, reflector_file
-from rlml_slam.maps.atomic_file import write_atomically
+from rlml_slam.maps.atomic_file import set_aside, write_atomically
 from rlml_slam.maps.nav2_map import save
 from rlml_slam.maps.occupancy import UNKNOWN, OccupancyGrid
 from rlml_slam.planning.audit.sightings import save as save_sightings
@@ -25,15 +25,25 @@ from rlml_slam.slam.landmarks.reflector_states import state_table
 SIGHTINGS = 'sightings.rlml'
 
 
-def write_outputs(run: Run, folder: str | Path, report: bool = True) -> dict[str, Any]:
+def write_outputs(
+    run: Run, folder: str | Path, report: bool = True, known: Path | None = None
+) -> dict[str, Any]:
     """Write all results of a run into a folder; the figures of metrics.json.
 
     trajectory.tum, front_end.tum, health.csv, map.rlml, map.pgm, map.yaml, reflectors.csv,
     reflector_states.csv, sightings.rlml and closures.csv depend on the data alone: two replays
-    give the same bytes. Without ``report`` there is no report.html. Raises MapError if the
-    folder cannot be written.
+    give the same bytes. Without ``report`` there is no report.html. What this run does not write
+    is of an earlier one, and set aside as ``.previous``, but for ``known``, the map that the run
+    localized in. Raises MapError if the folder cannot be written.
     """
     folder = make_folder(folder)
+    is_written = {
+        'map.rlml': run.stored is not None, SIGHTINGS: len(run.frames.sightings) > 0,
+        'closures.csv': bool(run.closure_table), 'report.html': report,
+        'reflector_states.csv': bool(run.reflector_states),
+    }  # fmt: skip
+    others = [folder / name for name, is_new in is_written.items() if not is_new]
+    set_aside(*(p for p in others if known is None or p.resolve() != known.resolve()))
     write_tum(folder / 'trajectory.tum', run.trajectory)
     write_tum(folder / 'front_end.tum', run.frames.trajectory())
     write_atomically(folder / HEALTH, health_table(run.frames).encode())
@@ -77,7 +87,9 @@ def write_report(
     # Bokeh takes a second to import, which other commands need not wait for
     from rlml_slam.report.report import report_html
 
-    write_atomically(folder / 'report.html', report_html(run, figures, errors).encode())
+    write_atomically(
+        folder / 'report.html', report_html(run, figures, errors).encode('utf-8', 'replace')
+    )
 
 
 def unknown_grid(trajectory: Trajectory) -> OccupancyGrid:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from rlml_slam.maps import survey_writer
-from rlml_slam.maps.atomic_file import write_atomically
+from rlml_slam.maps.atomic_file import set_aside, write_atomically
 from rlml_slam.maps.occupancy import UNKNOWN, OccupancyGrid
 from rlml_slam.maps.survey import Survey
 from rlml_slam.planning import site_file
@@ -63,6 +63,7 @@ def write_plan(
     """
     folder, found = make_folder(folder), figures(plan)
     added = 0
+    set_aside(*(folder / f'layout.{kind}' for kind in ('csv', 'imk', 'dxf')))
     if suggestion is not None:
         r, added = plan.site.reflectors, len(suggestion.mounts)
         found['suggested'] = _suggested(suggestion, r.ids[len(r) - added :].tolist())

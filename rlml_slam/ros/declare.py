@@ -8,6 +8,7 @@ may be set while the node runs, all others while it is unconfigured; the answer 
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import math
 import sys
@@ -35,6 +36,7 @@ from rlml_slam.params import (
 )
 
 Check = Callable[[Any], object]
+SHORT = 1_000_000  # [ns] shortest period of a timer
 
 
 def declare(
@@ -92,21 +94,26 @@ def _change(
             if d is None:
                 continue  # rclpy's own
             group = getattr(parameters, d.group)
-            before.append((group, d.field, getattr(group, d.field)))
+            before.append((group, d, getattr(group, d.field)))
             group.change(d.field, p.value, is_running)
+        for p in given:  # some act on it: only once all are known to be right
             checks.get(p.name, lambda _: None)(p.value)
     except RlmlError as e:
-        for group, field, value in before:
-            object.__setattr__(group, field, value)
+        for group, d, value in before:
+            object.__setattr__(group, d.field, value)
+            with contextlib.suppress(RlmlError):
+                checks.get(d.name, lambda _: None)(value)
         return SetParametersResult(successful=False, reason=str(e))
-    for group, field, value in before:
-        node.get_logger().info(f'{field}: {value} is now {getattr(group, field)}')
+    for group, d, value in before:
+        node.get_logger().info(f'{d.field}: {value} is now {getattr(group, d.field)}')
     return SetParametersResult(successful=True)
 
 
 def pace(timer: Any) -> Check:
     """What gives a timer another period [s]."""
-    return lambda seconds: setattr(timer, 'timer_period_ns', int((seconds or 0.1) * 1e9))
+    return lambda seconds: setattr(
+        timer, 'timer_period_ns', max(int(1e9 * (seconds or 0.1)), SHORT)
+    )
 
 
 def _ros_value(value: Any) -> Any:

@@ -88,10 +88,14 @@ class HealthPublisher:
         silence = ('no new scan or reflectors',) if self._is_silent else ()
         return with_problems(with_problems(self._frame.health, silence), self._found)
 
-    def _publish_health(self) -> None:
+    def end(self) -> None:
+        """Say that the node is inactive from now on."""
+        self._publish_health(with_problems(self.health(), ('the node is not active',)))
+
+    def _publish_health(self, health: Health | None = None) -> None:
         stamp = {'stamp': f'{self.newest // 10**9}.{self.newest % 10**9:09d}'}
         self._health.publish(
-            encode.diagnostic_status(make_rclpy, self._name, self.health(), stamp)
+            encode.diagnostic_status(make_rclpy, self._name, health or self.health(), stamp)
         )
 
     def _inputs(self) -> dict[str, object]:

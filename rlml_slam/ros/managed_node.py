@@ -101,6 +101,8 @@ class ManagedNode(LifecycleNode):
 
     def on_deactivate(self, state: Any) -> Any:
         """Take and publish nothing."""
+        if hasattr(self, 'health'):
+            self.health.end()  # it is latched: who comes later would hear that all is well
         self._halt()
         out = self._attempt(self.rest)
         return super().on_deactivate(state) if out == TransitionCallbackReturn.SUCCESS else out
@@ -164,7 +166,8 @@ class ManagedNode(LifecycleNode):
         return {kind: set(getattr(self, kind)) for kind in KINDS}
 
     def _made(self, kind: str) -> list[Any]:
-        return [e for e in getattr(self, kind) if e not in self._own[kind]]
+        clock = self._time_source._clock_sub  # made when use_sim_time is set, and the node's own
+        return [e for e in getattr(self, kind) if e not in self._own[kind] and e is not clock]
 
     def _answer(self, change: Any) -> Any:
         """The service of transitions; one that the present state does not have is refused."""

@@ -71,12 +71,12 @@ class MapPublisher:
         self.stamp = 0
         self.undrawn = ''
         self._warned = False
-        self._next = 0
         self._rested = 0.0
 
     def is_due(self, stamp: int) -> bool:
         """Whether the interval has passed, and the pause that the last map's cost asks for."""
-        return stamp >= self._next and time.monotonic() >= self._rested
+        due = self.stamp + int(self._p.map_update_interval * 1e9) if self.stamp else 0
+        return stamp >= due and time.monotonic() >= self._rested
 
     def grid(self, source: Mapped) -> OccupancyGrid | None:
         """The system's grid; None, with one warning, where it is too large to be drawn."""
@@ -107,7 +107,7 @@ class MapPublisher:
             if graph is not None:
                 self._send('graph', graph_markers(make, stamp, frame, graph))
         give_back()
-        self.stamp, self._next = stamp, stamp + int(self._p.map_update_interval * 1e9)
+        self.stamp = stamp
         now = time.monotonic()
         self._rested = now + (now - began) * (1.0 / MAX_SHARE - 1.0)
 

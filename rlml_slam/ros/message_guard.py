@@ -106,7 +106,10 @@ class Listener:
         self._guard = guard_of(node)
         self._kind, self._topic, self._use, self._largest = kind, topic, use, largest
         self._depth = qos.depth
-        self._tap: Callable[[str, Any, bytes], None] | None = getattr(node, 'tap', None)
+        is_sensor = not topic.startswith('rlml/')  # which is what the ends say to each other
+        self._tap: Callable[[str, Any, bytes], None] | None = (
+            getattr(node, 'tap', None) if is_sensor else None
+        )
         self._subscription = node.create_subscription(
             kind, topic, self.receive, qos, raw=True, **options
         )

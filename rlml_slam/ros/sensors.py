@@ -46,6 +46,7 @@ MOTION = QoSProfile(depth=MOTION_DEPTH, reliability=ReliabilityPolicy.BEST_EFFOR
 LONG_AGO = -(1 << 62)  # [ns]: a transform that was waited for
 PATIENCE = 5.0  # [s] of the wall clock, after which missing inputs are named in the log
 SILENCE = 1.0  # [s] of the wall clock without any message, after which nothing more is waited for
+POINT = 64  # bytes of a point in the cloud of a device
 MAX_SENSORS = 100  # whose frames are remembered
 REFUSED = ('',)  # in the place of what a message would have given
 # the back end says with it that it runs, so that a front end notices where it does not
@@ -268,8 +269,7 @@ class Sensors:
             if len(seen) >= self._topics[stream] or self._may_come(sensor, _stamp(msg)):
                 self._count_invalid(stream, f'{stream}: {why}')
                 return
-            place = list(self._p.node.laser_pose)
-            self._logger.warning(f'{why}: laser_pose is used, which is {place}')
+            self._logger.warning(f'{why}: laser_pose is used: {list(self._p.node.laser_pose)}')
         if len(seen) < MAX_SENSORS:
             seen.add(sensor)
         self._use(stream, msg)
@@ -321,7 +321,9 @@ def largest(params: Node, stream: str) -> int:
     """Bytes that a message of a stream may have."""
     has_beams = stream in ('scan', 'reflector_beams')
     most = params.max_beams if has_beams else params.max_reflectors
-    return SMALL + most * (STREAMS[stream][3] if stream in STREAMS else 0)
+    room = most * (STREAMS[stream][3] if stream in STREAMS else 0)
+    # a cloud may be a whole scan, in which a bit says what is a reflector
+    return SMALL + max(room, params.max_beams * POINT if stream == 'reflectors' else 0)
 
 
 def input_figures(synchronizer: Synchronizer) -> dict[str, object]:

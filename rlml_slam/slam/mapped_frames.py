@@ -39,6 +39,7 @@ class MappedFrames:
             frame = replace(frame, observation=replace(frame.observation, motion=motion))
         self._skipped = motion if self.is_paused else STILL
         if self.is_paused:
+            self.jumps |= frame.jumped
             return []
         if self.jumps:
             frame, self.jumps = replace(frame, jumped=True), False

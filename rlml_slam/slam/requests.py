@@ -51,8 +51,12 @@ class Requests:
     def is_superseded(self, record: SessionFrame) -> bool:
         """Whether a frame's session was begun by a request that a newer one replaces."""
         pending = self.pending
-        older = isinstance(pending, StartSession) and record.request < pending.number
-        return older and self.is_own(record)
+        if not isinstance(pending, StartSession) or not self.is_own(record):
+            return False
+        if pending.session not in (ANY, record.session):
+            self.pending = None  # the front end had begun this session before, and ignores it
+            return False
+        return record.request < pending.number
 
     def follow(self, record: SessionFrame) -> StartSession | Relocate | None:
         """Look whether a frame answers the pending request; one to be made again, if it got lost.

@@ -164,7 +164,7 @@ class System:
             return out + self._search_entry(self.entry, record)
         if self.map is None:
             out += self.frames.add(record)
-        if not self.frames.is_paused:
+        if self.map is not None or not self.frames.is_paused:
             out += self._restore(record) + self._recover(record)
         if self._remembers and self._last_pose is None:
             out.append(RememberPose(record.frame))

@@ -269,3 +269,17 @@ def test_health_table_is_read_as_written(tmp_path):
     (tmp_path / 'health.csv').write_text(health_table(frames) + '5.0,WRONG,0,0,0,0,0,\n')
     with pytest.raises(FileFormatError, match=r'health\.csv:62'):
         read_health(tmp_path / 'health.csv')
+
+
+def test_parting_is_in_the_map_of_the_first_run(tmp_path, capsys):
+    t = np.arange(0.0, 40.0, 0.1)
+    here = np.column_stack([0.5 * t, 0.2 * np.sin(t), 0.1 * np.sin(t)])
+    bump = np.column_stack([0.0 * t, 1.5 * np.exp(-(((t - 20.0) / 0.5) ** 2)), 0.0 * t])
+    stamps = np.round(t * 1e9).astype(np.int64) + 10**9
+    write_tum(tmp_path / 'a.tum', Trajectory(stamps, here))
+    there = se2.compose(np.array([100.0, 50.0, np.pi / 2]), here + bump)
+    write_tum(tmp_path / 'b.tum', Trajectory(stamps, there))
+    main(['compare', str(tmp_path / 'a.tum'), str(tmp_path / 'b.tum'), '--json'])
+    last = json.loads(capsys.readouterr().out)['parting'][-1]
+    assert abs(last['x_m'] - 10.0) < 1.0
+    assert abs(last['y_m']) < 2.0

@@ -87,6 +87,24 @@ def test_a_bag_without_reflectors_gets_no_proposal(scans, tmp_path, capsys):
     assert 'proposed' not in figures
 
 
+def test_scans_of_no_geometry_are_left_out(scans, tmp_path, capsys):
+    odd = [replace(s, angle_increment=0.0) for s in scans[:2]]
+    assert examined(capsys, write(tmp_path / 'bag', [*odd, *scans[2:]]))['scans'] == 28
+    assert main(['doctor', write(tmp_path / 'none', odd)]) == 1
+    said = capsys.readouterr().err
+    assert 'no scan that can be used: its angles, times or ranges are not valid' in said
+
+
+def test_beams_without_a_number_for_intensity_are_left_out(scans, tmp_path, capsys):
+    holes = [replace(s, intensities=s.intensities.copy()) for s in scans[:10]]
+    for scan in holes:
+        scan.intensities[::7] = np.nan
+    assert main(['doctor', write(tmp_path / 'bag', holes), '--json']) == 0
+    text = capsys.readouterr().out
+    assert 'NaN' not in text
+    assert json.loads(text)['intensity_max'] > 0.0
+
+
 def test_a_bag_without_scans_is_one_line(tmp_path, capsys):
     with BagWriter(tmp_path / 'bag') as bag:
         bag.add_topic('/odom', 'nav_msgs/msg/Odometry')

@@ -40,6 +40,26 @@ def test_help_imports_no_command():
         assert name in done.stdout
 
 
+@pytest.mark.parametrize(
+    ('words', 'what'),
+    [
+        (['evaluate', 'ate', 'a', 'b', '--max-gap', 'nan'], 'nan is not between 0 and inf'),
+        (
+            ['convert', 'carmen', 'a', 'b', '--field-of-view', '-10'],
+            '-10 is not between 1 and 360',
+        ),
+        (['check', '--seconds', '-1'], '-1 is not between 0.1 and 100000'),
+        (['plan', 'room', '--out', 'p', '--clearance', '-1'], '-1 is not between 0 and 100'),
+        (['map', 'merge', 'a', 'b', '--out', 'c', '--jobs', '-3'], 'invalid choice: -3'),
+    ],
+)
+def test_number_out_of_bounds_is_named(words, what, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert what in capsys.readouterr().err
+
+
 def test_numbers_say_their_default(capsys):
     with pytest.raises(SystemExit):
         main(['check', '--help'])

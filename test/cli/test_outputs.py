@@ -100,6 +100,20 @@ def test_run_without_scans_truth_and_timing_has_a_report(tmp_path):
     assert 'damaged after 3 messages' in (tmp_path / 'report.html').read_text()
 
 
+def test_files_of_an_earlier_run_are_set_aside(tmp_path):
+    others = ('map.rlml', 'closures.csv', 'report.html')
+    for name in others:
+        (tmp_path / name).write_text('of another run')
+    run = made_run()
+    run.stored, run.closure_table = None, ''
+    write_outputs(run, tmp_path, report=False, known=tmp_path / 'map.rlml')
+    assert (tmp_path / 'map.rlml').exists()  # the run localized in it
+    write_outputs(run, tmp_path, report=False)
+    for name in others:
+        assert not (tmp_path / name).exists()
+        assert (tmp_path / f'{name}.previous').read_text() == 'of another run'
+
+
 def test_folder_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / 'file').write_text('')
     with pytest.raises(MapError, match='file: cannot be made'):

@@ -17,10 +17,11 @@ from rlml_slam.datasets.tum import Trajectory, read_tum, write_tum
 from rlml_slam.maps import occupancy
 from rlml_slam.params import Parameters
 from rlml_slam.recordings.bag_replay import replay
-from rlml_slam.recordings.products import fates, sources
+from rlml_slam.recordings.products import fates, refused, sources
 from rlml_slam.ros.bags.bag import BagWriter
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_bag
+from rlml_slam.sensing.synchronization.input_counts import InputCounts
 from rlml_slam.types import Detections, Scan
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
@@ -116,6 +117,52 @@ def test_summary_says_which_topic_was_taken(tmp_path, capsys):
     (row,) = re.findall(r'input scan +(.*)', capsys.readouterr().out)
     # not the one that was asked for, but the only scans there are
     assert row.endswith('used (/scan)')
+
+
+def test_summary_says_that_no_transform_has_the_place_of_the_laser(tmp_path, capsys):
+    write_scans(tmp_path / 'bag', [k * SECOND // 10 for k in range(10, 20)])
+    arguments = ['replay', str(tmp_path / 'bag'), '--out', str(tmp_path / 'out'), '--no-report']
+    assert main(arguments) == 0
+    note = "no transform from base_link to 'laser': laser_pose is used: [0.0, 0.0, 0.0]"
+    (row,) = re.findall(r'input scan +(.*)', capsys.readouterr().out)
+    assert row == f'10 used (/scan; {note})'
+    f = json.loads((tmp_path / 'out' / 'metrics.json').read_text())
+    assert (f['topics']['scan'], f['problem']) == (f'/scan; {note}', '')
+
+
+@pytest.mark.parametrize(
+    ('ahead', 'why'), [(3600, 'ahead of all other stamps'), (-3600, 'is late by')]
+)
+def test_scans_of_another_clock_are_a_problem(ahead, why, tmp_path, capsys):
+    with BagWriter(tmp_path / 'bag') as bag:
+        for k in range(7200 * 40, 7200 * 40 + 800):
+            t, frames = k * SECOND // 40, ('odom', 'base_link')
+            pose = np.array([1e-3 * k, 0.0, 0.0])
+            bag.write('/odom', encode.odometry(make_bag, t, frames, pose, np.eye(3)), t)
+            if k % 4 == 1:
+                bag.write('/scan', encode.laser_scan(make_bag, made_scan(t + ahead * SECOND)), t)
+    arguments = ['replay', str(tmp_path / 'bag'), '--out', str(tmp_path / 'out'), '--no-report']
+    assert main(arguments) == 1
+    said = re.search(
+        r'(\d+) of (\d+) scans were not used; the first: (.*)', capsys.readouterr().err
+    )
+    assert said is not None
+    assert int(said[1]) > 0.7 * int(said[2])
+    assert why in said[3]
+
+
+def test_only_a_large_share_of_late_scans_is_a_problem():
+    inputs = InputCounts()
+    for k in range(100):
+        inputs.count('scan', 'used')
+        inputs.count('scan', 'waited_out')
+        inputs.count('odom', 'late', 'odom is late')
+        if k % 2:
+            inputs.count('scan', 'late', f'scan {k} is late')
+    assert refused(inputs) == ''
+    for _ in range(50):
+        inputs.count('scan', 'future', 'scan is ahead')
+    assert refused(inputs) == '100 of 200 scans were not used; the first: scan 1 is late'
 
 
 def test_both_topics_of_reflectors_are_told():

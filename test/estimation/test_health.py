@@ -416,3 +416,28 @@ def test_map_that_grows_to_and_fro_is_no_reason_to_be_lost():
     sigmas = np.concatenate([begin, out, out[::-1], out, out[::-1], 1.2 * out])
     seen = levels([(float(s), True, True) for s in sigmas])
     assert Level.LOST not in seen
+
+
+@pytest.mark.parametrize('between', [0, 1])
+def test_frames_without_a_scan_hide_no_scan_that_fits_nowhere(between):
+    """Detections with stamps of their own, or a second lidar that sees nothing."""
+    monitor, out = HealthMonitor(HealthLimits()), []
+    for k in range(30):
+        scan = ScanEvidence(has_scan=True, used=k < 5, misfit=k >= 5, score=0.6 if k < 5 else 0.1)
+        for has_scan in (True, *[False] * between):
+            own = scan if has_scan else ScanEvidence()
+            step = HealthInputs(own, True, None, 0, 1e-4 * np.eye(3))
+            stamp = FIRST + k * STEP + (not has_scan) * STEP // 2
+            out.append(monitor.evaluate(stamp, step).level)
+    assert Level.LOST in out
+    assert Level.LOST not in out[: 10 * (1 + between)]
+
+
+def test_scans_that_ended_are_no_misfit():
+    monitor = HealthMonitor(HealthLimits())
+    for k in range(60):
+        scan = ScanEvidence(has_scan=k < 5, used=k < 5, score=0.6)
+        level = monitor.evaluate(
+            FIRST + k * STEP, HealthInputs(scan, True, 3, 3, 1e-4 * np.eye(3))
+        )
+        assert level.level is Level.OK

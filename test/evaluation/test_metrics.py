@@ -73,6 +73,14 @@ def test_truth_of_another_time_is_none():
     assert 'ate_rmse_m' not in metrics(run)
 
 
+def test_truth_that_is_too_sparse_for_any_scan_is_none():
+    run = made_run()
+    path = run.truth.trajectory
+    stamps = path.stamps[[0, -1]] + 1
+    run.truth = type(run.truth)(Trajectory(stamps, path.poses[[0, -1]]), True)
+    assert 'ate_rmse_m' not in metrics(run)
+
+
 def test_nees_of_consistent_errors_is_three():
     rng = np.random.default_rng(5)
     truth = circle(4000)

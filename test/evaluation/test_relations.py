@@ -56,7 +56,7 @@ def test_summary_by_hand():
     )
     s = relation_errors(t, both).summary()
     assert s['relations'] == 2
-    assert s['unmatched'] == 0
+    assert s['relations_unmatched'] == 0
     assert_allclose([s['trans_mean_m'], s['trans_std_m'], s['trans_max_m']], [0.25, 0.25, 0.5])
     assert_allclose([s['trans_squared_mean_m2'], s['trans_squared_std_m2']], [0.125, 0.125])
     half = np.degrees(0.1)

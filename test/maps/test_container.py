@@ -109,6 +109,26 @@ def test_damage_anywhere_is_refused_and_the_map_before_named(tmp_path, seed):
     same(map_container.read(f'{path}.previous'), OLD)
 
 
+@pytest.mark.parametrize('is_full', [False, True])
+def test_map_before_stays_where_files_have_one_name(is_full, tmp_path, monkeypatch):
+    def none(*_):
+        raise PermissionError(1, 'Operation not permitted')
+
+    path = map_container.write(tmp_path / 'a.rlml', OLD)
+    monkeypatch.setattr('os.link', none)
+    if is_full:
+        monkeypatch.setattr('shutil.copy2', none)
+        with pytest.raises(MapError, match='Operation not permitted'):
+            map_container.write(path, NEW)
+        same(map_container.read(path), OLD)
+        assert [*tmp_path.iterdir()] == [path]
+        return
+    map_container.write(path, NEW)
+    same(map_container.read(path), NEW)
+    same(map_container.read(f'{path}.previous'), OLD)
+    assert len([*tmp_path.iterdir()]) == 2
+
+
 def test_every_bit_of_the_header_counts(tmp_path):
     path = map_container.write(tmp_path / 'a.rlml', NEW)
     good = path.read_bytes()

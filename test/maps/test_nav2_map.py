@@ -122,6 +122,16 @@ def test_saved_map_is_nav2s_and_comes_back(tmp_path):
     np.testing.assert_array_equal(back.cells, expected[::-1])
 
 
+@pytest.mark.parametrize(
+    'name', ['hall #2', 'plant: north', '[a]', '- x', '@x', "'q", 'a"b\\', 'a\nb', '*x', 'Hälle']
+)
+def test_map_of_any_name_comes_back(name, tmp_path):
+    grid = OccupancyGrid(0.1, (0.0, 0.0), np.zeros((2, 3), dtype=np.int8))
+    pgm, meta = save(grid, tmp_path / name)
+    assert describe(meta).image == pgm
+    np.testing.assert_array_equal(load(meta).cells, grid.cells)
+
+
 def test_first_row_of_the_image_is_the_top_of_the_map(tmp_path):
     cells = np.array([[0, 0, 0], [0, 0, 100]], dtype=np.int8)
     pgm, _ = save(OccupancyGrid(0.1, (0.0, 0.0), cells), tmp_path / 'm')

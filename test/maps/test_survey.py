@@ -55,6 +55,10 @@ def test_reflectors_of_a_map_are_a_survey(tmp_path):
         ('7,1.5,-2.25\n9,10,4\n', [7, 9]),
         ('P7\t1.5\t-2.25\nP9\t10\t4\n', [-1, -1]),
         ('1.5,-2.25,0.5\n10,4,0.5\n', [-1, -1]),
+        ('"id, number";x;y\n7;1.5;-2.25\n9;10;4\n', [-1, -1]),
+        ('id,x,y,note\n7,1.5,-2.25,"gate, left"\n9,10,4,,\n', [7, 9]),
+        ('id\tx\ty\n\t1.5\t-2.25\n9\t10\t4\n', [-1, 9]),
+        ('\ufeff# of today\nid,x,y\n7,"1.5","-2.25"\n9,10,4\n', [7, 9]),
     ],
 )
 def test_surveys_with_usual_columns_are_read(tmp_path, text, ids):
@@ -79,12 +83,22 @@ def test_id_and_diameter_may_be_missing(tmp_path):
         ('a.csv', 'x,y\n1,far\n', 'line 2: could not convert'),
         ('a.csv', 'x,y\n', 'no reflector'),
         ('a.csv', 'id,x,y\n3,1,2\n3,4,5\n', 'two reflectors'),
+        ('a.csv', 'id,x,y\n1,"10,5","20,5"\n', 'line 2: 10,5: write 1.5, or'),
+        ('a.csv', 'id,x,y\n1,10,5,20,5\n', 'line 2: 5 values, 3 expected'),
+        ('a.csv', '1,10,5\n2,11,5,20,5\n', 'line 2: 5 values, 3 expected'),
+        ('a.csv', 'x,y,n\n1.5,2.5,1\n', 'more than one column of y; the header has x, y, n'),
+        ('a.csv', 'n,x,y\n1,1.5,2.5\n', 'more than one column of y'),
+        ('a.csv', 'id,number,x,y\n1,2,3,4\n', 'more than one column of id'),
+        *(('a.csv', f'x,y,diameter\n1,2,{d}\n', 'line 2: a diameter of .* m is not in')
+          for d in ('80', '-0.08', '0', 'inf')),
+        ('a.imk', '7 1500 -2250 1 1 80000\n', 'line 1: a diameter of 80 m'),
+        ('a.csv', 'x,y\n' + '1' * 200_000, 'field larger than'),
         ('a.json', '[3]', 'entry 1: not an object'),
         ('a.json', '[{', 'Expecting'),
         ('a.imk', '7 1500 -2250\n', 'line 1: 3 fields'),
         ('a.txt', '', 'one of .csv, .json, .imk'),
     ],
-)
+)  # fmt: skip
 def test_what_is_wrong_is_said(tmp_path, name, text, why):
     path = tmp_path / name
     path.write_text(text)

@@ -23,6 +23,7 @@ from rlml_slam.maps import reflector_file
 from rlml_slam.nodes.back_end import BackEndNode
 from rlml_slam.nodes.front_end import FrontEndNode
 from rlml_slam.params import Parameters
+from rlml_slam.ros.back_end import searcher
 from rlml_slam.ros.codecs import decode, encode
 from rlml_slam.ros.codecs.message_types import make_rclpy as make
 from rlml_slam.ros.codecs.message_types import rclpy_class
@@ -349,6 +350,32 @@ def test_search_without_an_answer_is_logged_whether_it_finds_or_not(live, monkey
         return [m.msg[-11:].strip() for m in live.heard['/rosout'] if 'reinitialize' in m.msg]
 
     live.spin_until(lambda: len(said()) == 3, what='not all answers are in the log')
+
+
+def test_search_that_fails_is_answered_and_holds_up_no_service(live, monkeypatch):
+    def fail(*_):
+        raise np.linalg.LinAlgError('singular')
+
+    monkeypatch.setattr(searcher, 'locate', fail)
+    back = live.start(BackEndNode)
+    lost = live.call(Trigger, 'back_end/relocalize', Trigger.Request())
+    assert not lost.success
+    assert 'the search failed: singular' in lost.message
+    assert back.message_guard.unexpected.total() == 1
+    saved = live.call(Trigger, 'back_end/save_map', Trigger.Request())
+    assert saved.message == 'there is no map yet'
+
+
+def test_search_that_takes_its_time_holds_up_no_other_service(live):
+    back = live.start(BackEndNode)
+    back.mapper.searcher.delay = 600.0
+    client = live.ear.create_client(Trigger, 'back_end/relocalize')
+    live.spin_until(client.service_is_ready)
+    lost = client.call_async(Trigger.Request())
+    live.spin_until(lambda: back.mapper.answers)
+    saved = live.call(Trigger, 'back_end/save_map', Trigger.Request())
+    assert saved.message == 'there is no map yet'
+    assert not lost.done()
 
 
 def test_map_in_the_making_does_not_jump(live):

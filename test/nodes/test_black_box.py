@@ -13,6 +13,7 @@ import time
 import numpy as np
 import pytest
 from live import ROOT, room
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 from std_srvs.srv import Trigger
@@ -60,15 +61,14 @@ def test_degraded_for_long_and_jumps_are_incidents():
     assert reasons([frame(), bad, frame(jumped=True)]) == ['', '', 'jump']
 
 
-def publish(live, node, seconds):
+def publish(live, node, seconds, namespace=''):
     """The sensors of the room over DDS."""
     publishers = {}
     for stream, msg in room(seconds=seconds):
         if stream not in publishers:
-            publishers[stream] = live.ear.create_publisher(
-                type(msg), stream, QoSProfile(depth=100)
-            )
-            live.spin_until(lambda s=stream: live.ear.count_subscribers(s) == 1)
+            topic = stream if stream.startswith('/') else f'{namespace}/{stream}'
+            publishers[stream] = live.ear.create_publisher(type(msg), topic, QoSProfile(depth=100))
+            live.spin_until(lambda t=topic: live.ear.count_subscribers(t) == 1)
         publishers[stream].publish(msg)
         live.executor.spin_once(timeout_sec=0.0)
     live.spin_until(lambda: node.last is not None)
@@ -103,6 +103,32 @@ def test_incident_on_request_holds_inputs_and_outputs_and_can_be_replayed(live, 
         assert counts[f'/{stream}'] == sent.count(stream)
     assert counts['/pose'] == counts['/front_end/health'] > 10
     assert main(['replay', str(path), '--out', str(tmp_path / 'out'), '--no-report']) == 0
+
+
+def test_robot_whose_namespace_is_that_of_the_talk_between_the_ends_is_recorded(live):
+    node = live.add(FrontEndNode(context=live.context, namespace='rlml'))
+    node.sensors.stop_waiting()
+    publish(live, node, 1.0, '/rlml')
+    kept = {r.topic for r in node.black_box._received}
+    assert kept == {'/rlml/scan', '/rlml/odom', '/rlml/imu', '/rlml/reflectors'}
+
+
+def test_request_that_writes_nothing_is_refused_with_the_reason(live, node, tmp_path):
+    def refusal():
+        answer = live.call(Trigger, 'front_end/save_incident', Trigger.Request())
+        assert not answer.success
+        return answer.message
+
+    node.trigger_deactivate()
+    assert refusal() == 'nothing is written: the node is not active'
+    node.trigger_cleanup()
+    node.set_parameters([Parameter('incident.record', value=False)])
+    node.trigger_configure()
+    node.trigger_activate()
+    assert refusal() == 'nothing is written: incident.record is false'
+    node.trigger_deactivate()
+    node.trigger_cleanup()
+    assert incidents(tmp_path) == []
 
 
 def test_lost_writes_one_file_within_the_period(live, node, tmp_path):

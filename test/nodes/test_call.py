@@ -102,6 +102,28 @@ def test_pose_is_given_to_the_front_end(live, command, monkeypatch):
     np.testing.assert_allclose(cov, call.RVIZ)
 
 
+@pytest.mark.parametrize(
+    ('words', 'what'),
+    [
+        (['call', 'reset', '--node', 'a b'], 'a b'),
+        (['check', '--seconds', '0.5', '--namespace', 'a b'], 'a b'),
+        (['closures', '--node', 'a-b'], 'a-b'),
+    ],
+)
+def test_name_that_ros_does_not_allow_is_one_line(words, what, monkeypatch, capsys):
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(DOMAIN))
+    assert main(words) == 1
+    said = capsys.readouterr().err
+    assert what in said
+    assert said.count('\n') == 1
+
+
+def test_domain_that_is_none_is_named(monkeypatch, capsys):
+    monkeypatch.setenv('ROS_DOMAIN_ID', 'abc')
+    assert main(['call', 'reset']) == 1
+    assert "ROS_DOMAIN_ID = 'abc'" in capsys.readouterr().err
+
+
 def test_pose_for_nobody_is_refused(live, command, monkeypatch):
     monkeypatch.setattr(call, 'PATIENCE', 0.5)
     code, out, err = command('initialpose', '0,0,0')

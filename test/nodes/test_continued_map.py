@@ -4,20 +4,23 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 
 import numpy as np
 import pytest
 from made_worlds import ROOM, drive, errors, messages, observations
-from test_mapper import Ear, searched
+from test_mapper import Ear, journals, killed, searched
 
 from rlml_slam.errors import FileFormatError, MapError
 from rlml_slam.maps import reflector_file
 from rlml_slam.params import Parameters
-from rlml_slam.ros.back_end.map_folder import MapFolder
+from rlml_slam.ros.back_end.map_folder import AUTOSAVE, LOST, LOST_AGE, MapFolder
 from rlml_slam.ros.back_end.mapper import Mapper
 from rlml_slam.ros.back_end.user_requests import UserRequests
 from rlml_slam.ros.codecs.correction_message import read_correction
 from rlml_slam.ros.codecs.request_message import read_request
+from rlml_slam.slam.back_end.back_end import BackEnd
+from rlml_slam.slam.closures.loop_closure import State
 from rlml_slam.slam.conversation import RESTARTED
 from rlml_slam.slam.front_end_session import FrontEndSession
 from rlml_slam.slam.offline.slam import Slam
@@ -208,3 +211,99 @@ def test_folder_prefers_the_whole_map_unless_told(folder, mapped):
     maps = MapFolder(str(folder))
     assert len(maps.load('map').reflectors) == len(maps.load('map.rlml').reflectors) == len(found)
     assert len(maps.load('map.csv').reflectors) == 2
+
+
+# --- files of a map that is continued -----------------------------------------------------------
+
+
+def automatic(folder, kind):
+    return sorted(folder.glob(f'map{kind}*.rlml'))
+
+
+def test_autosave_that_is_the_only_map_stays_whatever_its_age(make, folder):
+    """Not where the journal begins, nor at an end without a new keyframe."""
+    only = folder / 'map.autosave-1.rlml'
+    (folder / 'map.rlml').rename(only)
+    old = only.stat().st_mtime - LOST_AGE - 1000.0
+    os.utime(only, (old, old))
+    older = folder / 'map.lost-1.rlml'
+    older.touch()
+    os.utime(older, (old, old))
+    mapper, ear = make(continue_map=True, journal_period=1e-3)
+    mapper.worker.submit(mapper.journal.flush).result()
+    assert len(journals(folder)) == 1
+    assert f'an old map is removed: {older}' in ear.warnings
+    mapper.close()
+    assert [*folder.iterdir()] == [only]
+
+
+@pytest.mark.parametrize(
+    ('begins', 'frames', 'wins'), [(False, 8, False), (True, 1, True), (False, 60, True)]
+)
+def test_few_recovered_keyframes_do_not_displace_a_map(make, mapped, folder, begins, frames, wins):
+    """At this start and at the next. A journal that continues the map has all of it, and wins."""
+    mapper, ear = make(continue_map=begins, journal_period=1e-3)
+    front = Front(mapper, ear)
+    for o in list(observations(ROOM, CURVE, rng=np.random.default_rng(1)))[:frames]:
+        front.process(o)
+    mapper.worker.submit(mapper.journal.flush).result()
+    keys = len(mapper.back_end.keyframes)
+    killed(mapper)
+    for _ in range(2):
+        mapper, ear = make(continue_map=True)
+        assert len(mapper.back_end.keyframes) == (keys if wins else len(mapped.keyframes))
+        mapper.close()
+        (recovered,) = automatic(folder, AUTOSAVE if wins else LOST)
+        assert len(map_file.load(recovered).arrays['pose']) == keys
+    assert journals(folder) == []
+
+
+def test_few_recovered_keyframes_are_better_than_nothing(make, folder):
+    (folder / 'map.rlml').unlink()
+    mapper, ear = make(journal_period=1e-3)
+    front = Front(mapper, ear)
+    for o in list(observations(ROOM, CURVE, rng=np.random.default_rng(1)))[:8]:
+        front.process(o)
+    mapper.worker.submit(mapper.journal.flush).result()
+    keys = len(mapper.back_end.keyframes)
+    killed(mapper)
+    mapper, _ = make(continue_map=True)
+    assert 0 < len(mapper.back_end.keyframes) == keys < 10
+
+
+@pytest.fixture
+def looped(make, folder):
+    """A mapper with a loop closure, all of whose map is in a file; the number of the closure."""
+    mapper, ear = make(journal_period=1e-3)
+    front = Front(mapper, ear)
+    laps = drive((0.6, 0.6, 10.5), (0.6, 0.6, 10.5))
+    for o in observations(ROOM, laps, rng=np.random.default_rng(1)):
+        front.process(o)
+    mapper.worker.submit(lambda: mapper.requests.save('map')).result()
+    return mapper, mapper.back_end.loop_closer.records.accepted()[0].number
+
+
+def state_in(path, number):
+    back_end = BackEnd(PARAMS)
+    map_file.restore(map_file.load(path), back_end)
+    return back_end.loop_closer.records.accepted(number)[0].status.state
+
+
+def test_revocation_after_the_map_was_saved_is_saved_at_the_end(looped, folder):
+    mapper, number = looped
+    mapper.worker.submit(lambda: mapper.requests.revoke(str(number))).result()
+    mapper.close()
+    assert state_in(folder / 'map.rlml', number) is not State.REVOKED
+    (saved,) = automatic(folder, AUTOSAVE)
+    assert state_in(saved, number) is State.REVOKED
+
+
+def test_revocation_survives_a_kill(looped, make, folder):
+    mapper, number = looped
+    mapper.worker.submit(lambda: mapper.requests.revoke(str(number))).result()
+    poses = mapper.back_end.graph.poses.copy()
+    killed(mapper)
+    make(continue_map=True)
+    (saved,) = automatic(folder, AUTOSAVE)
+    assert state_in(saved, number) is State.REVOKED
+    np.testing.assert_array_equal(map_file.load(saved).arrays['pose'], poses)

@@ -9,6 +9,9 @@ from nav_msgs.msg import Odometry
 from visualization_msgs.msg import Marker, MarkerArray
 
 from rlml_slam.nodes.front_end import FrontEndNode
+from rlml_slam.ros.codecs import encode
+from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
+from rlml_slam.ros.codecs.point_cloud import build_cloud
 
 PERIOD = 100_000_000  # [ns]
 PLACES = ((2.0, 1.0), (-1.0, 3.0))
@@ -57,3 +60,21 @@ def test_markers_of_a_nav350_become_detections(live):
     live.spin_until(seen, timeout=60.0, what='no detections')
     np.testing.assert_allclose(node.last.observation.detections.points, PLACES, atol=1e-6)
     assert (node.last.observation.detections.ids == -1).all()
+
+
+def test_full_frame_of_a_picoscan_is_not_too_large(live):
+    """Three echoes of 2760 beams, with all the fields that a user may choose."""
+    node = live.start(FrontEndNode)
+    node.sensors.stop_waiting()
+    floats = ('x', 'y', 'z', 'i', 'range', 'azimuth', 'elevation')
+    bits = ('layer', 'echo', 'reflector')
+    points = np.zeros(3 * 2760, [(f, '<f4') for f in floats] + [(b, 'i1') for b in bits])
+    points['x'], points['y'] = 5.0, np.linspace(-9.0, 9.0, len(points))
+    points['reflector'][::900] = 1
+    kind = rclpy_class('sensor_msgs/msg/PointCloud2')
+    clouds = live.ear.create_publisher(kind, 'reflectors', 50)
+    live.spin_until(clouds.get_subscription_count)
+    clouds.publish(build_cloud(make_rclpy, encode.header(make_rclpy, PERIOD, 'base_link'), points))
+    inputs, guard = node.sensors.synchronizer.inputs, node.message_guard
+    live.spin_until(lambda: guard.refused or 'reflectors' in inputs.totals())
+    assert guard.figures() == {}

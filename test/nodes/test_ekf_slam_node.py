@@ -12,8 +12,9 @@ from std_srvs.srv import Trigger
 
 from rlml_slam.errors import InputError
 from rlml_slam.nodes.ekf_slam import EkfSlamNode
-from rlml_slam.ros.codecs import encode
+from rlml_slam.ros.codecs import decode, encode
 from rlml_slam.ros.codecs.message_types import make_rclpy as make
+from rlml_slam.ros.codecs.message_types import rclpy_class
 from rlml_slam.ros.codecs.reflector_clouds import read_reflector_map
 
 
@@ -44,6 +45,24 @@ def test_every_scan_is_answered_and_the_landmarks_are_published(live, node, tmp_
     services.reset(None, Trigger.Response())
     assert node.estimator.filter.num_landmarks == 0
     assert not services.save_map(None, Trigger.Response()).success
+
+
+def test_robot_without_odometry_is_given_one(live):
+    topic, kind = '/tf', 'tf2_msgs/msg/TFMessage'
+    if rclpy_class(kind) is None:
+        topic, kind = '/ekf_slam/odom_to_base', 'geometry_msgs/msg/TransformStamped'
+    live.listen(topic, kind)
+    node = live.start(EkfSlamNode, use_odom=False, provide_odom_frame=True)
+    node.sensors.stop_waiting()
+    live.spin_until(lambda: node.count_subscribers(topic) == 1)
+    for stream, msg in room(('/scan',), seconds=2.0):
+        node.sensors.add(stream, msg)
+    live.spin_until(
+        lambda: any(
+            (t.parent, t.child) == ('odom', 'base_link')
+            for m in live.heard[topic] for t in decode.transforms(m)
+        )
+    )  # fmt: skip
 
 
 def test_start_pose_of_another_frame_changes_nothing(live, node):

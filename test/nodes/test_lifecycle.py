@@ -6,12 +6,15 @@ from __future__ import annotations
 import gc
 
 import pytest
+from builtin_interfaces.msg import Time
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from live import room
 from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
 
 from rlml_slam.errors import MapError
+from rlml_slam.nodes import front_end
 from rlml_slam.nodes.back_end import BackEndNode
 from rlml_slam.nodes.deformable_slam import DeformableSlamNode
 from rlml_slam.nodes.ekf_slam import EkfSlamNode
@@ -19,6 +22,7 @@ from rlml_slam.nodes.front_end import FrontEndNode
 from rlml_slam.nodes.reflector_detector import ReflectorDetectorNode
 from rlml_slam.nodes.slam import connected
 from rlml_slam.ros.managed_node import KINDS
+from rlml_slam.slam.conversation import LocalizeIn
 from rlml_slam.slam.store import map_file
 
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
@@ -229,6 +233,53 @@ def test_localization_goes_on_after_a_front_end_was_configured_again(live, tmp_p
         assert change(live, front, name)[0]
     front.sensors.stop_waiting()
     live.spin_until(lambda: front.control.session.map is not None)
+
+
+@pytest.mark.parametrize('is_first', [True, False])
+def test_command_that_comes_while_the_front_end_is_configured_is_carried_out(
+    live, monkeypatch, is_first
+):
+    front = live.start(FrontEndNode, autostart=not is_first)
+    command, make = LocalizeIn(7, None), front_end.FramePublisher
+
+    def publisher(*of):
+        front.command(command)
+        return make(*of)
+
+    for name in () if is_first else ('deactivate', 'cleanup'):
+        assert change(live, front, name)[0]
+    monkeypatch.setattr(front_end, 'FramePublisher', publisher)
+    executed = []
+    monkeypatch.setattr(
+        front_end.FrontEndControl, 'execute', lambda control, c: executed.append((control, c))
+    )
+    for name in ('configure', 'activate'):
+        assert change(live, front, name)[0]
+    live.spin_until(lambda: executed)
+    assert executed == [(front.control, command)]
+
+
+def test_command_to_a_front_end_that_is_not_configured_costs_nothing(live):
+    front = live.start(FrontEndNode)
+    for name in ('deactivate', 'cleanup'):
+        assert change(live, front, name)[0]
+    front.command(LocalizeIn(7, None))
+
+
+def test_simulated_time_that_was_chosen_at_run_time_goes_on_after_cleanup(live):
+    node = live.start(BackEndNode)
+    node.set_parameters([Parameter('use_sim_time', value=True)])
+    for name in ('deactivate', 'cleanup', 'configure', 'activate'):
+        assert change(live, node, name)[0]
+    clock = live.ear.create_publisher(Clock, '/clock', 10)
+
+    def is_heard():
+        clock.publish(Clock(clock=Time(sec=200)))
+        return node.get_clock().now().nanoseconds == 200_000_000_000
+
+    live.spin_until(is_heard)
+    for use in (False, True):
+        assert node.set_parameters([Parameter('use_sim_time', value=use)])[0].successful
 
 
 def test_process_waits_for_its_manager_and_ends_cleanly(live, start):

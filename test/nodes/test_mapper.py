@@ -167,6 +167,17 @@ def test_map_to_odom_waits_for_no_job_of_the_worker(mapper):
     busy.set()
 
 
+def test_interval_of_the_map_changes_at_run_time(make, monkeypatch):
+    mapper = make(map_update_interval=600.0)
+    stamp = give(mapper, 0)
+    mapper.worker.submit(mapper.publish_map).result()
+    monkeypatch.setattr(mapper.products, '_rested', 0.0)
+    assert not mapper.products.is_due(stamp + 10 * SECOND)
+    mapper._p.node.change('map_update_interval', 2.0)
+    assert not mapper.products.is_due(stamp + SECOND)
+    assert mapper.products.is_due(stamp + 2 * SECOND)
+
+
 def test_correction_of_one_session_is_not_of_the_next(mapper):
     give(mapper, 0, local=np.array([1.0, 0.0, 0.0]))
     mapper.system.T_map_local = np.array([1.0, 0.0, 0.0])
@@ -304,6 +315,23 @@ def test_map_is_kept_when_the_front_end_begins_anew(make, ear, tmp_path):
     assert len(lost(tmp_path)) == 1
 
 
+def test_keyframes_are_counted_as_they_come(make, ear, tmp_path):
+    """Sparsification removes as many as are added; they are in no file all the same."""
+    mapper = make(map_directory=str(tmp_path))
+    drives(mapper, range(60))
+    mapper.back_end.reflectors = lambda: posts(5)
+    mapper.requests.save('map')
+    keys = len(mapper.back_end.keyframes)
+    drives(mapper, range(60, 120))
+    del mapper.back_end.keyframes[1 : 1 - keys]
+    assert len(mapper.back_end.keyframes) == keys
+    written = []
+    mapper.archive._write = lambda path, *_: written.append(path.name)
+    assert mapper.archive.keep(mapper.back_end, None, 'a test')
+    assert mapper.archive.autosave(mapper.back_end, None)
+    assert [name.split('-')[0] for name in written] == ['map.lost', 'map.autosave']
+
+
 def test_map_that_cannot_be_kept_does_not_stop_the_next_one(make, ear, tmp_path):
     (tmp_path / 'file').touch()
     mapper = make(map_directory=str(tmp_path / 'file'))
@@ -339,7 +367,7 @@ def state_of(mapper, ear, folder):
         id(mapper.back_end), mapper.back_end.graph.poses.tobytes(), mapper.loaded, system.session,
         system.mode, id(system.map), system.entry, system.requests.pending, system.T_map_local
         .tobytes(), dict(system.searches._pending), system.recovery.is_active,
-        {topic: len(sent) for topic, sent in ear.sent.items()}, mapper.archive._written,
+        {topic: len(sent) for topic, sent in ear.sent.items()}, mapper.archive.unsaved,
         {path.name: path.read_bytes() for path in folder.iterdir()},
     )  # fmt: skip
 
@@ -693,3 +721,34 @@ def test_damaged_journal_is_kept_under_another_name(make, ear, tmp_path):
     searched(make(map_directory=str(tmp_path)))
     assert (tmp_path / 'map.journal-1.damaged').exists()
     assert any('no map can be made of it' in w for w in ear.warnings)
+
+
+@pytest.mark.parametrize('continues', [False, True])
+def test_journal_whose_map_has_no_name_is_left_and_the_node_starts(make, ear, tmp_path, continues):
+    name = 'n' * 185  # that of the autosave would be too long
+    mapper = make(map_directory=str(tmp_path), map_file_name=name, journal_period=1e-3)
+    drives(mapper, range(60))
+    killed(mapper)
+    searched(make(map_directory=str(tmp_path), map_file_name=name, continue_map=continues))
+    assert len(journals(tmp_path)) == 1
+    assert any('left for the next start' in w and 'no name of a file' in w for w in ear.warnings)
+
+
+def test_journal_that_vanishes_does_not_stop_the_others(make, ear, tmp_path, monkeypatch):
+    mapper = make(map_directory=str(tmp_path), journal_period=1e-3)
+    drives(mapper, range(60))
+    killed(mapper)
+    other = make(map_directory=str(tmp_path / 'other'))
+    other.journal._folder = mapper.archive.folder
+    left = [tmp_path / 'map.journal-0-1', *journals(tmp_path)]
+    monkeypatch.setattr(other.journal, '_left', lambda: left)
+    assert other.journal.recover() in tmp_path.glob('map.autosave-*.rlml')
+    assert f'{left[0]}: not recovered: No such file or directory' in ear.warnings
+
+
+def test_journal_that_is_being_opened_is_left_alone(make, ear, tmp_path):
+    """Between its name and its lock it is empty."""
+    (tmp_path / 'map.journal-1-1').touch()
+    searched(make(map_directory=str(tmp_path)))
+    assert [path.name for path in tmp_path.iterdir()] == ['map.journal-1-1']
+    assert ear.warnings == []

@@ -14,6 +14,9 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
 from live import LATCHED, room
 
+from rlml_slam.nodes.back_end import BackEndNode
+from rlml_slam.nodes.deformable_slam import DeformableSlamNode
+from rlml_slam.nodes.ekf_slam import EkfSlamNode
 from rlml_slam.nodes.front_end import FrontEndNode
 from rlml_slam.ros import diagnostics
 from rlml_slam.ros.front_end import frame_publisher
@@ -97,6 +100,23 @@ def test_silence_is_said_without_waiting_for_diagnostics(live, node, monkeypatch
     live.spin_until(lambda: live.heard[HEALTH])
     assert 'no new scan' in live.heard[HEALTH][-1].message
     assert level(live.heard[HEALTH][-1]) >= Level.DEGRADED
+
+
+@pytest.mark.parametrize('kind', [FrontEndNode, BackEndNode, EkfSlamNode, DeformableSlamNode])
+def test_whoever_asks_an_inactive_node_for_its_health_hears_that_it_is_inactive(live, kind):
+    node = live.start(kind)
+    node.health._frame = SimpleNamespace(stamp=1, statuses=np.zeros(0, int), health=Health())
+    node.health._publish_health()
+    node.trigger_deactivate()
+    topic = f'/{node.get_name()}/health'
+    live.listen(topic, 'diagnostic_msgs/msg/DiagnosticStatus', LATCHED)
+    live.spin_until(lambda: live.heard[topic])
+    (heard,) = live.heard[topic]
+    assert level(heard) == Level.DEGRADED
+    assert heard.message.endswith('the node is not active')
+    node.health._frame.wall_ms = 1.0
+    node.trigger_activate()
+    live.spin_until(lambda: 'not active' not in live.heard[topic][-1].message)
 
 
 def test_gate_stops_the_robot_that_is_lost(live):

@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from rlml_slam.params import Parameters
 from rlml_slam.recordings.bag_inputs import BagInputs
@@ -11,6 +14,48 @@ from rlml_slam.ros.bags.bag import BagReader, BagWriter
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_bag
 from rlml_slam.types import Scan
+
+PLACE = np.array([0.3, 0.1, 0.0])
+
+
+def scan_in(frame):
+    ranges = np.ones(4, dtype=np.float32)
+    return encode.laser_scan(make_bag, Scan(1, frame, 0.0, 0.1, 0.0, 0.1, 10.0, ranges, ranges))
+
+
+def changed_node(**values):
+    return replace(Parameters(), node=replace(Parameters().node, **values))
+
+
+def inputs_of(path, params):
+    with BagReader(path) as bag:
+        return BagInputs(bag, params)
+
+
+@pytest.mark.parametrize('source', ['auto', 'topic'])
+def test_place_that_comes_late_on_tf_is_found(source, tmp_path):
+    with BagWriter(tmp_path / 'bag') as bag:
+        bag.write('/scan', scan_in('laser'), 1)
+        for k in range(1, 700):
+            pose = np.array([1e-3 * k, 0.0, 0.0])
+            moved = encode.transform(make_bag, k, ('odom', 'base_link'), pose)
+            bag.write('/tf', encode.tf_message(make_bag, [moved]), k)
+        placed = encode.transform(make_bag, 700, ('base_link', 'laser'), PLACE)
+        bag.write('/tf', encode.tf_message(make_bag, [placed]), 700)
+    inputs = inputs_of(tmp_path / 'bag', changed_node(odom_source=source))
+    np.testing.assert_allclose(inputs.extrinsics.pose('base_link', 'laser'), PLACE)
+    assert inputs.sources()['scan'] == '/scan'
+
+
+def test_place_that_nobody_tells_is_told(tmp_path):
+    with BagWriter(tmp_path / 'bag') as bag:
+        bag.write('/scan', scan_in('base_link'), 1)
+        bag.write('/rear', scan_in('rear'), 1)
+    params = changed_node(scan_topics=('scan', 'rear'), laser_pose=(0.2, 0.0, 0.0))
+    note = "no transform from base_link to 'rear': laser_pose is used: [0.2, 0.0, 0.0]"
+    assert inputs_of(tmp_path / 'bag', params).sources()['scan'] == f'/scan, /rear; {note}'
+    without = inputs_of(tmp_path / 'bag', changed_node(scan_topic='scan'))
+    assert without.sources()['scan'] == '/scan'  # in the frame of the base itself
 
 
 def test_a_broken_transform_costs_none_of_its_message(tmp_path):
@@ -21,9 +66,7 @@ def test_a_broken_transform_costs_none_of_its_message(tmp_path):
     bad.transform.rotation.w = 0.0
     with BagWriter(tmp_path / 'bag') as bag:
         bag.add_topic('/scan', 'sensor_msgs/msg/LaserScan')
-        ranges = np.ones(4, dtype=np.float32)
-        scan = Scan(1, 'laser', 0.0, 0.1, 0.0, 0.1, 10.0, ranges, ranges)
-        bag.write('/scan', encode.laser_scan(make_bag, scan), 1)
+        bag.write('/scan', scan_in('laser'), 1)
         bag.add_topic('/tf_static', 'tf2_msgs/msg/TFMessage', latched=True)
         bag.write('/tf_static', encode.tf_message(make_bag, [bad, *good]), 1)
     with BagReader(tmp_path / 'bag') as bag:

@@ -3,19 +3,23 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
+import tempfile
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.typesys import Stores, get_typestore
 
 from rlml_slam.errors import BagError
 from rlml_slam.params import Node
 from rlml_slam.ros.bags.bag import BagReader, BagWriter, Topic, choose_topics
 from rlml_slam.ros.bags.bag_recovery import BagRecovery
 from rlml_slam.ros.codecs import decode, encode
-from rlml_slam.ros.codecs.message_types import make_bag
+from rlml_slam.ros.codecs.message_types import bag_types, make_bag
 from rlml_slam.types import Imu
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -312,6 +316,134 @@ def test_folder_that_lost_its_metadata_is_read(tmp_path, storage):
     got, damage = readable(folder)
     assert got == whole
     assert 'has no metadata.yaml' in damage
+
+
+def write_imu(path, stamps, storage='mcap', topics=('/imu',)):
+    """Topic by topic."""
+    with BagWriter(path, storage) as bag:
+        for topic in topics:
+            for stamp in stamps:
+                bag.write(topic, encode.imu(make_bag, Imu(stamp, 0.1), 'imu'), stamp)
+    return path
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_split_recording_without_metadata_comes_in_the_order_of_log_time(tmp_path, storage):
+    split = tmp_path / 'split'
+    split.mkdir()
+    for k in range(12):
+        part = write_imu(tmp_path / f'{k}', range(SECOND + 9 * k, SECOND + 9 * k + 9), storage)
+        file = storage_file(part)
+        file.rename(split / f'split_{k}{file.suffix}')
+    got, damage = readable(split)
+    assert got == [(SECOND + t, '/imu') for t in range(12 * 9)]
+    assert 'has no metadata.yaml' in damage
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_files_without_metadata_that_were_recorded_side_by_side_are_merged(tmp_path, storage):
+    both = tmp_path / 'both'
+    both.mkdir()
+    for k, name in enumerate(('odd', 'even')):
+        stamps = range(SECOND + 1 - k, SECOND + 100, 2)
+        file = storage_file(write_imu(tmp_path / name, stamps, storage, [f'/{name}']))
+        file.rename(both / file.name)
+    got, _ = readable(both)
+    assert got == [(SECOND + t, '/odd' if t % 2 else '/even') for t in range(100)]
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_file_written_topic_by_topic_comes_in_the_order_of_log_time(tmp_path, storage):
+    folder = write_imu(tmp_path / 'bag', range(SECOND, SECOND + 50), storage, ['/a', '/b'])
+    with BagReader(folder) as bag:
+        whole = sorted(bag.serialized(), key=lambda m: m[:2])
+    (folder / 'metadata.yaml').unlink()
+    with BagReader(folder) as bag:
+        assert list(bag.serialized()) == whole
+        assert list(bag.serialized(['/b'])) == [m for m in whole if m[1] == '/b']
+        assert (bag.start, bag.end) == (SECOND, SECOND + 50)
+
+
+def killed(folder, whole, all_in_wal):
+    """A SQLite bag whose recorder was killed after it had recorded the messages of one twice."""
+    folder.mkdir()
+    made = folder.with_name('made.db3')
+    if not all_in_wal:
+        shutil.copy(whole, made)
+    with closing(sqlite3.connect(made)) as base, closing(sqlite3.connect(whole)) as source:
+        base.execute('PRAGMA journal_mode=WAL')
+        base.execute('PRAGMA wal_autocheckpoint=0')
+        if all_in_wal:
+            base.executescript('\n'.join(source.iterdump()))
+        base.execute(
+            'INSERT INTO messages (topic_id, timestamp, data) '
+            f'SELECT topic_id, timestamp + {SECOND}, data FROM messages'
+        )
+        base.commit()
+        for end in ('', '-wal'):  # as they are while it is open
+            shutil.copy(f'{made}{end}', folder / f'bag.db3{end}')
+    return folder / 'bag.db3'
+
+
+@pytest.mark.parametrize('all_in_wal', [True, False])
+@pytest.mark.parametrize('what', ['file', 'folder', 'folder with metadata'])
+def test_sqlite_of_a_killed_recorder_is_read_with_its_wal(tmp_path, monkeypatch, all_in_wal, what):
+    whole = storage_file(write(tmp_path / 'whole', 'sqlite3', n=20))
+    file = killed(tmp_path / 'killed', whole, all_in_wal)
+    if what == 'folder with metadata':
+        text = (whole.parent / 'metadata.yaml').read_text()
+        (file.parent / 'metadata.yaml').write_text(text.replace(whole.name, file.name))
+    before = {f.name: f.read_bytes() for f in file.parent.iterdir()}
+    (tmp_path / 'temporary').mkdir()
+    monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path / 'temporary'))
+    got, damage = readable(file if what == 'file' else file.parent)
+    once, _ = readable(whole)
+    assert got == once + [(time + SECOND, topic) for time, topic in once]
+    assert ('has no metadata' if what == 'folder' else 'was not closed') in damage
+    assert {f.name: f.read_bytes() for f in file.parent.iterdir()} == before
+    assert list((tmp_path / 'temporary').iterdir()) == []
+
+
+def test_wal_that_does_not_fit_in_the_temporary_folder_is_named(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, 'No space left on device')
+
+    whole = storage_file(write(tmp_path / 'whole', 'sqlite3'))
+    file = killed(tmp_path / 'killed', whole, all_in_wal=False)
+    monkeypatch.setattr(shutil, 'copyfile', full)
+    with pytest.raises(BagError, match=r'bag\.db3: cannot be read: No space left on device'):
+        BagReader(file)
+
+
+def write_ros1(path, stamps):
+    types, msgtype = get_typestore(Stores.ROS1_NOETIC), 'sensor_msgs/msg/Imu'
+    with Ros1Writer(path) as bag:
+        imu = bag.add_connection('/imu', msgtype, typestore=types)
+        for stamp in stamps:
+            message = encode.imu(make_bag, Imu(stamp, 0.1), 'imu')
+            raw = bag_types().serialize_cdr(message, msgtype)
+            bag.write(imu, stamp, bag_types().cdr_to_ros1(raw, msgtype))
+    return path
+
+
+def test_ros1_bag_is_known_by_its_first_bytes(tmp_path):
+    bag = write_ros1(tmp_path / 'a.bag', range(SECOND, SECOND + 50))
+    active = shutil.copy(bag, tmp_path / 'a.bag.active')
+    assert readable(active) == readable(bag) == ([(SECOND + t, '/imu') for t in range(50)], '')
+
+
+def test_ros1_bag_of_a_killed_recorder_gives_what_came_before(tmp_path):
+    """Sizes and index are written last: the header of the bag and of its last chunk have zeros."""
+    bag = write_ros1(tmp_path / 'a.bag', range(SECOND, SECOND + 50))
+    data, active = bytearray(bag.read_bytes()), tmp_path / 'a.bag.active'
+    for name, size in ((b'index_pos=', 8), (b'compression=none\t\0\0\0size=', 8)):
+        at = data.index(name) + len(name)
+        data[at : at + size] = bytes(size)
+    active.write_bytes(data[: at + 10_000])
+    got, damage = readable(active)
+    assert got == [(SECOND + t, '/imu') for t in range(len(got))]
+    assert len(got) > 10
+    assert damage.endswith('a.bag.active is cut off')
 
 
 def test_scratched_mcap_loses_the_scratched_chunk_alone(tmp_path):

@@ -15,7 +15,7 @@ from rclpy.parameter import Parameter  # noqa: E402
 
 from rlml_slam.errors import ParameterError  # noqa: E402
 from rlml_slam.params import NODES, Parameters, declarations  # noqa: E402
-from rlml_slam.ros.declare import declare  # noqa: E402
+from rlml_slam.ros.declare import declare, pace  # noqa: E402
 
 
 @pytest.fixture
@@ -134,3 +134,30 @@ def test_live_parameters_change_and_others_say_why_not(make_node):
     assert (limits.sigma_lost, parameters.node.map_file_name) == (1.0, 'second')
     assert not given(health__sigma_degraded=0.1, use_imu=False).successful
     assert limits.sigma_degraded == Parameters().health.sigma_degraded
+
+
+def test_timer_is_changed_by_a_set_that_is_taken_and_never_without_a_pause(make_node):
+    node, timer = make_node(), SimpleNamespace(timer_period_ns=20_000_000)
+
+    def refuse(name):
+        raise ParameterError(name)
+
+    declare(node, checks={'transform_publish_period': pace(timer), 'map_file_name': refuse})
+
+    def given(period, **others):
+        values = {'transform_publish_period': period, **others}
+        return node.set_parameters_atomically([Parameter(n, value=v) for n, v in values.items()])
+
+    assert not given(1.0, use_imu=False).successful
+    assert not given(1.0, map_file_name='other').successful
+    assert timer.timer_period_ns == 20_000_000
+    for period, ns in ((0.5, 500_000_000), (1e-10, 1_000_000), (0.0, 100_000_000)):
+        assert given(period).successful
+        assert timer.timer_period_ns == ns
+
+
+def test_frames_lose_the_slash_that_ros_1_allowed(make_node):
+    node = make_node(base_frame='/base_link', scan_topic='/scan')
+    parameters = declare(node)
+    assert (parameters.node.base_frame, parameters.node.scan_topic) == ('base_link', '/scan')
+    assert node.get_parameter('base_frame').value == 'base_link'

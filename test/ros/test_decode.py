@@ -78,10 +78,21 @@ def test_scan_without_intensities_is_legal(make):
     assert decode.scan(msg).intensities.shape == (0,)
 
 
-def test_scan_with_other_number_of_intensities_is_refused(make):
-    msg = encode.laser_scan(make, a_scan(intensities=np.zeros(2, np.float32)))
-    with pytest.raises(InputError, match='front: 2 intensities for 6 ranges'):
-        decode.scan(msg, 'front')
+def test_scan_with_other_number_of_intensities_is_used_without_them(make):
+    scan = decode.scan(encode.laser_scan(make, a_scan(intensities=np.zeros(2, np.float32))))
+    assert scan.intensities.shape == (0,)
+    np.testing.assert_array_equal(scan.ranges, a_scan().ranges)
+
+
+@pytest.mark.parametrize('longest', [0.0, -1.0, 0.1])
+def test_range_max_that_leaves_no_range_is_not_known(make, longest):
+    scan = decode.scan(encode.laser_scan(make, a_scan(range_max=longest, range_min=0.1)))
+    assert scan.range_max == decode.FARTHEST
+    assert scan.range_min == pytest.approx(0.1)
+
+
+def test_range_max_that_is_nan_stays_so(make):
+    assert np.isnan(decode.scan(encode.laser_scan(make, a_scan(range_max=np.nan))).range_max)
 
 
 @pytest.mark.parametrize('stamp', [0, -1_000_000_000])

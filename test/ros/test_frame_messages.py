@@ -170,6 +170,15 @@ def test_lost_part_costs_only_itself():
     assert len(out[0].frame.observation.detections) == 3
 
 
+def test_parts_whose_records_never_come_are_kept_for_a_while():
+    join = FrameAssembler()
+    for k in range(5 * MAX_BEHIND):
+        assert send(join, a_frame((k + 1) * SECOND), parts='pd') == []
+    assert len(join._points) == len(join._associated) == 2 * MAX_BEHIND
+    assert len(send(join, a_frame(5 * MAX_BEHIND * SECOND), parts='r')) == 1
+    assert join.incomplete == 0
+
+
 def test_other_clouds_are_refused():
     msg = build_points(make_bag, SECOND, 'base_link', np.zeros((1, 2)))
     with pytest.raises(InputError, match='frames: 1 points; missing fields: session'):

@@ -77,11 +77,52 @@ def test_only_old_automatic_maps_of_the_name_are_removed(tmp_path):
     for path in (*others, *old, *young):
         path.write_bytes(b'')
         os.utime(path, (now, now) if path in young else (0, 0))
+    os.utime(others[0], (1, 1))  # newer than the autosaves
     previous = old[0].with_name(old[0].name + '.previous')
     previous.write_bytes(b'')
     assert folder.make_room('hall', now) == old
     assert {*tmp_path.iterdir()} == {*others, *young}
     assert folder.make_room('hall', now) == []
+
+
+def aged(path, stamp):
+    path.write_bytes(b'')
+    os.utime(path, (stamp, stamp))
+    return path
+
+
+@pytest.mark.parametrize('whole', [None, 1, 3])
+def test_map_that_the_next_start_would_continue_is_never_removed(whole, tmp_path):
+    folder, now = MapFolder(str(tmp_path)), 2.0 * LOST_AGE
+    first, second = (aged(folder.free('hall', AUTOSAVE, k), k) for k in (1, 2))
+    lost = aged(folder.free('hall', LOST, 3), 3)
+    if whole is not None:
+        aged(folder.whole('hall'), whole)
+    kept = {second} if whole != 3 else set()
+    assert {*folder.make_room('hall', now)} == {first, second, lost} - kept
+    assert {*folder.automatic('hall')} == kept
+    assert folder.newest('hall') in tmp_path.iterdir()
+
+
+def test_journals_and_what_was_loaded_are_never_removed(tmp_path):
+    folder, now = MapFolder(str(tmp_path)), 2.0 * LOST_AGE
+    names = ('hall.rlml', 'hall.journal-1-1', 'hall.journal-2-1.damaged', 'hall.autosave-7.rlml')
+    files = {aged(tmp_path / name, 1) for name in names}
+    aged(folder.whole('hall'), 2)
+    folder.loaded.add(tmp_path / names[-1])
+    assert folder.make_room('hall', now) == []
+    assert {*tmp_path.iterdir()} == files
+
+
+def test_automatic_maps_of_a_name_with_a_suffix_are_found(tmp_path):
+    folder = MapFolder(str(tmp_path))
+    for name in ('hall.rlml', 'deep/hall.yaml'):
+        path = folder.free(name, AUTOSAVE, 7)
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+        assert path.name == 'hall.autosave-7.rlml'
+        assert folder.automatic(name) == [path]
+        assert folder.newest(name) == path
 
 
 def test_automatic_maps_displace_none_where_they_fill_their_share(tmp_path, monkeypatch):

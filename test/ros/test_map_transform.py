@@ -121,6 +121,18 @@ def test_period_0_at_run_time_stops_it_and_another_one_starts_it(robot):
     assert drive_on(0.05) == (5, 2)
 
 
+def test_period_that_goes_to_0_and_back_makes_no_further_publisher(robot, monkeypatch):
+    made = []
+    monkeypatch.setattr(map_transform, 'TransformPublisher', lambda node: made.append(1) or node)
+    node = Node()
+    transform = MapTransform(robot, node)
+    for period in (0.0, 0.02) * 3:
+        node.change('transform_publish_period', period)
+        robot.now += SECOND
+        transform.follow(frame(robot.now))
+    assert made == [1]
+
+
 def test_without_tolerance_now_is_refused(robot):
     refused, asked, _ = drive(robot, 20.0, np.random.default_rng(1), transform_tolerance=0.0)
     assert refused == asked

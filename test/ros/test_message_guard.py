@@ -126,6 +126,18 @@ def test_signal_passes_the_guard():
         guard.pass_on('scan', interrupted)
 
 
+def test_what_the_ends_say_to_each_other_is_not_recorded(node):
+    taken = []
+    node.tap = lambda topic, kind, data: taken.append(topic)
+    node.create_subscription = lambda kind, topic, *_, **__: SimpleNamespace(
+        topic_name=f'/rlml/{topic}'
+    )
+    for topic in ('scan', 'rlml/graph_correction'):
+        heard = Listener(node, LaserScan, topic, len, QoSProfile(depth=5))
+        heard.receive(serialize_message(LaserScan()))
+    assert taken == ['/rlml/scan']
+
+
 def test_refused_message_is_counted(node):
     listener(node, refuse).accept(LaserScan())
     assert guard_of(node).refused == {'scan': 1}

@@ -10,7 +10,7 @@ import pytest
 
 from rlml_slam import se2
 from rlml_slam.params import Detector, SimulatorParameters, from_mapping
-from rlml_slam.sensing.reflectors.reflector_calibration import calibrated
+from rlml_slam.sensing.reflectors.reflector_calibration import ReflectorCalibration, calibrated
 from rlml_slam.sensing.reflectors.scan_reflectors import ScanReflectors
 from rlml_slam.simulation.simulation import Simulation
 from rlml_slam.simulation.world_file import load_world
@@ -142,6 +142,13 @@ def test_the_noise_of_ranges_is_found(sigma, beams):
     for s in noisy:
         seen = reflectors.detections(s, STILL, STILL)
     assert len(seen) >= 5
+
+
+def test_scan_without_a_step_between_its_beams_teaches_nothing():
+    calibration = ReflectorCalibration(Detector())
+    for step in (0.0, np.nan):
+        calibration.add(replace(next(scans()), angle_increment=step))
+    assert calibration.num_scans == 0
 
 
 def test_size_and_divergence_are_found():

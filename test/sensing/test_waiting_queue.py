@@ -71,6 +71,20 @@ def test_detections_wait_through_a_pause_of_the_odometry():
     assert len(waiting.pop(T - 50 * MS)) == 1
 
 
+def test_pause_that_is_waited_out_changes_at_run_time():
+    inputs, params = InputCounts(), Parameters(node=Node(odom_timeout=0.2))
+    stamps = StampCheck(inputs)
+    for stamp in (T0, T):
+        stamps.accept('odom', stamp, None)
+    waiting = WaitingQueue(params, stamps, inputs)
+    params.health.change('input_timeout', 30.0)
+    waiting.add('reflectors', detections(T), 0)
+    stamps.accept('reflectors', T + 29 * SECOND, None)
+    assert waiting.pop(T - 50 * MS) == []
+    params.health.change('input_timeout', PAUSE)
+    assert len(waiting.pop(T - 50 * MS)) == 1
+
+
 def test_detections_do_not_wait_beside_a_lidar():
     waiting, stamps = queue(T, odom_timeout=0.2)
     waiting.note_lidar(scan(T - 50 * MS))

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from rlml_slam.cli.main import between
 from rlml_slam.cli.support.text_table import aligned
 from rlml_slam.datasets.tum import read_tum
 from rlml_slam.errors import FileFormatError, MapError, ParameterError
@@ -58,8 +59,9 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--redundant', type=int, default=0, choices=(0, 1, 2), metavar='K',
                         help='the goal holds with the worst K reflectors hidden')  # fmt: skip
     parser.add_argument('--spacing', type=float, default=0.25, help='between places [m]')
-    parser.add_argument('--clearance', type=float, default=0.3, help='half the width of robots '
-                        '[m]: places and ways are as far from walls and posts')  # fmt: skip
+    parser.add_argument('--clearance', type=between(0.0, 100.0), default=0.3,
+                        help='half the width of robots [m]: places and ways are as far from walls '
+                        'and posts')  # fmt: skip
     more = parser.add_mutually_exclusive_group()
     more.add_argument('--suggest', type=int, metavar='N', help='add N reflectors where they help '
                       'most; layout.csv, .imk and .dxf')  # fmt: skip

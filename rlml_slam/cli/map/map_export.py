@@ -47,7 +47,4 @@ def export(content: Content, folder: Path) -> list[str]:
     poses = frame_path.poses_of(a['path'], a['path_motion'], a['pose'])
     write_tum(folder / 'trajectory.tum', Trajectory(a['path']['stamp'], poses))
     names = ['graph.g2o', 'reflectors.csv', 'keyframes.tum', 'trajectory.tum']
-    if known.grid is not None:
-        nav2_map.save(known.grid, folder / 'map')
-        names += ['map.pgm', 'map.yaml']
-    return names
+    return names + nav2_map.save_grid(known.grid, folder)

@@ -41,7 +41,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--survey', metavar='FILE', type=Path, help='.csv, .json or SICK .imk')
     parser.add_argument('--config', metavar='YAML', type=Path, help='ROS parameter file')
     parser.add_argument(
-        '--jobs', metavar='N', type=int, default=1,
+        '--jobs', metavar='N', type=int, choices=range(257), default=1,
         help='worker processes, 0 for one per core; 1: this process (default)',
     )  # fmt: skip
     parser.add_argument('--cluster', metavar='tcp://HOST:PORT', help='scheduler of Dask')

@@ -35,15 +35,21 @@ def message_of(answer: Any) -> str:
 def asking(namespace: str | None = None) -> Iterator[Any]:
     """A node that asks. KeyboardInterrupt where a signal ended ROS meanwhile."""
     import rclpy
+    from rclpy._rclpy_pybind11 import RCLError
+    from rclpy.exceptions import NameValidationException
 
-    rclpy.init()
     try:
+        rclpy.init()
         asker = rclpy.create_node('rlml_ask', namespace=namespace)
         try:
             yield asker
         finally:
             asker.destroy_node()
-    except Exception:
+    except NameValidationException as e:
+        raise InputError(' '.join(str(e).split())) from e
+    except Exception as e:
+        if isinstance(e, RCLError) and 'DOMAIN_ID' in str(e):
+            raise InputError(f'ROS_DOMAIN_ID = {domain()!r} is no domain') from e
         if rclpy.utilities.ok():
             raise
         raise KeyboardInterrupt from None

@@ -28,7 +28,7 @@ class MapArchive:
         self._p = params
         self._logger = logger
         self.folder = MapFolder(params.node.map_directory)
-        self._written = 0  # keyframes of the map in the making that are in a file
+        self.unsaved = 0  # keyframes added since the map in the making was written
 
     def load(self, name: str) -> Content:
         """A whole map of the folder. Raises MapError or FileFormatError."""
@@ -36,6 +36,7 @@ class MapArchive:
         if name.endswith(SUFFIXES) and not name.endswith(whole.suffix):
             raise MapError(f'{name} can be localized in; only a .rlml file can be continued')
         content = map_file.load(whole)
+        self.folder.loaded.add(whole)
         self._compare_image(whole)
         return content
 
@@ -67,15 +68,15 @@ class MapArchive:
 
         Whether nothing is lost thereby.
         """
-        keys = back_end.keyframes
-        if len(keys) - self._written < WORTH_KEEPING:
+        if self.unsaved < WORTH_KEEPING:
             return True
-        return self._keep(LOST, keys[-1].stamp // SECOND, back_end, grid, reason)
+        stamp = back_end.keyframes[-1].stamp
+        return self._keep(LOST, stamp // SECOND, back_end, grid, reason)
 
     def autosave(self, back_end: BackEnd, grid: OccupancyGrid | None) -> bool:
         """The same at the end of the process, where anything is in no file yet."""
-        keys = len(back_end.keyframes)
-        if keys < WORTH_KEEPING or keys == self._written:
+        keys = max(len(back_end.keyframes), self.unsaved)
+        if keys < WORTH_KEEPING or self.unsaved == 0:
             return True
         return self._keep(AUTOSAVE, int(time.time()), back_end, grid, 'the node ends')
 
@@ -94,13 +95,13 @@ class MapArchive:
         self._logger.warning(f'{reason}: the map until now is kept: {path}')
         return True
 
-    def begin(self, back_end: BackEnd) -> None:
+    def begin(self) -> None:
         """The map in the making is another one, all of which is in a file."""
-        self._written = len(back_end.keyframes)
+        self.unsaved = 0
 
     def _write(self, path: Path, back_end: BackEnd, grid: OccupancyGrid | None) -> None:
         map_container.write(path, map_file.content_of(back_end, self._p, grid))
-        self._written = len(back_end.keyframes)
+        self.unsaved = 0
 
 
 def contents(of: SavedMap) -> str:

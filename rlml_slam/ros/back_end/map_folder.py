@@ -6,7 +6,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from rlml_slam.errors import MapError, NoMapError
-from rlml_slam.maps import map_container, nav2_map, reflector_file, saved_map, survey
+from rlml_slam.maps import nav2_map, reflector_file, saved_map, survey
+from rlml_slam.maps.atomic_file import PREVIOUS
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.maps.survey import Survey
 from rlml_slam.slam.store import map_file
@@ -15,7 +16,7 @@ from rlml_slam.slam.store import map_file
 # of, and one that was in the making when its process ended
 # and the journal of one
 LOST, AUTOSAVE, JOURNAL = AUTOMATIC = ('.lost-', '.autosave-', '.journal-')
-ENDS = ('.rlml', f'.rlml{map_container.PREVIOUS}')
+ENDS = ('.rlml', f'.rlml{PREVIOUS}')
 MAX_NAME = 200  # bytes
 LOST_AGE = 30 * 86400.0  # [s] after which such a file is removed
 LOST_BYTES = 1_000_000_000  # of such files: where there are more, no other one is written
@@ -28,6 +29,7 @@ class MapFolder:
 
     def __init__(self, directory: str) -> None:
         self.root = Path(directory).expanduser().resolve()
+        self.loaded: set[Path] = set()  # what this process goes on with is never removed
 
     def path(self, name: str) -> Path:
         """The path of a map without its suffixes; MapError if it lies outside of the folder."""
@@ -90,10 +92,11 @@ class MapFolder:
 
     def free(self, name: str, kind: str, seconds: int) -> Path:
         """The path for an automatic map of a kind, made until a time [s]; no file has it yet."""
-        path, k = self.whole(f'{name}{kind}{seconds}'), 1
+        begin = f'{self.path(name).relative_to(self.root)}{kind}{seconds}'
+        path, k = self.whole(begin), 1
         while path.exists():
             k += 1
-            path = self.whole(f'{name}{kind}{seconds}-{k}')
+            path = self.whole(f'{begin}-{k}')
         return path
 
     def newest(self, name: str) -> Path:
@@ -106,14 +109,17 @@ class MapFolder:
     def make_room(self, name: str, now: float) -> list[Path]:
         """Remove automatic maps that are older than LOST_AGE at a time [s]; which.
 
-        No other file is ever removed. Raises MapError where the younger ones fill LOST_BYTES.
+        No other file is ever removed: no journal, nor what a start would continue or was loaded.
+        Raises MapError where automatic files fill LOST_BYTES.
         """
         path = self.path(name)
         try:
-            old = [f for f in self.automatic(name) if now - f.stat().st_mtime > LOST_AGE]
+            kept = {*self.loaded, self.newest(name)}
+            maps = [f for f in self.automatic(name, (LOST, AUTOSAVE)) if f not in kept]
+            old = [f for f in maps if now - f.stat().st_mtime > LOST_AGE]
             for file in old:
                 file.unlink(missing_ok=True)
-                file.with_name(file.name + map_container.PREVIOUS).unlink(missing_ok=True)
+                file.with_name(file.name + PREVIOUS).unlink(missing_ok=True)
             size = sum(file.stat().st_size for file in self.automatic(name))
         except OSError as e:
             raise MapError(f'{path}: {e.filename}: {e.strerror}') from e
@@ -122,7 +128,7 @@ class MapFolder:
                 f'{path}: {", ".join(AUTOMATIC)}… have {size / 1e6:.0f} MB; remove those that are '
                 f'not needed, so that others can be kept'
             )
-        return [file for file in old if file.suffix == '.rlml']
+        return old
 
     def automatic(self, name: str, kinds: tuple[str, ...] = AUTOMATIC) -> list[Path]:
         """Files of a map that were written without a user's request, by name."""
@@ -153,6 +159,7 @@ class MapFolder:
         if found is None:
             names = ' and no '.join(f.name for f in files)
             raise NoMapError(f'{path.parent}: there is no {names}')
+        self.loaded.add(found)
         if found.suffix == '.rlml':
             return map_file.saved_map(map_file.load(found))
         self.readable(found.with_suffix('.csv'))

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import math
+import os
 import time
 from pathlib import Path
 from typing import IO, Any
@@ -18,7 +19,8 @@ from rlml_slam.errors import MapError, RlmlError
 from rlml_slam.maps import map_container
 from rlml_slam.maps.map_container import Content
 from rlml_slam.params import Parameters
-from rlml_slam.ros.back_end.map_folder import AUTOSAVE, JOURNAL, MapFolder
+from rlml_slam.ros.back_end.map_archive import WORTH_KEEPING
+from rlml_slam.ros.back_end.map_folder import AUTOSAVE, JOURNAL, LOST, MapFolder
 from rlml_slam.slam.keyframes import FoundPose
 from rlml_slam.slam.store import journal, map_file
 from rlml_slam.slam.store.journal import Journal
@@ -59,6 +61,12 @@ class MapJournal:
         self._journal.add(frame, is_keyframe, found)
         self.write()
 
+    def revoke(self, number: int) -> None:
+        """A loop closure that the graph is to have no more; on disk at once."""
+        if self._p.node.journal_period > 0.0 and not self.problem:
+            self._journal.revoke(number)
+            self.flush()
+
     @property
     def is_due(self) -> bool:
         """Whether there is something to be written by now."""
@@ -90,7 +98,8 @@ class MapJournal:
         """A new file, locked for as long as this process lives."""
         path = self._folder.path(self._p.node.map_file_name)
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._folder.make_room(self._p.node.map_file_name, time.time())
+        for old in self._folder.make_room(self._p.node.map_file_name, time.time()):
+            self._logger.warning(f'an old map is removed: {old}')
         name, k = f'{path.name}{JOURNAL}{int(time.time())}', 1
         while path.with_name(f'{name}-{k}').exists():
             k += 1
@@ -115,15 +124,20 @@ class MapJournal:
         self._file = None
 
     def recover(self) -> Path | None:
-        """Make maps of what killed processes left; the path of the last one."""
+        """Make maps of what killed processes left; the path of the last one worth continuing."""
         made = None
         for path in self._left():
-            with path.open('rb') as file:
-                try:
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except OSError:
-                    continue  # another process is writing it
-                made = self._recover(path) or made
+            try:
+                with path.open('rb') as file:
+                    if os.fstat(file.fileno()).st_size == 0:
+                        continue  # opened this moment, and not locked yet
+                    try:
+                        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    except OSError:
+                        continue  # another process is writing it
+                    made = self._recover(path) or made
+            except OSError as e:
+                self._logger.error(f'{path}: not recovered: {e.strerror or e}')
         return made
 
     def _check(self) -> None:
@@ -135,7 +149,6 @@ class MapJournal:
         return [path for path in files if path.name[-1].isdecimal() and path.is_file()]
 
     def _recover(self, path: Path) -> Path | None:
-        name = self._p.node.map_file_name
         self._logger.warning(
             f'{path}: the last run ended without saving its map; recovering it '
             f'({path.stat().st_size / 1e6:.1f} MB)'
@@ -152,12 +165,20 @@ class MapJournal:
             path.rename(bad)
             self._logger.error(f'{bad}: no map can be made of it: {e}')
             return None
-        to = self._folder.free(name, AUTOSAVE, int(time.time()))
+        return self._save(path, content, len(back_end.keyframes))
+
+    def _save(self, path: Path, content: Content, keys: int) -> Path | None:
+        """Write a recovered map; its path, unless it is too small to displace the map there."""
+        name = self._p.node.map_file_name
         try:
+            there = self._folder.newest(name)
+            wins = keys >= WORTH_KEEPING or not there.exists() or journal.has_base(path)
+            to = self._folder.free(name, AUTOSAVE if wins else LOST, int(time.time()))
             map_container.write(to, content)
             path.unlink()
         except (MapError, OSError) as e:
             self._logger.error(f'{path}: left for the next start: {e}')
             return None
-        self._logger.warning(f'recovered: {len(back_end.keyframes)} keyframes in {to}')
-        return to
+        why = '' if wins else f'; too few: {there} remains the newest map'
+        self._logger.warning(f'recovered: {keys} keyframes in {to}{why}')
+        return to if wins else None

@@ -9,7 +9,7 @@ from typing import Any
 
 from diagnostic_msgs.srv import AddDiagnostics
 from nav_msgs.srv import GetMap, LoadMap
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
 from std_srvs.srv import Empty, SetBool, Trigger
 
@@ -38,8 +38,9 @@ class MapServices:
         self._mapper = mapper
         self._requests = requests
         self.refused = ''
-        # in the node's group, every subscription would wait for the answer
-        own = MutuallyExclusiveCallbackGroup()
+        # in the node's group, every subscription would wait for the answer, and every service in
+        # one that is exclusive
+        own = ReentrantCallbackGroup()
         for kind, name, answer in (
             (Trigger, '~/save_map', self.save_map),
             (LoadMap, '~/load_map', self.load_map),

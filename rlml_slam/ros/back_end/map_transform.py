@@ -43,10 +43,10 @@ class MapTransform:
         return p.tf_broadcast and not p.shadow and p.transform_publish_period > 0.0
 
     def _open(self) -> TransformPublisher | None:
-        """The publisher, where anything is to be published."""
-        if not self._is_sent:
-            return None
-        return self._publisher or TransformPublisher(self._node)
+        """The publisher, from when anything is to be published."""
+        if self._publisher is None and self._is_sent:
+            return TransformPublisher(self._node)
+        return self._publisher
 
     def restart(self) -> None:
         """The local frame is another one from now on."""
@@ -57,7 +57,7 @@ class MapTransform:
         """Take the next frame, and publish."""
         self._odom.follow(frame)
         self._publisher = self._open()
-        if self._odom.newest is None or self._publisher is None:
+        if self._odom.newest is None or self._publisher is None or not self._is_sent:
             return
         stamp, T = self._odom.newest
         if self._smoothed is not None:

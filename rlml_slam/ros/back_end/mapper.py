@@ -138,6 +138,7 @@ class Mapper:
         self.journal.add(frame, update is not None, command.found)
         if update is None:
             return
+        self.archive.unsaved += 1
         self._topics.update(frame.stamp, self.back_end.graph.poses[update.keyframe, :2], update)
         belief = None
         if update.optimized:
@@ -183,7 +184,7 @@ class Mapper:
         self._begin_map(base)
 
     def _begin_map(self, base: Content | None) -> None:
-        self.archive.begin(self.back_end)
+        self.archive.begin()
         self.journal.restart(base, keep=not self._is_kept)
         self._is_kept = True
         self.products.restart()

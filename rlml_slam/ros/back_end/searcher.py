@@ -12,6 +12,7 @@ from rlml_slam.ros.back_end.worker import Worker
 from rlml_slam.slam.conversation import Search
 from rlml_slam.slam.relocalization.pose_test import locate
 from rlml_slam.slam.relocalization.scan_relocalization import Relocation
+from rlml_slam.types import Verdict
 
 DELAY = 'RLML_SEARCH_DELAY'  # environment variable [s], for studies of slow machines
 
@@ -32,6 +33,7 @@ class Searcher:
         self._p = params
         self._on_result = on_result
         self.delay = float(os.environ.get(DELAY, '0')) if delay is None else delay
+        self._report = report
         self.worker = Worker(report)
         self._ends = threading.Event()
 
@@ -40,7 +42,11 @@ class Searcher:
         self.worker.submit(lambda: self._run(search))
 
     def _run(self, search: Search) -> None:
-        found = locate(search, self._p)
+        try:
+            found = locate(search, self._p)
+        except Exception as e:  # who asked waits for an answer
+            self._report(e)
+            found = Relocation(Verdict.NOT_SEARCHED, f'the search failed: {e}')
         if not self._ends.wait(self.delay):
             self._on_result(search.number, found)
 

@@ -12,7 +12,7 @@ from rlml_slam.errors import FileFormatError, MapError
 from rlml_slam.maps.saved_map import SavedMap, require_contents
 from rlml_slam.params import Parameters
 from rlml_slam.ros.back_end.last_pose import LastPose
-from rlml_slam.ros.back_end.map_archive import contents
+from rlml_slam.ros.back_end.map_archive import WORTH_KEEPING, contents
 from rlml_slam.ros.back_end.mapper import Mapper
 from rlml_slam.slam.closures.closure_table import describe
 from rlml_slam.slam.conversation import Answer, Command
@@ -143,6 +143,8 @@ class UserRequests:
         if mapper.system.map is not None:
             raise MapError('the map that is localized in does not change')
         closure = back_end.revoke(int(number))
+        self._archive.unsaved += WORTH_KEEPING  # a user's decision is worth as much
+        mapper.journal.revoke(int(number))
         self._logger.warning(describe(closure))
         known, stamp = back_end.known, back_end.keyframes[-1].stamp
         cov = None if known is None else known.cov_map

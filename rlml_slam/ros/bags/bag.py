@@ -6,6 +6,7 @@ Nothing here needs a ROS installation. A message that cannot be read never costs
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import shutil
@@ -29,7 +30,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 
 from rlml_slam.errors import BagError
 from rlml_slam.params import Node
-from rlml_slam.ros.bags.bag_recovery import BagRecovery
+from rlml_slam.ros.bags.bag_recovery import ROSBAG1, BagRecovery, has_wal
 from rlml_slam.ros.codecs.message_types import bag_types
 from rlml_slam.ros.sensor_input import PLACED, STREAMS, USED_BY, topics_of
 
@@ -50,8 +51,8 @@ class BagReader:
 
     ``topics`` by name; ``start`` and ``end`` [ns] of the recording; ``skipped`` counts, by topic,
     the messages that ``messages`` left out because their type is unknown or they are broken;
-    ``damage`` says in one line what is wrong with a bag that could only be read in part (then
-    in the order of its file), empty for a sound one.
+    ``damage`` says in one line what is wrong with a bag that had to be salvaged, empty for a sound
+    one.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -63,7 +64,7 @@ class BagReader:
             raise BagError(f'{path}: no such bag')
         if self.path.is_dir() and all(f.name == 'metadata.yaml' for f in self.path.iterdir()):
             raise BagError(f'{path}: no bag: there is no recording in this folder')
-        self.is_ros1 = self.path.suffix == '.bag' and not self.path.is_dir()
+        self.is_ros1 = _is_ros1(self.path)
         self._reader = self._open()
         self.topics = {
             name: Topic(name, info.msgtype or '', info.msgcount)
@@ -75,14 +76,19 @@ class BagReader:
     def _open(self) -> Any:
         """The library's reader, or, for a bag that it refuses, what can be salvaged of it."""
         try:
+            files = self.path.glob('*.db3') if self.path.is_dir() else [self.path]
+            if any(map(has_wal, files)):  # which the library overlooks
+                raise BagError('was not closed, and read with its -wal')
             reader: Any = (Reader1 if self.is_ros1 else Reader2)(self.path)
             reader.open()
             _ = reader.topics  # of a topic without a type it can be opened, but not listed
         except Exception as e:  # the library lets struct.error, KeyError and others through
             try:
                 reader = BagRecovery(self.path)
-            except (ValueError, OSError):
+            except ValueError:
                 raise BagError(f'{self.path}: not a readable bag: {_line(e)}') from e
+            except OSError as error:
+                raise BagError(f'{self.path}: cannot be read: {error.strerror}') from e
             self.damage = f'{self.path}: {reader.damage or _line(e)}'
         return reader
 
@@ -175,6 +181,13 @@ class BagReader:
             raise
         except Exception as e:
             raise BagError(f'{self.path}: damaged after {count} messages: {_line(e)}') from e
+
+
+def _is_ros1(path: Path) -> bool:
+    """By name or first bytes: a recorder that was killed leaves a ``.bag.active``."""
+    with contextlib.suppress(OSError), path.open('rb') as file:  # OSError: also of a folder
+        return path.suffix == '.bag' or file.read(len(ROSBAG1)) == ROSBAG1
+    return False
 
 
 @functools.lru_cache(maxsize=100)  # most bags have the same

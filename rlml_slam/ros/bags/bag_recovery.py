@@ -3,13 +3,15 @@
 
 A recorder that lost its power leaves such files, and the library rosbags refuses all of them. They
 are read from the front, record by record, to the first damage; their messages come in the order of
-the file. The one use is ``BagRecovery(path)`` in bag.py, in place of the library's reader.
+log time. The one use is ``BagRecovery(path)`` in bag.py, in place of the library's reader.
 """
 
 from __future__ import annotations
 
 import contextlib
+import heapq
 import os
+import shutil
 import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
@@ -17,6 +19,7 @@ from contextlib import closing
 from functools import partial
 from io import BytesIO
 from pathlib import Path
+from tempfile import TemporaryDirectory, TemporaryFile
 from typing import Any, BinaryIO, TypeAlias
 
 import apsw
@@ -36,8 +39,9 @@ MCAP = b'\x89MCAP0\r\n'
 ROSBAG1 = b'#ROSBAG V2.0\n'
 SQLITE = b'SQLite format 3\0'
 SMALLEST_PAGE = 512  # [bytes] of SQLite
-# a connection when it is met, a message (connection id, log time [ns], raw), or what is broken
-Found: TypeAlias = Connection | tuple[int, int, bytes] | str
+Message: TypeAlias = tuple[int, int, bytes]  # connection id, log time [ns], raw
+# a connection when it is met, a message, or what is broken
+Found: TypeAlias = Connection | Message | str
 _FORMATS = {
     'ros2msg': MessageDefinitionFormat.MSG, 'ros2idl': MessageDefinitionFormat.IDL
 }  # fmt: skip
@@ -57,13 +61,25 @@ class BagRecovery:
         self._files = [path]
         self.damage = ''
         if path.is_dir():
-            self._files = sorted(f for f in path.iterdir() if f.suffix in ('.mcap', '.db3'))
+            files = [f for f in path.iterdir() if f.suffix in ('.mcap', '.db3')]
+            self._files = sorted(files, key=lambda f: (len(f.name), f.name))  # _2 before _10
             if not (path / 'metadata.yaml').exists():
                 self.damage = 'has no metadata.yaml'
         self.connections: list[Connection] = []
         self._counts: Counter[int] = Counter()
-        self.start_time, self.end_time = 2**63 - 1, 0
-        for found in self._scan():
+        self._starts = [2**63 - 1] * len(self._files)  # [ns]
+        self._unsorted: set[int] = set()  # files, by number
+        self.end_time = 0
+        for number in range(len(self._files)):
+            self._survey(number)
+        self.start_time = min(self._starts, default=2**63 - 1)
+        if not self._counts:
+            raise ValueError(self.damage or 'it holds no messages')
+
+    def _survey(self, number: int) -> None:
+        """Note what a file holds."""
+        last = 0
+        for found in self._scan(number):
             if isinstance(found, Connection):
                 self.connections.append(found)
             elif isinstance(found, str):
@@ -71,10 +87,11 @@ class BagRecovery:
             else:
                 connection, time, _ = found
                 self._counts[connection] += 1
-                self.start_time = min(self.start_time, time)
+                self._starts[number] = min(self._starts[number], time)
                 self.end_time = max(self.end_time, time + 1)
-        if not self._counts:
-            raise ValueError(self.damage or 'it holds no messages')
+                if time < last:
+                    self._unsorted.add(number)
+                last = time
 
     def open(self) -> None:
         """Nothing is left to do."""
@@ -95,27 +112,47 @@ class BagRecovery:
     def messages(
         self, connections: Collection[Connection]
     ) -> Iterator[tuple[Connection, int, bytes]]:
-        """(connection, log time [ns], raw) in the order of the file."""
+        """(connection, log time [ns], raw) in the order of log time."""
         wanted = {c.id: c for c in connections}
-        for found in self._scan():
-            if isinstance(found, str | Connection) or found[0] not in wanted:
-                continue
-            yield wanted[found[0]], found[1], found[2]
+        parts = [self._part(number, wanted) for number in range(len(self._files))]
+        for connection, time, raw in heapq.merge(*parts, key=lambda m: m[1]):
+            if connection in wanted:
+                yield wanted[connection], time, raw
 
-    def _scan(self) -> Iterator[Found]:
-        for number, file in enumerate(self._files):
-            with file.open('rb') as source:
-                magic = source.read(len(SQLITE))
-            # ids are unique over several files
-            first = number * 100_000
-            if magic.startswith(MCAP):
-                yield from _from_file(file, len(MCAP), partial(_mcap, first=first, owner=self))
-            elif magic.startswith(ROSBAG1):
-                yield from _from_file(file, len(ROSBAG1), partial(_rosbag1, owner=self))
-            elif magic == SQLITE:
-                yield from _sqlite(file, first, self)
-            else:
-                yield f'{file.name} is no bag'
+    def _part(self, number: int, wanted: Collection[int]) -> Iterator[Message]:
+        """The messages of one file by log time, behind an empty one that holds its place."""
+        yield -1, self._starts[number], b''  # so that a file is opened when it is its turn
+        found = (f for f in self._scan(number) if not isinstance(f, str | Connection))
+        messages = (m for m in found if m[0] in wanted)
+        yield from _sorted(messages) if number in self._unsorted else messages
+
+    def _scan(self, number: int) -> Iterator[Found]:
+        file = self._files[number]
+        with file.open('rb') as source:
+            magic = source.read(len(SQLITE))
+        first = number * 100_000  # ids are unique over several files
+        if magic.startswith(MCAP):
+            yield from _from_file(file, len(MCAP), partial(_mcap, first=first, owner=self))
+        elif magic.startswith(ROSBAG1):
+            yield from _from_file(file, len(ROSBAG1), partial(_rosbag1, owner=self))
+        elif magic == SQLITE:
+            with _with_wal(file) as whole:
+                yield from _sqlite(whole, first, self)
+        else:
+            yield f'{file.name} is no bag'
+
+
+def _sorted(messages: Iterator[Message]) -> Iterator[Message]:
+    """By log time; a temporary file holds them, which may be larger than the memory."""
+    index: list[tuple[int, int, int, int]] = []
+    with TemporaryFile() as spool:
+        at = 0
+        for connection, time, raw in messages:
+            index.append((time, at, len(raw), connection))
+            at += spool.write(raw)
+        for time, start, size, connection in sorted(index):
+            spool.seek(start)
+            yield connection, time, spool.read(size)
 
 
 def _from_file(
@@ -257,6 +294,27 @@ def _connection(number: int, header: Header, about: Header, owner: Any) -> Conne
 
 
 # --- SQLite --------------------------------------------------------------------------------
+
+
+def has_wal(file: Path) -> bool:
+    """Whether a ``-wal`` beside it holds the newest part: its recorder was killed."""
+    wal = Path(f'{file}-wal')
+    return wal.is_file() and wal.stat().st_size > 0
+
+
+@contextlib.contextmanager
+def _with_wal(file: Path) -> Iterator[Path]:
+    """The file, or a temporary copy into which SQLite has taken its ``-wal``."""
+    if not has_wal(file):
+        yield file
+        return
+    with TemporaryDirectory() as folder:
+        copy = Path(folder, file.name)
+        shutil.copyfile(file, copy)
+        shutil.copyfile(f'{file}-wal', f'{copy}-wal')
+        with contextlib.suppress(apsw.Error), closing(apsw.Connection(str(copy))) as base:
+            base.execute('PRAGMA wal_checkpoint(TRUNCATE)').fetchall()
+        yield copy
 
 
 def _pages(file: Path) -> tuple[int, int]:

@@ -15,6 +15,8 @@ from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.codecs.message_types import rclpy_class
 
 DEPTH = 1000  # a subscriber that pauses gets all the same what it missed
+# of what the player keeps for late subscribers: maps are large; several nodes publish /tf_static
+LATCHED, STATIC = 10, 100
 
 
 class Playback:
@@ -35,6 +37,7 @@ class Playback:
             elif topic.name != '/clock':
                 qos = QoSProfile(depth=DEPTH)
                 if bag.is_latched(topic.name):
+                    qos.depth = STATIC if topic.name.endswith('tf_static') else LATCHED
                     qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
                 self._publishers[topic.name] = node.create_publisher(kind, topic.name, qos)
         if not self._publishers:

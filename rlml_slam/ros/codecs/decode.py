@@ -121,17 +121,19 @@ def size(msg: Any) -> int:
 def scan(msg: Any, topic: str = 'scan') -> Scan:
     """LaserScan; ranges are passed on as they are, NaN and Inf included.
 
-    A range_max of Inf says that the driver does not know it, not that Inf is a range; a range_min
-    below 0 makes no range of what is below 0.
+    A range_max of Inf, or one that leaves no range at all, as 0 does, says that the driver does
+    not know it, not that Inf is a range; a range_min below 0 makes no range of what is below 0.
+    Intensities of which there are not as many as ranges are left out.
     """
     ranges = np.array(msg.ranges, dtype=np.float32)
     intensities = np.array(msg.intensities, dtype=np.float32)
-    if intensities.size and intensities.shape != ranges.shape:
-        raise InputError(f'{topic}: {len(intensities)} intensities for {len(ranges)} ranges')
+    if intensities.shape != ranges.shape:  # nobody knows which beams they are of
+        intensities = intensities[:0]
+    least, most = max(float(msg.range_min), 0.0), min(float(msg.range_max), FARTHEST)
     return Scan(
         stamp(msg, topic), frame(msg.header.frame_id), float(msg.angle_min),
-        float(msg.angle_increment), float(msg.time_increment), max(float(msg.range_min), 0.0),
-        min(float(msg.range_max), FARTHEST), ranges, intensities,
+        float(msg.angle_increment), float(msg.time_increment), least,
+        FARTHEST if most <= least else most, ranges, intensities,
     )  # fmt: skip
 
 

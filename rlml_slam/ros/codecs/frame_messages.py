@@ -148,12 +148,12 @@ class FrameAssembler:
 
     def add_points(self, time: int, points: Array) -> list[SessionFrame]:
         """End points of a scan."""
-        self._points[time] = points
+        _put(self._points, time, points)
         return self._complete()
 
     def add_associated(self, associated: Associated) -> list[SessionFrame]:
         """Detections with their landmarks."""
-        self._associated[associated.detections.stamp] = associated
+        _put(self._associated, associated.detections.stamp, associated)
         return self._complete()
 
     def add_record(self, record: Record) -> list[SessionFrame]:
@@ -183,6 +183,13 @@ class FrameAssembler:
         for of in parts:
             for old in [t for t in of if t <= time]:
                 del of[old]
+
+
+def _put(parts: dict[int, Any], time: int, part: Any) -> None:
+    """Keep a part; the oldest goes where no record comes for them."""
+    parts[time] = part
+    if len(parts) > 2 * MAX_BEHIND:
+        del parts[next(iter(parts))]
 
 
 def _whole(frame: Frame, points: Array | None, seen: Associated | None) -> Frame:

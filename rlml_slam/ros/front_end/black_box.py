@@ -67,7 +67,7 @@ class BlackBox:
         self, node: Any, params: Parameters, map_id: Callable[[], str] = lambda: ''
     ) -> None:
         self._map_id = map_id
-        self._p, self._logger = params, node.get_logger()
+        self._node, self._p, self._logger = node, params, node.get_logger()
         self._i = params.incident
         self._folder = Path(params.node.map_directory).absolute() / FOLDER
         self._received: deque[Received] = deque()
@@ -88,7 +88,7 @@ class BlackBox:
 
     def tap(self, topic: str, kind: type[Any], data: bytes) -> None:
         """A message of a sensor, as it came."""
-        if not self._i.record or '/rlml/' in topic:  # what the ends say to each other
+        if not self._i.record:
             return
         package = kind.__module__.partition('.')[0]
         name = f'{package}/msg/{kind.__name__}'
@@ -154,6 +154,12 @@ class BlackBox:
 
     def on_request(self, _request: Any, response: Any) -> Any:
         """Write what there is, for a user."""
+        why = '' if self._i.record else 'incident.record is false'
+        if not self._node.is_active:  # nothing comes, and no timer runs that would write it
+            why = 'the node is not active'
+        if why:
+            response.success, response.message = False, f'nothing is written: {why}'
+            return response
         if self._pending is None:
             self._begin('asked', '', time.monotonic())
         assert self._pending is not None

@@ -56,6 +56,9 @@ class DetectorHealth:
         figures = [f'{what} {n}' for what, n in self.counts.items() if n]
         return '; '.join(['ends', *figures])
 
+    def end(self) -> None:
+        """Nothing to take back: its health is on /diagnostics alone, which keep nothing."""
+
     def publish(self) -> None:
         """Send the status."""
         figures: dict[str, object] = dict(self.counts)

@@ -102,10 +102,12 @@ class ReflectorCalibration:
 
     def add(self, scan: Scan, T_odom_laser: Array | None = None) -> None:
         """One scan with intensities, from a pose (3,) in odom; now and then a new estimate."""
+        step = abs(float(scan.angle_increment))
+        if not step > 0.0:  # also true for NaN
+            return
         self.num_scans += 1
         ranges, bright = valid_beams(scan)
         self._noise.append(range_noise(ranges))
-        step = abs(float(scan.angle_increment))
         surface = opened(ranges, bright, step, is_circular(scan), WIDEST)
         octaves = octave_of(ranges)
         seen = octaves >= 0

@@ -11,9 +11,11 @@ from dataclasses import dataclass, field
 class InputCounts:
     """Inputs by stream: used, late, duplicate, future, invalid, waited_out.
 
-    Of the used ones, ``no_returns`` are scans without a valid beam, and ``robot_parts`` those of
-    which beams were left out that see the robot itself. Not used are ``repeated`` ones, old
-    scans of a robot that has moved since, and those ``in_gap``, after a gap and before odometry.
+    Of the used ones, ``no_returns`` are scans without a valid beam, ``robot_parts`` those of
+    which beams were left out that see the robot itself, and ``sweep_time`` those of which the time
+    per ray cannot be. Not used are ``repeated`` ones, old scans of a robot that has moved since,
+    those ``in_gap``, after a gap and before odometry, and turn rates where the gyro
+    ``contradicts`` odometry.
     """
 
     counts: dict[str, Counter[str]] = field(default_factory=dict)

@@ -19,9 +19,9 @@ import numpy as np
 from rlml_slam.motion import SECOND, MotionBuffer
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
-from rlml_slam.sensing.deskew import sweep_time
 from rlml_slam.sensing.no_return import NoReturnRanges
 from rlml_slam.sensing.reflectors.scan_reflectors import ScanReflectors
+from rlml_slam.sensing.synchronization.gyro_check import GyroCheck
 from rlml_slam.sensing.synchronization.input_counts import InputCounts
 from rlml_slam.sensing.synchronization.observation_assembly import ObservationAssembly
 from rlml_slam.sensing.synchronization.odometry_delay import OdometryDelay
@@ -29,6 +29,7 @@ from rlml_slam.sensing.synchronization.odometry_sources import TF, TOPIC, Odomet
 from rlml_slam.sensing.synchronization.sensor_kinds import SensorKinds
 from rlml_slam.sensing.synchronization.stamp_check import CONFIRM, StampCheck
 from rlml_slam.sensing.synchronization.stamp_jitter import StampJitter
+from rlml_slam.sensing.synchronization.sweep_check import SweepCheck
 from rlml_slam.sensing.synchronization.waiting_queue import WaitingQueue
 from rlml_slam.types import Detections, Frame, Imu, Observation, Odometry, Scan, Status
 
@@ -36,7 +37,6 @@ MEASURED = ('scan', 'reflectors')  # streams that give observations
 LARGEST_VIEW = 2.2 * math.pi  # [rad] some drivers repeat beams at the end of a turn
 FINEST = 1e-5  # [rad] between beams: the finest lidars have twenty times that
 WAITED = 0.75  # share of ``odom_timeout`` by which odometry is corrected at most
-MAX_SWEEP = 1.0  # [s] of one scan; all later inputs would wait for the odometry at its end
 
 
 class Synchronizer:
@@ -56,10 +56,12 @@ class Synchronizer:
         n = self._node
         self.odometry = OdometrySources(n.odom_source, n.tf_buffer_duration)
         self.delay = OdometryDelay()
+        self.gyro = GyroCheck()
         # scans would wait for later odometry in vain
         self._longest_delay = int(WAITED * self._node.odom_timeout * SECOND)
         self._assembly = ObservationAssembly(params, self.inputs, self.odometry.transforms)
         self._no_returns = NoReturnRanges()
+        self._sweeps = SweepCheck(self.inputs)
         self._kinds = {stream: SensorKinds() for stream in MEASURED}
         self._add: dict[str, Callable[[Any], list[Observation]]] = {
             TOPIC: self.add_odometry,
@@ -116,8 +118,12 @@ class Synchronizer:
         if self.buffer.add_odometry(sample):
             self.inputs.count(TOPIC, 'used')
             self.delay.add_odometry(stamp, sample.pose[2])
+            self.gyro.add_odometry(stamp, sample.pose[2])
+            if self.gyro.fault:
+                self.buffer.forget_imu_after(0)
         else:
             self.inputs.count(TOPIC, 'jump')
+            self.gyro.restart()
         if not len(self._queue):
             self._assembly.carry(stamp)
         return self._release()
@@ -130,22 +136,29 @@ class Synchronizer:
             return self._release()
         stamp = self._jitter.filtered('imu', sample.stamp)
         sample = sample if stamp == sample.stamp else Imu(stamp, sample.yaw_rate)
+        if math.isfinite(sample.yaw_rate):
+            self.gyro.add_imu(sample)
         possible = abs(sample.yaw_rate) <= self._fastest_turn
-        if self._accept('imu', stamp, possible, f'no robot turns at {sample.yaw_rate:g} rad/s'):
-            self.buffer.add_imu(sample)
-            self.inputs.count('imu', 'used')
+        why = f'no robot turns at {sample.yaw_rate:g} rad/s (is it in degrees per second?)'
+        if self._accept('imu', stamp, possible, why):
+            if self.gyro.fault:
+                self.inputs.count('imu', 'contradicts', self.gyro.error)
+            else:
+                self.buffer.add_imu(sample)
+                self.inputs.count('imu', 'used')
         return self._release()
 
     def add_scan(self, scan: Scan) -> list[Observation]:
         """Add one sweep; without ``use_scan`` only its stamp is used."""
         if self._stamps.holds('scan', scan):
             return self._release()
-        error = _invalid_geometry(scan)
+        error = invalid_geometry(scan)
         if error:
             self.inputs.count('scan', 'invalid', f'scan at {scan.stamp} ns: {error}')
         elif self._is_of_sensor(
             'scan', scan, scan.angle_min, scan.angle_increment, scan.time_increment
         ) and self._accept('scan', scan.stamp, source=scan.frame_id):
+            scan = self._sweeps.possible(scan)
             self._queue.note_lidar(scan)
             self._wait('scan', self._no_returns.left_out(scan))
         return self._release()
@@ -171,6 +184,8 @@ class Synchronizer:
         A pose that neither scan nor reflectors corrected is that of the odometry itself.
         """
         is_measured = frame.scan_used or (frame.statuses == Status.USED).any()
+        if is_measured:
+            self.gyro.add_pose(frame.T_local_base[2])
         if not self._node.estimate_odometry_delay or not is_measured:
             return
         before = self.delay.now
@@ -272,7 +287,7 @@ class Synchronizer:
         return out
 
 
-def _invalid_geometry(scan: Scan) -> str:
+def invalid_geometry(scan: Scan) -> str:
     """Why a scan cannot be used, empty if it can."""
     n = len(scan.ranges)
     geometry = (
@@ -287,9 +302,4 @@ def _invalid_geometry(scan: Scan) -> str:
         return f'angle_increment {scan.angle_increment:g} rad times {n} beams is no field of view'
     if abs(scan.angle_min) > LARGEST_VIEW:
         return f'angle_min is {scan.angle_min:g} rad, more than a turn'
-    if not 0.0 <= sweep_time(scan) <= MAX_SWEEP:
-        return (
-            f'time_increment {scan.time_increment:g} s times {n} beams is no sweep of '
-            f'0 to {MAX_SWEEP} s'
-        )
     return ''

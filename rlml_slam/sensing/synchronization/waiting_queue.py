@@ -44,7 +44,7 @@ class WaitingQueue:
         self._stamps = stamps
         self._inputs = inputs
         self._timeout = int(params.node.odom_timeout * SECOND)
-        self._longest_pause = int(params.health.input_timeout * SECOND)
+        self._health = params.health
         self._max_gap = int(params.motion.max_gap * SECOND)
         self._released = -(2**62)  # stamp of the last group
         self._items: list[Waiting] = []
@@ -124,7 +124,7 @@ class WaitingQueue:
         if not is_after_gap and (self._lidars or any(w.stream == 'scan' for w in group)):
             return False
         begin = group[0].stamp if is_after_gap else newest
-        return self._stamps.newest - begin <= self._longest_pause
+        return self._stamps.newest - begin <= int(self._health.input_timeout * SECOND)
 
     def _waits_for_odometry(self, end: int, newest: int | None) -> bool:
         """Whether odometry at ``end`` is still expected; none is, if none came in a second."""

@@ -120,10 +120,12 @@ class FrontEnd:
         # an unmatched detection with an id is no contradiction here: the back end resolves it
         resolved = matches.num_unmatched_ids(observation.detections)
         fits = scan.used and scan.open_direction is None and not self._map.grid_match.refutes
-        contradicted = self.kidnapping.check(
-            observation.stamp, scan.misfit, fits,
-            len(matches.status) - resolved, matches.num_used, bool(self.tracks.surveyed.any()),
-        )  # fmt: skip
+        contradicted = self.kidnapping.since is not None
+        if scan.has_scan or len(matches.status):  # a sensor that sees nothing changes nothing
+            contradicted = self.kidnapping.check(
+                observation.stamp, scan.misfit, fits, len(matches.status) - resolved,
+                matches.num_used, bool(self.tracks.surveyed.any()),
+            )  # fmt: skip
         self._carried.follow(observation, scan, self.kidnapping.since)
         patience = self._p.health.new_session_time
         if self._map.saved is None and self.kidnapping.has_lasted(observation.stamp, patience):

@@ -3,8 +3,9 @@
 
 A file of containers (:mod:`rlml_slam.maps.map_container`), one appended after the other, each with
 its checksums: first the parameters and the map that is continued, if there is one, then pieces of
-frames. A process that was killed loses at most the piece that it had not written; from the others
-``recover`` makes the same map again, to the last bit.
+frames, and between them the numbers of loop closures that were revoked. A process that was killed
+loses at most the piece that it had not written; from the others ``recover`` makes the same map
+again, to the last bit.
 """
 
 from __future__ import annotations
@@ -57,6 +58,7 @@ class Journal:
         }  # fmt: skip
         self._head: Content | None = Content({} if base is None else base.arrays, description)
         self._frames: list[Given] = []
+        self._pieces: list[Content] = []  # what came before the frames
 
     def add(self, frame: Frame, is_keyframe: bool, found: FoundPose | None = None) -> None:
         """A frame that the graph was given; only keyframes need their scans."""
@@ -65,11 +67,21 @@ class Journal:
             observation = dataclasses.replace(observation, points=None)
         self._frames.append((dataclasses.replace(frame, observation=observation), found))
 
+    def revoke(self, number: int) -> None:
+        """A loop closure that the graph has revoked."""
+        if self._frames:
+            self._pieces.append(_piece(self._frames))
+            self._frames.clear()
+        self._pieces.append(Content({}, {'format': FORMAT, 'revoked': number}))
+
     def write(self, file: IO[bytes]) -> None:
         """Append what has come since the last call, and have it on the disk."""
         if self._head is not None:
             file.writelines(pack(self._head))
             self._head = None
+        for piece in self._pieces:
+            file.writelines(pack(piece))
+        self._pieces.clear()
         if self._frames:
             file.writelines(pack(_piece(self._frames)))
             self._frames.clear()
@@ -132,6 +144,12 @@ def frames_of(piece: Content) -> Iterator[Given]:
         ), found  # fmt: skip
 
 
+def has_base(path: Path) -> bool:
+    """Whether the map of a journal continues a saved one. Raises MapError if it is not there."""
+    head = next(read_pieces(path), None)
+    return head is not None and head.description.get('base') is not None
+
+
 def recover(
     path: Path, survey: Survey | None = None, check: Callable[[], None] = lambda: None
 ) -> tuple[BackEnd, Parameters]:
@@ -153,6 +171,9 @@ def recover(
         map_file.restore(Content(head.arrays, base), back_end)
     for piece in pieces:
         with map_file.consistent():
+            if 'revoked' in piece.description:
+                back_end.revoke(int(piece.description['revoked']))
+                continue
             for frame, found in frames_of(piece):
                 check()
                 back_end.add(frame, found)

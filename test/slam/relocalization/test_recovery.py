@@ -1,19 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """How often a lost robot is looked for in the map."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from made_worlds import ROOM, drive, observations
 
+from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Parameters
-from rlml_slam.slam.conversation import Relocate, SessionFrame
+from rlml_slam.slam.conversation import ANY, Relocate, SessionFrame, StartSession
+from rlml_slam.slam.front_end.front_end import FrontEnd
+from rlml_slam.slam.mapped_frames import MappedFrames
 from rlml_slam.slam.relocalization.recovery import Recovery
 from rlml_slam.slam.relocalization.scan_relocalization import Relocation
+from rlml_slam.slam.requests import Requests
 from rlml_slam.slam.search_area import search_area
 from rlml_slam.slam.searches import Purpose
 from rlml_slam.slam.system import System
-from rlml_slam.types import Health, Level, Status, Verdict
+from rlml_slam.types import Health, Level, Reflectors, Status, Verdict
 
 SECOND = 1_000_000_000
 UNSURE = np.eye(3)  # within metres
@@ -103,3 +109,41 @@ def test_robot_that_the_graph_cannot_find_jumps_to_where_it_was_found(changes, p
     out = system.on_search_result(command.number, found)
     assert any(isinstance(c, Relocate) for c in out)
     assert system.frames.found is None
+
+
+def test_robot_that_localizes_is_searched_while_mapping_is_paused():
+    none = Reflectors(
+        *(np.zeros(shape) for shape in (0, (0, 2), (0, 2, 2))), *(np.zeros(0) for _ in range(3))
+    )
+    for known, searched in ((None, False), (SavedMap(none), True)):
+        system, asked = System(Parameters()), []
+        system.map = known
+        system.pause(True)
+        system._recover = lambda record, asked=asked: asked.append(record) or []
+        system._restore = lambda record: []
+        system.mode = 0
+        system.on_frame(SessionFrame(1, drove_unseen()))
+        assert bool(asked) is searched
+
+
+def test_session_that_the_front_end_had_left_is_not_waited_for():
+    """A search ended after a reset: the front end ignores where the one before was found."""
+    requests = Requests()
+    begin = np.zeros(3), np.eye(3)
+    reset = requests.ask(StartSession(requests.new_number(), ANY, SECOND, *begin))
+    late = requests.ask(StartSession(requests.new_number(), 1, SECOND, *begin))
+    assert not requests.is_superseded(SessionFrame(1, drove_unseen(), 0))
+    assert requests.pending is late
+    assert not requests.is_superseded(SessionFrame(2, drove_unseen(), reset.number))
+    assert requests.pending is None
+
+
+@pytest.mark.parametrize('paused', [False, True])
+def test_jump_while_mapping_is_paused_is_one_afterwards(paused):
+    frames = MappedFrames()
+    front_end, mapped = FrontEnd(Parameters()), []
+    for k, observation in enumerate(observations(ROOM, drive((0.5, 0.0, 1.0))[:6])):
+        frames.is_paused = paused and 1 <= k <= 3
+        frame = replace(front_end.process(observation), jumped=k == 2)
+        mapped += frames.add(SessionFrame(1, frame))
+    assert [c.frame.jumped for c in mapped].count(True) == 1

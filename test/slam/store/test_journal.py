@@ -12,10 +12,11 @@ from rlml_slam.maps import map_container
 from rlml_slam.maps.map_container import SIZE, Content
 from rlml_slam.params import Parameters
 from rlml_slam.slam.back_end.back_end import BackEnd
+from rlml_slam.slam.closures.loop_closure import State
 from rlml_slam.slam.front_end.front_end import FrontEnd
 from rlml_slam.slam.keyframes import FoundPose
 from rlml_slam.slam.store import map_file
-from rlml_slam.slam.store.journal import Journal, recover
+from rlml_slam.slam.store.journal import Journal, has_base, recover
 
 PARAMS = Parameters()
 DRIVE = drive((0.6, 0.0, 3.0), (0.6, 0.6, 4.0), (0.5, -0.7, 2.0))
@@ -87,6 +88,45 @@ def test_continued_map_is_recovered_with_what_it_was_made_of(frames, tmp_path):
     write(tmp_path / 'journal', frames, second, base)
     saved.unlink()
     same(second, recover(tmp_path / 'journal')[0])
+
+
+def test_revoked_closure_stays_revoked(tmp_path):
+    """Frames, a revocation and frames again: in one piece of the journal, and in three."""
+    laps = drive((0.6, 0.6, 10.5), (0.6, 0.6, 10.5), (0.6, 0.6, 3.0))
+    front_end, back_end = FrontEnd(PARAMS), BackEnd(PARAMS)
+    journals = Journal(PARAMS), Journal(PARAMS)
+    number = None
+    with (tmp_path / 'a').open('wb') as a, (tmp_path / 'b').open('wb') as b:
+        for o in observations(ROOM, laps, rng=np.random.default_rng(1)):
+            frame = front_end.process(o)
+            update = back_end.add(frame)
+            accepted = back_end.loop_closer.records.accepted()
+            for journal in journals:
+                journal.add(frame, update is not None)
+            if number is None and len(accepted) > 1:
+                number = accepted[0].number
+                back_end.revoke(number)
+                journals[1].write(b)
+                for journal in journals:
+                    journal.revoke(number)
+                journals[1].write(b)
+        journals[0].write(a)
+        journals[1].write(b)
+    assert number is not None
+    for name in 'ab':
+        again, _ = recover(tmp_path / name)
+        same(back_end, again)
+        assert again.loop_closer.records.accepted()[0].status.state is State.REVOKED
+
+
+def test_journal_knows_whether_it_continues_a_map(frames, tmp_path):
+    back_end = BackEnd(PARAMS)
+    write(tmp_path / 'first', frames[:30], back_end)
+    base = map_file.content_of(back_end, PARAMS, None)
+    write(tmp_path / 'second', frames[30:], back_end, base)
+    assert [has_base(tmp_path / name) for name in ('first', 'second')] == [False, True]
+    (tmp_path / 'other').write_bytes(b'x' * 200)
+    assert not has_base(tmp_path / 'other')
 
 
 def test_file_that_ends_anywhere_gives_all_whole_pieces(frames, tmp_path):
