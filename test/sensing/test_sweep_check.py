@@ -10,7 +10,7 @@ from rlml_slam.motion import SECOND
 from rlml_slam.params import Node, Parameters, SimulatorParameters
 from rlml_slam.sensing.deskew import sweep_time
 from rlml_slam.sensing.synchronization.input_counts import InputCounts
-from rlml_slam.sensing.synchronization.sweep_check import SweepCheck
+from rlml_slam.sensing.synchronization.sweep_check import LASERS, SweepCheck
 from rlml_slam.simulation.simulation import GroundTruth, Simulation
 from rlml_slam.simulation.world_file import load_world
 from rlml_slam.slam.offline.slam import Slam
@@ -109,3 +109,12 @@ def test_wrong_time_per_ray_costs_a_drive_little():
     right, wrong = (error_of_drive(messages, factor) for factor in (1.0, 5.0))
     assert right < 0.015
     assert wrong < right + 0.005
+
+
+def test_names_of_frames_cost_no_memory():
+    check = SweepCheck(InputCounts())
+    ranges = np.ones(N, np.float32)
+    for k in range(1000):
+        scan = Scan(SECOND * k, f'laser{k}', -2.0, 0.01, 0.0, 0.1, 20.0, ranges, ranges[:0])
+        assert check.possible(scan) is scan
+    assert len(check._stamps) == LASERS

@@ -19,6 +19,7 @@ WINDOW, ENOUGH = 21, 5  # stamps of a laser, and intervals before anything is sa
 # of the intervals, one that is longer than this share of them is the period: up to five scans of
 # one frame may come in one period, of several layers
 SHARE = 0.8
+LASERS = 100  # that are remembered
 LONGER = 1.1  # times the period, that a sweep may last: stamps jitter
 
 
@@ -44,6 +45,8 @@ class SweepCheck:
         """Time [s] between two scans of a laser, infinite as long as it is not known."""
         laser = scan.frame_id, round(scan.angle_min, 1)
         stamps = self._stamps.setdefault(laser, deque(maxlen=WINDOW))
+        if len(self._stamps) > LASERS:  # names in messages may be anything
+            del self._stamps[next(iter(self._stamps))]
         stamps.append(scan.stamp)
         steps = np.sort(np.abs(np.diff(stamps)))
         return float(steps[int(SHARE * len(steps))]) / SECOND if len(steps) >= ENOUGH else math.inf
