@@ -19,7 +19,7 @@ from rlml_slam.evaluation.metrics import metrics
 from rlml_slam.params import Laser, Simulator
 from rlml_slam.simulation.world_file import load_world
 
-ALSO_USED = ('waited_out', 'no_returns')  # counted beside `used`
+ALSO_USED = ('waited_out', 'no_returns', 'robot_parts', 'sweep_time')  # counted beside `used`
 START = 10.0  # [s] at least: a shorter run is not significant
 MOTION_HZ = 100.0  # of odometry and IMU: a scan waits for the odometry at its end
 

@@ -67,7 +67,8 @@ class HealthMonitor:
     def __init__(self, limits: HealthLimits) -> None:
         self._limits = limits
         self._odometry = NEVER
-        self._detected = self._reflectors_matched = NEVER
+        self._detected = self._reflectors_matched = self._updated = NEVER
+        self._num_detections, self._score = 0, 0.0  # the newest
         self._reflectors_seen = NEVER
         self._scanned = self._scan_matched = NEVER
         self._held_by_reflectors = NEVER
@@ -102,7 +103,8 @@ class HealthMonitor:
         if heading_sigma > self._limits.heading_sigma_degraded:
             reasons.append(f'heading sigma is {math.degrees(heading_sigma):.1f} deg')
         is_lost = step.is_lost or step.contradicted or self._is_adrift(stamp, step, sigma)
-        if is_lost or (misfit and (unmatched or not step.matched)):
+        alone = self._fails(self._updated, stamp)  # no reflector has matched for as long
+        if is_lost or (misfit and (unmatched or alone)):
             return Health(Level.LOST, tuple(reasons))
         return Health(Level.DEGRADED if reasons else Level.OK, tuple(reasons))
 
@@ -145,13 +147,15 @@ class HealthMonitor:
         # frames may be of the scan or of the reflectors alone: one without says nothing of them,
         # unless there are none any more
         if step.detections is not None:
-            self._detected = stamp
+            self._detected, self._num_detections = stamp, step.detections
+        if step.matched > 0:
+            self._updated = stamp
         if step.matched > 0 or step.detections == 0 or self._fails(self._detected, stamp):
             self._reflectors_matched = stamp
         if step.expected < FEW or 2 * step.seen > step.expected:
             self._reflectors_seen = stamp
         if step.scan.has_scan:
-            self._scanned = stamp
+            self._scanned, self._score = stamp, step.scan.score
         if step.scan.used or self._fails(self._scanned, stamp):
             self._scan_matched = stamp
         if step.scan.used and step.scan.open_direction is None:
@@ -169,11 +173,11 @@ class HealthMonitor:
         if self._fails(self._odometry, stamp):
             reasons.append('no odometry')
         if unmatched:
-            reasons.append(f'none of {step.detections} detected reflectors matches the map')
+            reasons.append(f'none of {self._num_detections} detected reflectors matches the map')
         if self._fails(self._reflectors_seen, stamp):
             reasons.append(f'only {step.seen} of {step.expected} expected reflectors detected')
         if misfit:
-            reasons.append(f'scan does not match the submap: score {step.scan.score:.2f}')
+            reasons.append(f'scan does not match the submap: score {self._score:.2f}')
         open_direction = step.scan.open_direction
         if self._fails(max(self._held_by_scan, self._held_by_reflectors), stamp):
             if open_direction is not None:

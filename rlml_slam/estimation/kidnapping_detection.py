@@ -29,6 +29,7 @@ class KidnappingDetection:
         self.usual = 0.0
         self._num_scores = 0
         self._last_match = -(2**62)  # stamp of the last frame whose reflectors agreed
+        self._checked = 0  # stamp of the last frame that said anything
         self.since: int | None = None
 
     def is_misfit(self, score: float, insertions: int) -> bool:
@@ -51,6 +52,7 @@ class KidnappingDetection:
         ``scan_is_complete``: the scan matches and observes every direction. ``matched`` of its
         ``detections`` match; in a ``surveyed`` map, new reflectors are not expected.
         """
+        self._checked = stamp
         agree = agree_with_map(detections, matched)
         if agree:
             self._last_match = stamp
@@ -63,6 +65,15 @@ class KidnappingDetection:
             self.since = stamp
         return contradicted
 
+    def holds(self, stamp: int) -> bool:
+        """Whether the map is contradicted at a frame in which no sensor sees anything.
+
+        It is as it was before, until nothing has been seen for ``input_timeout``.
+        """
+        if stamp - self._checked > self._limits.input_timeout * 1e9:
+            self.since = None
+        return self.since is not None
+
     def learn(self, score: float) -> None:
         """Add the score of a matched scan to the usual score."""
         self._num_scores += 1
@@ -70,7 +81,7 @@ class KidnappingDetection:
         self.usual += weight * (score - self.usual)
 
     def has_lasted(self, stamp: int, duration: float) -> bool:
-        """Whether every frame has contradicted the map for this long [s]."""
+        """Whether every frame that says anything has contradicted the map for this long [s]."""
         return self.since is not None and stamp - self.since >= duration * 1e9
 
 

@@ -40,11 +40,15 @@ def write_atomically(
 
 
 def set_aside(*paths: Path) -> None:
-    """Give files that are no longer true the name ``path.previous``. Raises MapError."""
+    """Name files that are no longer true ``path.previous``, or ``-2``; raises MapError."""
     for path in paths:
         try:
+            previous, k = path.with_name(path.name + PREVIOUS), 1
+            while path.exists() and previous.exists():
+                k += 1
+                previous = path.with_name(f'{path.name}{PREVIOUS}-{k}')
             if path.exists():
-                os.replace(path, path.with_name(path.name + PREVIOUS))
+                os.replace(path, previous)
         except OSError as e:
             raise MapError(f'{path}: cannot be set aside: {e.strerror or e}') from e
 

@@ -93,6 +93,7 @@ def _checked(where: str, row: Mapping[str, Any]) -> tuple[float, float, float, f
         raise ValueError(f'{where}: {e}') from e
     if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST):
         raise ValueError(f'{where}: the place is not finite, or beyond {FARTHEST:g} m')
+    diameter = diameter or math.nan  # 0: flat, or not known
     if not (math.isnan(diameter) or 0.0 < diameter < WIDEST):
         raise ValueError(f'{where}: a diameter of {diameter:g} m is not in (0, {WIDEST:g})')
     if abs(id_) >= 1 << 53:

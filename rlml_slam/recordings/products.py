@@ -22,7 +22,12 @@ from rlml_slam.slam.closures.closure_table import closure_table
 from rlml_slam.slam.offline.slam import Slam
 
 MANY = 0.4  # of a stream: with a clock of its own, one of two lidars has about half of the scans
-OF_USED = ('no_returns', 'robot_parts', 'waited_out')  # counted among the used ones as well
+OF_USED = (
+    'no_returns',
+    'robot_parts',
+    'sweep_time',
+    'waited_out',
+)  # counted among the used ones as well
 
 
 def survey_figures(back_end: BackEnd) -> dict[str, Any]:

@@ -43,7 +43,8 @@ def write_outputs(
         'reflector_states.csv': bool(run.reflector_states),
     }  # fmt: skip
     others = [folder / name for name, is_new in is_written.items() if not is_new]
-    set_aside(*(p for p in others if known is None or p.resolve() != known.resolve()))
+    is_used = known is not None and folder.resolve() in (known.resolve(), known.resolve().parent)
+    set_aside(*(p for p in others if not is_used or p.name != 'map.rlml'))
     write_tum(folder / 'trajectory.tum', run.trajectory)
     write_tum(folder / 'front_end.tum', run.frames.trajectory())
     write_atomically(folder / HEALTH, health_table(run.frames).encode())

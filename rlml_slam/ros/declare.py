@@ -76,7 +76,8 @@ def _warn_of_files(node: Any, of: type[Any]) -> None:
             try:
                 read_yaml(file, of)
             except FileFormatError as e:
-                node.get_logger().warning(f'{e}: this file has no effect here')
+                if 'no section for' in str(e):  # ROS may well read what is refused otherwise
+                    node.get_logger().warning(f'{e}: this file has no effect here')
 
 
 def _change(

@@ -106,8 +106,9 @@ def test_files_of_an_earlier_run_are_set_aside(tmp_path):
         (tmp_path / name).write_text('of another run')
     run = made_run()
     run.stored, run.closure_table = None, ''
-    write_outputs(run, tmp_path, report=False, known=tmp_path / 'map.rlml')
-    assert (tmp_path / 'map.rlml').exists()  # the run localized in it
+    for known in (tmp_path / 'map.rlml', tmp_path, tmp_path / 'map.yaml'):
+        write_outputs(run, tmp_path, report=False, known=known)
+        assert (tmp_path / 'map.rlml').exists()  # the run localized in it
     write_outputs(run, tmp_path, report=False)
     for name in others:
         assert not (tmp_path / name).exists()

@@ -441,3 +441,28 @@ def test_scans_that_ended_are_no_misfit():
             FIRST + k * STEP, HealthInputs(scan, True, 3, 3, 1e-4 * np.eye(3))
         )
         assert level.level is Level.OK
+
+
+def test_reflectors_that_match_between_scans_that_do_not_keep_the_robot():
+    """A crowd hides the walls from a lidar; the reflector device has stamps of its own."""
+    monitor, out = HealthMonitor(HealthLimits()), []
+    for k in range(60):
+        bad = ScanEvidence(has_scan=True, used=k < 5, misfit=k >= 5, score=0.6 if k < 5 else 0.1)
+        for step in (
+            HealthInputs(bad, True, None, 0, 1e-4 * np.eye(3)),
+            HealthInputs(ScanEvidence(), True, 4, 4, 1e-4 * np.eye(3)),
+        ):
+            stamp = FIRST + k * STEP + (step.detections is not None) * STEP // 2
+            out.append(monitor.evaluate(stamp, step))
+    assert Level.LOST not in [h.level for h in out]
+    assert all('score 0.10' in h.reasons[0] for h in out if h.reasons)
+    assert out[-1].level is Level.DEGRADED
+
+
+def test_contradiction_lapses_where_nothing_is_seen_any_more():
+    kidnapping = KidnappingDetection(HealthLimits())
+    assert kidnapping.check(FIRST, True, False, 0, 0, False)
+    assert kidnapping.holds(FIRST + STEP)
+    assert kidnapping.since == FIRST
+    assert not kidnapping.holds(FIRST + 20 * STEP)
+    assert kidnapping.since is None

@@ -90,7 +90,7 @@ def test_id_and_diameter_may_be_missing(tmp_path):
         ('a.csv', 'n,x,y\n1,1.5,2.5\n', 'more than one column of y'),
         ('a.csv', 'id,number,x,y\n1,2,3,4\n', 'more than one column of id'),
         *(('a.csv', f'x,y,diameter\n1,2,{d}\n', 'line 2: a diameter of .* m is not in')
-          for d in ('80', '-0.08', '0', 'inf')),
+          for d in ('80', '-0.08', 'inf')),
         ('a.imk', '7 1500 -2250 1 1 80000\n', 'line 1: a diameter of 80 m'),
         ('a.csv', 'x,y\n' + '1' * 200_000, 'field larger than'),
         ('a.json', '[3]', 'entry 1: not an object'),
@@ -156,3 +156,8 @@ def test_map_of_another_place_is_refused():
     a, b = rng.uniform(-15.0, 15.0, (2, 10, 2))
     with pytest.raises(MapError, match='not found in the survey'):
         map_survey.compare(mapped(a), Survey(np.arange(10), b, np.full(10, np.nan)))
+
+
+def test_diameter_of_zero_is_not_known(tmp_path):
+    (tmp_path / 'a.csv').write_text('x,y,diameter\n1,2,0\n3,4,0.08\n')
+    np.testing.assert_array_equal(survey.load(tmp_path / 'a.csv').diameters, [np.nan, 0.08])

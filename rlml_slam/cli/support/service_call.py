@@ -38,8 +38,10 @@ def asking(namespace: str | None = None) -> Iterator[Any]:
     from rclpy._rclpy_pybind11 import RCLError
     from rclpy.exceptions import NameValidationException
 
+    has_begun = False
     try:
         rclpy.init()
+        has_begun = True
         asker = rclpy.create_node('rlml_ask', namespace=namespace)
         try:
             yield asker
@@ -50,7 +52,7 @@ def asking(namespace: str | None = None) -> Iterator[Any]:
     except Exception as e:
         if isinstance(e, RCLError) and 'DOMAIN_ID' in str(e):
             raise InputError(f'ROS_DOMAIN_ID = {domain()!r} is no domain') from e
-        if rclpy.utilities.ok():
+        if not has_begun or rclpy.utilities.ok():
             raise
         raise KeyboardInterrupt from None
     finally:

@@ -120,7 +120,7 @@ class FrontEnd:
         # an unmatched detection with an id is no contradiction here: the back end resolves it
         resolved = matches.num_unmatched_ids(observation.detections)
         fits = scan.used and scan.open_direction is None and not self._map.grid_match.refutes
-        contradicted = self.kidnapping.since is not None
+        contradicted = self.kidnapping.holds(observation.stamp)
         if scan.has_scan or len(matches.status):  # a sensor that sees nothing changes nothing
             contradicted = self.kidnapping.check(
                 observation.stamp, scan.misfit, fits, len(matches.status) - resolved,
