@@ -14,6 +14,7 @@ from rlml_slam.params import HealthLimits
 MEMORY = 0.05  # weight of the newest score in the usual one
 SETTLED = 5  # scans in a submap, or scores known, before a low score counts
 RECENT = 0.5  # [s] reflectors matched within this time should still be in view
+LAPSE = 5.0  # [s] some scans of a laser of 1 Hz; nothing seen for longer ends a contradiction
 FEW = 2  # this many reflectors may match, or not match, by chance
 MIN_SHARE = 1.0 / 3.0  # of the detections that have to match; up to half of them are ghosts
 
@@ -68,9 +69,9 @@ class KidnappingDetection:
     def holds(self, stamp: int) -> bool:
         """Whether the map is contradicted at a frame in which no sensor sees anything.
 
-        It is as it was before, until nothing has been seen for ``input_timeout``.
+        It is as it was before, until nothing has been seen for LAPSE.
         """
-        if stamp - self._checked > self._limits.input_timeout * 1e9:
+        if stamp - self._checked > LAPSE * 1e9:
             self.since = None
         return self.since is not None
 

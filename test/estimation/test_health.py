@@ -464,5 +464,6 @@ def test_contradiction_lapses_where_nothing_is_seen_any_more():
     assert kidnapping.check(FIRST, True, False, 0, 0, False)
     assert kidnapping.holds(FIRST + STEP)
     assert kidnapping.since == FIRST
-    assert not kidnapping.holds(FIRST + 20 * STEP)
+    assert kidnapping.holds(FIRST + 40 * STEP)  # a slow laser misses some
+    assert not kidnapping.holds(FIRST + 60 * STEP)
     assert kidnapping.since is None
