@@ -50,7 +50,7 @@ def test_help_imports_no_command():
         ),
         (['check', '--seconds', '-1'], '-1 is not between 0.1 and 100000'),
         (['plan', 'room', '--out', 'p', '--clearance', '-1'], '-1 is not between 0 and 100'),
-        (['map', 'merge', 'a', 'b', '--out', 'c', '--jobs', '-3'], 'invalid choice: -3'),
+        (['map', 'merge', 'a', 'b', '--out', 'c', '--jobs', '-3'], '-3 is not between 0 and 256'),
     ],
 )
 def test_number_out_of_bounds_is_named(words, what, capsys):

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rlml_slam import warm_up
+from rlml_slam.cli.main import between
 from rlml_slam.cli.support.usage import usage
 from rlml_slam.errors import ClusterError
 from rlml_slam.maps import map_container, survey
@@ -41,11 +42,16 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--survey', metavar='FILE', type=Path, help='.csv, .json or SICK .imk')
     parser.add_argument('--config', metavar='YAML', type=Path, help='ROS parameter file')
     parser.add_argument(
-        '--jobs', metavar='N', type=int, choices=range(257), default=1,
+        '--jobs', metavar='N', type=number_of_jobs, default=1,
         help='worker processes, 0 for one per core; 1: this process (default)',
     )  # fmt: skip
     parser.add_argument('--cluster', metavar='tcp://HOST:PORT', help='scheduler of Dask')
     parser.add_argument('--json', action='store_true', help='print one JSON object and no more')
+
+
+def number_of_jobs(text: str) -> int:
+    """The ``type`` of --jobs."""
+    return int(between(0, 256)(text))
 
 
 def run(args: argparse.Namespace) -> int:
