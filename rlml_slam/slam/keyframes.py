@@ -24,9 +24,11 @@ SIGHTING_GATE = 9.2  # 99 % of a chi-square with 2 degrees of freedom
 class Keyframe:
     """Pose of the graph; ``points`` (n, 2) and ``origin`` (2,) are its scan in base, or None.
 
-    ``index`` changes when keyframes before it are removed; ``points`` may be replaced by a later
-    scan of the same place, taken at ``scan_stamp``. ``detector_ran`` near it, with or without
-    reflectors. ``jumped``: it follows a relocalization, and no motion leads to it.
+    ``index`` changes when keyframes before it are removed, ``number`` does not: both are in order,
+    which stamps are not where a clock was set back. ``points`` may be replaced by a later scan of
+    the same place; ``scan_stamp`` is that of the scan, and never before that of an earlier one.
+    ``detector_ran`` near it, with or without reflectors. ``jumped``: it follows a relocalization,
+    and no motion leads to it.
     """
 
     index: int
@@ -38,6 +40,10 @@ class Keyframe:
     scan_stamp: int
     detector_ran: bool = False
     jumped: bool = False
+    number: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.number = self.index
 
     def take_scan(self, other: Keyframe, T: Array) -> None:
         """Replace the scan by that of another keyframe at the relative pose ``T`` (3,)."""

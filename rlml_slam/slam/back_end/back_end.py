@@ -166,7 +166,7 @@ class BackEnd:
             information = relative_information(delta, cov)
             self.graph.add_edge(EdgeKind.ODOMETRY, index - 1, index, delta, information)
             self.delayed_association.move(delta, cov)
-        key = keyframe_of(index, frame, is_first=not self.keyframes)
+        key = keyframe_of(index, frame, self.keyframes[-1] if self.keyframes else None)
         self.keyframes.append(key)
         if frame.jumped:
             self.path_covariance.start(key)

@@ -63,15 +63,18 @@ def leaves_submap(last: Keyframe, frame: Frame, sigma: Array) -> bool:
     return bool((np.diag(grown) > (GATE * sigma) ** 2).any())
 
 
-def keyframe_of(index: int, frame: Frame, is_first: bool) -> Keyframe:
-    """Keyframe of a frame; without its scan, if that did not match in the front end."""
+def keyframe_of(index: int, frame: Frame, last: Keyframe | None) -> Keyframe:
+    """Keyframe of a frame after ``last``; without its scan, if the front end did not match it."""
     o = frame.observation
-    is_mapped = frame.scan_used or is_first
+    is_mapped = frame.scan_used or last is None
     points = o.points.astype(np.float32) if is_mapped and o.points is not None else None
-    return Keyframe(
+    key = Keyframe(
         index, frame.stamp, frame.T_local_base, frame.cov_local,
         points, o.origin if is_mapped else None, frame.stamp, jumped=frame.jumped,
     )  # fmt: skip
+    if last is not None:
+        key.number, key.scan_stamp = last.number + 1, max(frame.stamp, last.scan_stamp + 1)
+    return key
 
 
 def draw(poses: Array, keys: Sequence[Keyframe], resolution: float) -> OccupancyGrid | None:

@@ -39,17 +39,17 @@ class PathCovariance:
     """
 
     def __init__(self) -> None:
-        self._stamps: list[int] = []
+        self._numbers: list[int] = []
         self._known: list[ReferencePose] = []  # entries, in the axes of the local frame
-        self._starts: list[int] = []  # stamps of keyframes after a jump
+        self._starts: list[int] = []  # numbers of keyframes after a jump
         self._num_closures = 0  # closures below this number are included
 
     def cov(self, key: Keyframe) -> Array:
         """Covariance (3, 3) of a keyframe."""
-        k = bisect_right(self._stamps, key.stamp)
+        k = bisect_right(self._numbers, key.number)
         known = self._known[k - 1] if k else None
         _, cov = Correction(np.zeros(3), known).apply(key.T_local, key.cov_local)
-        if k < len(self._stamps) and self._stamps[k] not in self._starts:
+        if k < len(self._numbers) and self._numbers[k] not in self._starts:
             later = self._known[k]
             lever = later.pose[:2] - key.T_local[:2]
             growth = positive(later.cov_local - carried(key.cov_local, lever))
@@ -58,12 +58,12 @@ class PathCovariance:
 
     @property
     def newest(self) -> int:
-        """Stamp of the last entry, -1 before the first."""
-        return self._stamps[-1] if self._stamps else -1
+        """Number of the last entry, -1 before the first."""
+        return self._numbers[-1] if self._numbers else -1
 
     def start(self, key: Keyframe) -> None:
         """Start at a keyframe after a jump, with the covariance of its relocalization."""
-        self._starts.append(key.stamp)
+        self._starts.append(key.number)
         self._enter(key, se2.rotate_cov(key.cov_local, -key.T_local[2]))
 
     def add_closures(
@@ -80,8 +80,8 @@ class PathCovariance:
 
     def remove_closures(self) -> None:
         """Closures were disabled or enabled: the enabled ones have to be added again."""
-        at = [self._stamps.index(stamp) for stamp in self._starts]
-        self._stamps, self._known = list(self._starts), [self._known[k] for k in at]
+        at = [self._numbers.index(number) for number in self._starts]
+        self._numbers, self._known = list(self._starts), [self._known[k] for k in at]
         self._num_closures = 0
 
     def keep(self, keys: Sequence[Keyframe]) -> None:
@@ -89,26 +89,26 @@ class PathCovariance:
 
         For each of these the last entry up to it and the first one after it are kept.
         """
-        stamps = sorted(key.stamp for key in keys)
-        self._starts = [self._starts[k] for k in _ends(stamps, self._starts)]
-        starts = [self._stamps.index(stamp) for stamp in self._starts]
-        kept = sorted({*_ends(stamps, self._stamps), *starts})
-        self._stamps = [self._stamps[k] for k in kept]
+        numbers = [key.number for key in keys]
+        self._starts = [self._starts[k] for k in _ends(numbers, self._starts)]
+        starts = [self._numbers.index(number) for number in self._starts]
+        kept = sorted({*_ends(numbers, self._numbers), *starts})
+        self._numbers = [self._numbers[k] for k in kept]
         self._known = [self._known[k] for k in kept]
 
     def _enter(self, key: Keyframe, cov: Array) -> None:
         known = ReferencePose(key.T_local, key.cov_local, se2.rotate_cov(cov, key.T_local[2]))
-        k = bisect_right(self._stamps, key.stamp)
-        self._stamps.insert(k, key.stamp)
+        k = bisect_right(self._numbers, key.number)
+        self._numbers.insert(k, key.number)
         self._known.insert(k, known)
 
 
-def _ends(stamps: Sequence[int], entries: Sequence[int]) -> list[int]:
-    """Indices of the first and last of the ``entries`` between each two neighbouring ``stamps``.
+def _ends(numbers: Sequence[int], entries: Sequence[int]) -> list[int]:
+    """Indices of the first and last of the ``entries`` between each two neighbouring ``numbers``.
 
-    Both ascend; an entry at one of the ``stamps`` is before it.
+    Both ascend; an entry at one of the ``numbers`` is before it.
     """
-    gap = [bisect_left(stamps, entry) for entry in entries]
+    gap = [bisect_left(numbers, entry) for entry in entries]
     last = len(entries) - 1
     return [
         k for k, g in enumerate(gap) if k in (0, last) or g != gap[k - 1] or g != gap[k + 1]
@@ -160,7 +160,7 @@ def _is_constrained(
     """Whether reflectors that were mapped at the last closure constrain a keyframe."""
     if not graph.edges.enabled[closures.edges].any():
         return False
-    until = bisect_right(keys, covariance.newest, key=lambda k: k.stamp) - 1
+    until = bisect_right(keys, covariance.newest, key=lambda k: k.number) - 1
     return is_constrained_by_reflectors(graph.sightings, key.index, until)
 
 

@@ -34,13 +34,13 @@ def restore(
     """
     if survey is not None:
         back_end.use_survey_of_map(survey)
-    for key in keys:
-        if key.jumped:
-            back_end.path_covariance.start(key)
     last = keys[-1]
     T_map = back_end.graph.poses[last.index].copy()
     last.cov_local = se2.rotate_cov(last.cov_local, float(T_map[2] - last.T_local[2]))
     last.T_local = T_map
+    for key in keys:
+        if key.jumped:
+            back_end.path_covariance.start(key)
     back_end.keyframes = keys
     back_end.scan_graph.restore(arrays, keys)
     back_end.loop_closer.restore(arrays)

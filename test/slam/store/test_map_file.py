@@ -96,7 +96,20 @@ def test_a_jump_is_one_in_the_saved_map_as_well(saved):
     before, after = (again.path_covariance.cov(keys[k]) for k in (5, 6))
     assert_allclose(before, without.path_covariance.cov(keys[5]), atol=1e-15)
     assert_allclose(after, se2.rotate_cov(keys[6].cov_local, -keys[6].T_local[2]), atol=1e-12)
-    assert again.path_covariance.newest == keys[6].stamp
+    assert again.path_covariance.newest == keys[6].number
+
+
+def test_last_keyframe_is_known_by_its_jump_in_the_frame_of_the_map(saved):
+    content = map_file.load(saved)
+    jumped, local = (content.arrays[name].copy() for name in ('key_jumped', 'key_local'))
+    jumped[-1] = True
+    local[-1] = 20.0, -5.0, 1.0  # the frame of a session that began elsewhere
+    again = BackEnd(PARAMS)
+    arrays = {**content.arrays, 'key_jumped': jumped, 'key_local': local}
+    map_file.restore(Content(arrays, content.description), again)
+    last = again.keyframes[-1]
+    known = se2.rotate_cov(again.path_covariance.cov(last), last.T_local[2])
+    assert_allclose(known, last.cov_local, atol=1e-12)
 
 
 def test_saved_map_keeps_its_sightings_whatever_comes_after(saved):
