@@ -25,6 +25,8 @@ from rlml_slam.slam.keyframes import Keyframe
 from rlml_slam.types import EdgeKind, Frame
 
 COVERED = 0.8  # share of a submap's walls that a newer one must contain to replace it
+SAME_PLACE = 0.15  # [m] to the nearest wall of another submap, at which two walls are one
+CHANGED = 0.1  # share of walls up to which a submap shows what others show already
 
 
 class ScanGraph:
@@ -117,11 +119,22 @@ class ScanGraph:
             m.centre = m.centre + (T[:2] - m.centre) / m.size
 
     def _finish(self, new: KeyframeSubmap) -> None:
-        """Finish a submap; it replaces the older ones that it covers."""
+        """Finish a submap that shows something new; it replaces the older ones that it covers."""
         new.submap.complete()
         if self._p.back_end.keyframes_per_place:
+            if self._shows_the_same(new):
+                return
             self.finished = [m for m in self.finished if not self._is_covered(m, new)]
         self.finished.append(new)
+
+    def _shows_the_same(self, new: KeyframeSubmap) -> bool:
+        """Whether finished submaps have the walls of a new one, which would add its error."""
+        poses, left = self._graph.poses, new.walls
+        for m in self.finished:
+            T = se2.between(m.grid_pose(poses), new.grid_pose(poses))
+            gap, _ = m.wall_tree.query(se2.transform(T, left), distance_upper_bound=SAME_PLACE)
+            left = left[np.isinf(gap)]
+        return len(left) <= CHANGED * len(new.walls)
 
     def _is_covered(self, old: KeyframeSubmap, new: KeyframeSubmap) -> bool:
         """Whether the walls of one submap are known to another one."""

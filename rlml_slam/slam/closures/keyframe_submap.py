@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from rlml_slam import se2
 from rlml_slam.graph import relative_information
@@ -40,6 +41,11 @@ class KeyframeSubmap:
     def walls(self) -> Array:
         """Occupied cells (n, 2) of the finished submap."""
         return self.submap.walls()
+
+    @cached_property
+    def wall_tree(self) -> cKDTree:
+        """The walls, for a search of the nearest one."""
+        return cKDTree(self.walls)
 
     def grid_pose(self, poses: Array) -> Array:
         """Pose (3,) of the grid in the map, with the graph's ``poses`` (n, 3)."""

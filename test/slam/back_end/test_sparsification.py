@@ -208,6 +208,24 @@ def test_place_shows_its_newest_scans():
     assert grid.cells[i - 2 : i + 3, j - 4 : j + 5].max() >= 65
 
 
+def test_map_does_not_drift_with_the_laps():
+    """Copies of copies of the submaps would, by 3 mm a lap, and the graph knows nothing of it."""
+    laps = 15
+    path = drive(*ROUND * laps, start=START)
+    observed = observations(SQUARE, path, reflectors=False, rng=np.random.default_rng(5))
+    start = replace(Parameters().node, map_start_pose=START)
+    off = []
+    for k, back_end, update in driven(observed, Parameters(node=start)):
+        if update is not None and update.optimized and k > len(path) * 2 // 3:
+            pose, cov = back_end.graph.poses[-1], back_end.known.cov_map
+            e = se2.between(path[k], pose)
+            e[:2] = se2.rotation(path[k][2]) @ e[:2]
+            off.append((e @ np.linalg.solve(cov, e), np.hypot(*e[:2])))
+    nees, error = np.mean(off, axis=0)
+    assert error < 0.02
+    assert nees < 4.0  # 3 degrees of freedom
+
+
 def test_path_is_thinned_beyond_its_limit():
     path = FrameTrajectory(1000)
     for k in range(3000):
