@@ -65,8 +65,9 @@ class Sensors:
     Where the clock jumps back by more than the buffer holds, ``restart`` is called and a new
     sequencer begins. At the start, scans and detections wait, in order, until /tf_static has where
     one of their sensors is, but no longer than TF_PATIENCE: then a sensor without a transform is
-    taken to sit at ``laser_pose``, one for each topic. Later, a message in another frame without
-    transform is refused, and holds up nothing. Where all inputs fall silent, what still waits for
+    taken to sit at ``laser_pose``, one for each topic; where its transform comes after all, a map
+    begins again. Later, a message in another frame without transform is refused, and holds up
+    nothing. Where all inputs fall silent, what still waits for
     odometry is used as it is.
     """
 
@@ -86,6 +87,7 @@ class Sensors:
         self._restart = restart
         self._begin(Extrinsics())
         self._has_tf = self._waits = subscribe_static(node, self._feed.extrinsics)
+        self._assumed: set[str] = set()  # sensors that are taken to sit at laser_pose
         self._since: dict[str, int] = {}  # stamp at which a sensor without a transform appeared
         self._held: list[tuple[str, Any]] = []
         self._frames: defaultdict[str, set[str]] = defaultdict(set)  # of sensors, by stream
@@ -185,21 +187,11 @@ class Sensors:
                 if self._queues[k][0] != 'odom' or not self._feed.tf.path
             ]
             if missing:
-                self._logger.warning(f'waiting for {", ".join(missing)}{self._others()}')
+                kinds = {STREAMS[self._queues[k][0]][1]: self._queues[k][0] for k in self._missing}
+                known = {listener.topic_name for _, listener in self._queues}
+                others = _others(self._node, kinds, known)
+                self._logger.warning(f'waiting for {", ".join(missing)}{others}')
             self._missing = []
-
-    def _others(self) -> str:
-        """Other topics of the types that are missing, but for the node's own."""
-        own = f'{self._node.get_fully_qualified_name()}/'
-        kinds = {STREAMS[self._queues[k][0]][1]: self._queues[k][0] for k in self._missing}
-        known = {subscription.topic_name for _, subscription in self._queues}
-        found = [
-            f'{topic} ({kinds[t]})'
-            for topic, types in sorted(self._node.get_topic_names_and_types())
-            for t in types
-            if t in kinds and topic not in known and not topic.startswith(own)
-        ]
-        return f'; of these types there are {", ".join(found[:8])}' if found else ''
 
     def _tell_of_refused(self) -> None:
         """Say of each stream once why an input was not used; /diagnostics count all of them."""
@@ -270,6 +262,11 @@ class Sensors:
                 self._count_invalid(stream, f'{stream}: {why}')
                 return
             self._logger.warning(f'{why}: laser_pose is used: {list(self._p.node.laser_pose)}')
+            self._assumed.add(sensor)
+        if sensor in self._assumed and self._is_placed(msg):
+            self._assumed.discard(sensor)
+            if self._p.node.mode == 'mapping':  # a saved map shows by itself where the robot is
+                self._start_again(f'{stream}: the place of {sensor!r} is on /tf_static only now')
         if len(seen) < MAX_SENSORS:
             seen.add(sensor)
         self._use(stream, msg)
@@ -298,17 +295,32 @@ class Sensors:
         if use is REFUSED:
             self._count_invalid(stream, self._guard.last)
 
+    def _start_again(self, why: str) -> None:
+        self._logger.warning(f'{why}: the front end starts again')
+        self._begin(self.extrinsics)
+        self._restart()
+
     def _observe(self, add: Callable[[], list[Observation]]) -> None:
         try:
             observations = add()
         except InputError as e:
-            self._logger.warning(f'{e}: the front end starts again')
-            self._begin(self.extrinsics)
-            self._restart()
+            self._start_again(str(e))
             return
         self._tell_of_refused()
         for observation in observations:
             self._handle(observation)
+
+
+def _others(node: Any, kinds: dict[str, str], known: set[str]) -> str:
+    """Other topics of types (by which: their stream), but for the node's own, in words."""
+    own = f'{node.get_fully_qualified_name()}/'
+    found = [
+        f'{topic} ({kinds[t]})'
+        for topic, types in sorted(node.get_topic_names_and_types())
+        for t in types
+        if t in kinds and topic not in known and not topic.startswith(own)
+    ]
+    return f'; of these types there are {", ".join(found[:8])}' if found else ''
 
 
 def _place(msg: Any) -> str:

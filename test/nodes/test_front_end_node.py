@@ -475,6 +475,26 @@ def test_parameter_serves_where_nobody_tells_the_place_of_the_laser(live):
     np.testing.assert_allclose(node.last.observation.origin, [0.3, 0.1])
 
 
+def test_front_end_starts_again_where_the_place_of_the_laser_comes_late(live):
+    node = live.start(FrontEndNode)
+    node.sensors._has_tf = node.sensors._waits = True
+    messages = list(room(seconds=6.0))
+    place = encode.transform(make, SECOND, ('base_link', 'laser'), np.array([0.2, 0.0, 0.0]))
+    for stream, msg in messages[: len(messages) // 2]:
+        node.sensors.add(stream, msg)
+    before = node.control.session.session
+    np.testing.assert_allclose(node.last.observation.origin, [0.0, 0.0])
+    node.sensors.extrinsics.add(decode.transforms(place))
+    for stream, msg in messages[len(messages) // 2 :]:
+        node.sensors.add(stream, msg)
+    assert node.control.session.session != before
+    np.testing.assert_allclose(node.last.observation.origin, [0.2, 0.0], atol=1e-6)
+    sessions = node.control.session.session
+    for stream, msg in messages[-2:]:
+        node.sensors.add(stream, msg)
+    assert node.control.session.session == sessions  # once
+
+
 # --- parameters -----------------------------------------------------------------------------
 
 
