@@ -24,7 +24,7 @@ WAIT = 0.2  # [s] after which a signal is looked for where nothing comes
 
 
 class _Signals:
-    """SIGINT and SIGTERM: end the spinning, or what comes before it at once.
+    """SIGINT, SIGTERM, SIGHUP: end the spinning, or what comes before it at once.
 
     Those of rclpy take the topics away first, and whoever still publishes or logs fails.
     """
@@ -33,6 +33,8 @@ class _Signals:
         self.came = self.is_spinning = False
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._on_signal)
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup wants it
+            signal.signal(signal.SIGHUP, self._on_signal)
 
     def _on_signal(self, _number: int, _frame: object) -> None:
         self.came = True
@@ -43,7 +45,7 @@ class _Signals:
 def run(*factories: Callable[[], Any]) -> int:
     """Spin the nodes until they ask to end or a signal comes; the exit code.
 
-    A node ends the run by raising SystemExit in a callback. SIGINT and SIGTERM end it with 0.
+    A node ends the run by raising SystemExit in a callback. A signal ends it with 0.
     """
     try:
         code = answered(factories[0], sys.argv)

@@ -113,8 +113,8 @@ class Process:
             cwd=cwd, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         )  # fmt: skip
 
-    def interrupt(self):
-        self._process.send_signal(signal.SIGINT)
+    def interrupt(self, number=signal.SIGINT):
+        self._process.send_signal(number)
 
     def finish(self, timeout=30.0):
         """Exit code and all that was printed."""

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import signal
+
 import numpy as np
 import pytest
 from live import LATCHED, ROOM, ROOT
@@ -83,14 +85,15 @@ def test_processes_map_a_recording_and_stop_cleanly(live, start):
     assert np.hypot(*error[:2]) < 0.06
 
 
-def test_both_in_one_process_stop_cleanly(live, start):
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGHUP])  # a terminal that closes
+def test_both_in_one_process_stop_cleanly(live, start, number):
     live.listen('pose', POSE)
     both = start('slam')
     live.spin_until(lambda: live.ear.count_publishers('rlml/frames') == 1, timeout=60.0)
     live.spin_until(lambda: live.ear.count_publishers('graph') == 1, timeout=60.0)
     # frames pass from one to the other as they are
     assert live.ear.count_subscribers('rlml/frames') == 0
-    both.interrupt()
+    both.interrupt(number)
     assert ended(both)[0] == 0
 
 
