@@ -50,8 +50,8 @@ def declare(
     Raises ParameterError for a value that its field refuses. A name that no node of this package
     knows is warned about: one YAML file may serve them all.
     """
-    given = {name: p.value for name, p in node._parameter_overrides.items()}
     known = {d.name: d for d in declarations(of)}
+    given = {n: _word(known.get(n), p.value) for n, p in node._parameter_overrides.items()}
     parameters = from_mapping({n: v for n, v in given.items() if n in known}, of)
     everywhere = [d.name for other in NODES for d in declarations(other)]
     for name in sorted(given.keys() - set(everywhere)):
@@ -67,6 +67,12 @@ def declare(
         lambda given: _change(node, parameters, known, given, {} if checks is None else checks)
     )
     return parameters
+
+
+def _word(d: Declaration | None, value: Any) -> Any:
+    """The value as it was written: YAML takes on and off for booleans."""
+    is_word = d is not None and isinstance(value, bool) and 'on' in d.choices
+    return ('off', 'on')[value] if is_word else value
 
 
 def _warn_of_files(node: Any, of: type[Any]) -> None:
@@ -92,8 +98,8 @@ def _change(
     try:
         for p in given:
             d = known.get(p.name)
-            if d is None:
-                continue  # rclpy's own
+            if d is None or node.get_parameter(p.name).value == p.value:
+                continue  # rclpy's own, and what `ros2 param load` gives as it is
             group = getattr(parameters, d.group)
             before.append((group, d, getattr(group, d.field)))
             group.change(d.field, p.value, is_running)

@@ -77,6 +77,22 @@ def test_given_values_are_taken_and_whole_numbers_serve_as_fractions(make_node):
     assert parameters.node.map_start_pose == (1.0, 2.0, 3.0)
 
 
+@pytest.mark.parametrize('word', ['on', 'off'])
+def test_words_that_yaml_takes_for_booleans_are_words(make_node, word):
+    node = make_node(detect_reflectors=word == 'on')  # as rcl reads `-p detect_reflectors:=off`
+    assert declare(node).node.detect_reflectors == word
+    assert node.get_parameter('detect_reflectors').value == word
+
+
+def test_parameters_that_were_dumped_are_loaded(make_node):
+    node = make_node()
+    declare(node)
+    dumped = [node.get_parameter(d.name) for d in declarations(Parameters)]
+    assert all(result.successful for result in node.set_parameters(dumped))
+    other = Parameter('odom_frame', value='other')
+    assert not node.set_parameters_atomically([*dumped, other]).successful
+
+
 def test_wrong_value_is_reported_with_its_name_and_meaning(make_node):
     with pytest.raises(
         ParameterError, match=r"^mode = 'mopping' is not one of .*\(build a map, or"
