@@ -235,6 +235,15 @@ def test_localization_goes_on_after_a_front_end_was_configured_again(live, tmp_p
     live.spin_until(lambda: front.control.session.map is not None)
 
 
+def test_front_end_that_is_configured_again_knows_that_the_back_end_runs(live, start):
+    front = live.start(FrontEndNode)
+    start('back_end')
+    live.spin_until(lambda: front.control._absent is None)
+    for name in ('deactivate', 'cleanup', 'configure', 'activate'):
+        assert change(live, front, name)[0]
+    live.spin_until(lambda: front.control._absent is None, what='is back_end running?')
+
+
 @pytest.mark.parametrize('is_first', [True, False])
 def test_command_that_comes_while_the_front_end_is_configured_is_carried_out(
     live, monkeypatch, is_first
