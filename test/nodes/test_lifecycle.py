@@ -9,11 +9,13 @@ import pytest
 from builtin_interfaces.msg import Time
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from live import room
+from live import LATCHED, room
+from nav_msgs.srv import LoadMap
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 
 from rlml_slam.errors import MapError
+from rlml_slam.maps.reflector_file import COLUMNS
 from rlml_slam.nodes import front_end
 from rlml_slam.nodes.back_end import BackEndNode
 from rlml_slam.nodes.deformable_slam import DeformableSlamNode
@@ -220,6 +222,23 @@ def test_cleanup_saves_the_map_and_frees_it(live, tmp_path):
     for name in ('configure', 'activate'):
         assert change(live, back, name)[0]
     assert back.mapper.back_end.keyframes == []
+
+
+def test_map_that_is_loaded_before_the_activation_is_the_one_that_is_used(live, tmp_path):
+    for name in 'ab':
+        row = f'0,-1,{ord(name)},0,1e-4,0,1e-4,9,'
+        (tmp_path / f'{name}.csv').write_text('\n'.join([','.join(COLUMNS), row, '']))
+    given = {'map_directory': str(tmp_path), 'mode': 'localization', 'map_file_name': 'a'}
+    front = live.start(FrontEndNode)
+    back = live.start(BackEndNode, **given, autostart=False)
+    assert change(live, back, 'configure')[0]
+    live.call(LoadMap, 'back_end/load_map', LoadMap.Request(map_url='b'))
+    assert change(live, back, 'activate')[0]
+    back.mapper.worker.submit(lambda: None).result()
+    live.listen('reflector_map', 'visualization_msgs/msg/MarkerArray', LATCHED)
+    live.spin_until(lambda: live.heard['reflector_map'])
+    live.drain()
+    assert front.control.session.map.id == back.mapper.system.map.id
 
 
 def test_localization_goes_on_after_a_front_end_was_configured_again(live, tmp_path):

@@ -36,10 +36,18 @@ class UserRequests:
 
     def begin(self) -> None:
         """Do what the parameters ask for; later, send the map as it is now."""
+        self._mapper.worker.submit(self._on_begin)
+
+    def _on_begin(self) -> None:
+        mapper = self._mapper
+        if not self._do_first() and (mapper.stamp > 1 or mapper.system.map is not None):
+            mapper.publish_map()
+
+    def _do_first(self) -> bool:
+        """What the parameters ask for comes before requests; whether it was still to be done."""
         first, self._first = self._first, []
-        self._mapper.submit(first)
-        if self._mapper.stamp > 1:
-            self._mapper.worker.submit(self._mapper.publish_map)
+        self._mapper.execute(first)
+        return bool(first)
 
     def _begin(self) -> list[Command]:
         node, system = self._p.node, self._mapper.system
@@ -60,6 +68,7 @@ class UserRequests:
 
     def reset(self) -> str:
         """Begin at ``map_start_pose``; what was done."""
+        self._do_first()
         system = self._mapper.system
         localizes = system.map is not None
         self._mapper.execute(system.reset(np.array(self._p.node.map_start_pose)))
@@ -81,6 +90,7 @@ class UserRequests:
 
         Raises MapError or FileFormatError.
         """
+        self._do_first()
         mapper = self._mapper
         if mapper.system.map is not None:
             mapper.execute(self._localize_in(name))
@@ -114,6 +124,7 @@ class UserRequests:
 
         Raises MapError where there is no map yet.
         """
+        self._do_first()
         mapper, system = self._mapper, self._mapper.system
         if on == (system.map is not None):
             return 'localizes already' if on else 'maps already'
