@@ -277,6 +277,15 @@ def bias(offset: float, factor: float) -> Fault:
     return lambda messages, _: _scans(messages, lambda s: s.ranges * factor + offset)
 
 
+def noise(sigma: float) -> Fault:
+    """Ranges have further white noise of ``sigma`` [m]."""
+
+    def apply(messages: Messages, rng: np.random.Generator) -> Messages:
+        return _scans(messages, lambda s: s.ranges + sigma * rng.standard_normal(len(s.ranges)))
+
+    return apply
+
+
 def _detections(messages: Messages, changed: Callable[[Detections], Detections]) -> Messages:
     return [changed(m) if isinstance(m, Detections) else m for m in messages]
 
@@ -350,6 +359,7 @@ FAULTS: Mapping[str, Fault] = {
     'three people walk along': people(3),
     'range +5 cm': bias(0.05, 1.0),
     'range +1 %': bias(0.0, 1.01),
+    'range noise of 1 cm': noise(0.01),
     'reflectors: 50 % missed': misses(0.5),
     'reflectors: 3 ghosts': ghosts(3.0),
     'reflectors: 10 % wrong ids': wrong_ids(0.1),

@@ -14,6 +14,7 @@ from rlml_lab.faults import recording
 from rlml_lab.faults.fault_catalog import FAULTS, chosen
 from rlml_lab.faults.fault_run import FaultFigures
 from rlml_lab.faults.fault_run import run as run_fault
+from rlml_lab.faults.other_drives import DRIVES
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.params import Parameters, from_mapping, read_yaml
 
@@ -44,6 +45,10 @@ def add_parser(subparsers: Any) -> None:
         help=f'only those whose name has one of these words, of: {", ".join(FAULTS)}'
         .replace('%', '%%'),
     )  # fmt: skip
+    parser.add_argument(
+        '--drive', choices=DRIVES, default='recorded',
+        help='the same drive as another one; default: %(default)s',
+    )  # fmt: skip
     parser.add_argument('--seeds', type=int, default=1, metavar='N', help='default: %(default)s')
     parser.add_argument('--config', type=Path, metavar='YAML', help="the system's parameters")
     parser.add_argument('--json', action='store_true', help='print one JSON object and no more')
@@ -52,7 +57,7 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Replay with each fault and each seed, and print a row for each."""
     params = from_mapping(read_yaml(args.config)) if args.config else Parameters()
-    given = recording.load(args.recording, args.reference, params)
+    given = DRIVES[args.drive](recording.load(args.recording, args.reference, params))
     faults = list(chosen(args.fault))
     rows: list[tuple[str, int, FaultFigures]] = []
     reference = None

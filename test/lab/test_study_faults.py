@@ -14,11 +14,14 @@ from rlml_lab.faults.fault_run import (
     restamped,
     stamps_as_recorded,
 )
+from rlml_lab.faults.other_drives import DRIVES
+from rlml_lab.faults.recording import Recording
 from rlml_slam import se2
 from rlml_slam.datasets.tum import Trajectory
+from rlml_slam.evaluation.relations import Relations
 from rlml_slam.evaluation.run_record import FrameLog
 from rlml_slam.params import Parameters
-from rlml_slam.types import Detections, Odometry, Scan
+from rlml_slam.types import Detections, Imu, Odometry, Scan
 
 SECOND = 10**9
 
@@ -40,6 +43,57 @@ def odometry(messages):
 
 def applied(fault, messages, seed=3):
     return fault(messages, np.random.default_rng(seed))
+
+
+def other(drive, messages):
+    """The drive as another one, with relations and a truth."""
+    relations = Relations(np.array([[2 * SECOND, 5 * SECOND]]), np.array([[1.0, 0.5, 0.2]]))
+    truth = Trajectory(np.array([2, 5]) * SECOND, np.array([[0.0, 1.0, 0.1], [1.0, 2.0, 0.3]]))
+    given = Recording('arc', messages, {'laser': np.array([0.2, 0.1, 0.3])}, relations, truth)
+    return DRIVES[drive](given)
+
+
+def test_mirrored_drive_has_its_left_at_the_right():
+    ranges = np.arange(1.0, 4.0, dtype=np.float32)
+    scan = Scan(5, 'laser', -0.5, 0.1, 0.0, 0.1, 30.0, ranges, ranges)
+    seen = Detections(
+        6, 'laser', np.array([[3.0, 1.0]]), np.array([[[2.0, 1.0], [1.0, 3.0]]]),
+        np.array([7]), np.array([0.1]),
+    )  # fmt: skip
+    messages = [Odometry(4, np.array([1.0, 2.0, 0.5])), Imu(4, 0.3), scan, seen]
+    out = other('mirrored', messages)
+    assert out.messages[0].pose.tolist() == [1.0, -2.0, -0.5]
+    assert out.messages[1].yaw_rate == -0.3
+    assert out.messages[2].ranges.tolist() == [3.0, 2.0, 1.0]
+    assert out.messages[2].angle_min == pytest.approx(0.3)  # the beam that was the last one
+    assert out.messages[3].points.tolist() == [[3.0, -1.0]]
+    assert out.messages[3].cov.tolist() == [[[2.0, -1.0], [-1.0, 3.0]]]
+    assert out.sensors['laser'].tolist() == [0.2, -0.1, -0.3]
+    assert out.relations.deltas.tolist() == [[1.0, -0.5, -0.2]]
+    assert out.truth.poses[1].tolist() == [1.0, -2.0, -0.3]
+
+
+def test_drive_backwards_keeps_the_distances_in_time_and_twice_gives_the_drive():
+    before = drive(5.0)
+    out = other('backwards', before)
+    stamps = [m.stamp for m in out.messages]
+    assert stamps == sorted(stamps)
+    first, last = out.messages[-1], before[0]  # a scan has the same stamp as its odometry
+    assert odometry(out.messages)[-1].tolist() == last.pose.tolist()
+    assert first.stamp == out.end
+    assert out.relations.stamps[0, 0] - out.relations.stamps[0, 1] == 3 * SECOND
+    assert (np.diff(out.truth.stamps) == 3 * SECOND).all()
+    again = DRIVES['backwards'](out)
+    assert sorted(m.stamp for m in again.messages) == sorted(m.stamp for m in before)
+    np.testing.assert_array_equal(again.truth.poses, other('recorded', before).truth.poses)
+
+
+def test_noise_of_ranges_is_white():
+    before = [m.ranges for m in drive(20.0) if isinstance(m, Scan)]
+    after = [m.ranges for m in applied(faults.noise(0.01), drive(20.0)) if isinstance(m, Scan)]
+    error = np.array(after) - np.array(before)
+    assert error.std() == pytest.approx(0.01, rel=0.05)
+    assert abs(error.mean()) < 0.001
 
 
 def test_same_seed_gives_the_same_fault():
@@ -158,7 +212,13 @@ def test_each_row_is_printed_when_its_run_ends(monkeypatch, capsys):
     monkeypatch.setattr(study_faults, 'run_fault', one_run)
     monkeypatch.setattr(study_faults.recording, 'load', lambda *given: None)
     args = argparse.Namespace(
-        recording='', reference=None, fault=['cut 3 s'], seeds=2, config=None, json=False
+        recording='',
+        reference=None,
+        fault=['cut 3 s'],
+        drive='recorded',
+        seeds=2,
+        config=None,
+        json=False,
     )
     assert study_faults.run(args) == 0
     first, second, third = printed_before
