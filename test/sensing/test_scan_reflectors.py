@@ -101,6 +101,25 @@ def test_walls_are_no_reflectors(gloss):
     assert seen is None or len(seen) == 0, said
 
 
+def noisy(sigma, seed=3):
+    """As a laser whose intensities are little more than a quality of the signal."""
+    rng = np.random.default_rng(seed)
+    return lambda bright: bright * np.exp(sigma * rng.standard_normal(len(bright)))
+
+
+@pytest.mark.parametrize('sigma', [0.3, 0.6, 1.0])
+def test_noise_of_intensities_is_no_reflector(sigma):
+    seen, said = last_seen(noisy(sigma), gain=2.0)
+    assert seen is None, said
+
+
+def test_reflectors_are_found_in_noisy_intensities():
+    seen, said = last_seen(noisy(0.4), gain=100.0)
+    assert seen is not None, said
+    off = np.linalg.norm(seen.points[:, None] + [0.78, 0.39] - POSTS, axis=-1)
+    assert off.min(axis=1).max() < 0.1  # all that is seen is a post
+
+
 def test_reflectors_alone_in_an_open_field_are_found():
     """Nothing else returns: there is nothing to compare them with, and nothing to confuse."""
 

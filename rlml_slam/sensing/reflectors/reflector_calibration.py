@@ -49,6 +49,7 @@ DIFFUSE = 0.98  # quantile of the intensity of wide surfaces: the whitest of the
 NEARER = 1.5  # times as bright as nearer ones is a diffuse surface at most; more is glare
 FULL = 4  # octave from which on diffuse light falls with range: 2 m
 STANDS_OUT = 2.5  # least ratio of a reflector to that
+NOISE = 7.0  # sigmas of noisy intensities; half of them are between a wide surface and its darkest
 BELOW = 0.75  # share of the ratio of dim reflectors at which the threshold is
 SCANS = 200  # newest ones whose range noise is remembered
 SPOTS = 2000  # newest bright spots that are remembered
@@ -97,6 +98,7 @@ class ReflectorCalibration:
         self._spots: deque[tuple[float, float]] = deque(maxlen=SPOTS)  # range and peak
         self._size = ReflectorSize(max(params.diameter, params.flat_width), params.divergence)
         self._noise: deque[float] = deque(maxlen=SCANS)  # [m] of the newest scans
+        self._speckle: deque[float] = deque(maxlen=SCANS)  # the same of the log of intensities
         self.num_scans = 0
         self.result: Calibration | None = None
 
@@ -108,13 +110,14 @@ class ReflectorCalibration:
         self.num_scans += 1
         ranges, bright = valid_beams(scan)
         self._noise.append(range_noise(ranges))
+        self._speckle.append(intensity_noise(bright))
         surface = opened(ranges, bright, step, is_circular(scan), WIDEST)
         octaves = octave_of(ranges)
         seen = octaves >= 0
         # next to beams without a return the width of what is bright is not known
         wide = seen & ((surface > 0.0) | (bright == 0.0))
         np.add.at(self._counts, (octaves[wide], bin_of(surface)[wide]), 1)
-        bound = STANDS_OUT * diffuse_at(self._diffuse(), ranges)
+        bound = self._stands_out() * diffuse_at(self._diffuse(), ranges)
         settings = settings_of(self._search)
         beams = Beams(
             ranges, bright, settings.extent * np.where(seen, bound, 0.0), float(scan.angle_min),
@@ -149,18 +152,23 @@ class ReflectorCalibration:
         out: Array = np.interp(np.arange(OCTAVES), at, level)
         return out
 
+    def _stands_out(self) -> float:
+        """Least ratio of a reflector to what is diffuse: none is noise."""
+        return max(STANDS_OUT, math.exp(NOISE * float(np.median(self._speckle or 0.0))))
+
     def estimate(self) -> Calibration | None:
         """What the spots have in common, None if they are too few."""
+        least = self._stands_out()
         spots, diffuse = np.array(self._spots).reshape(-1, 2), self._diffuse()
         level = diffuse_at(diffuse, spots[:, 0])
         ratios = np.where(level > 0.0, spots[:, 1] / np.maximum(level, 1e-300), np.inf)
-        out = ratios >= STANDS_OUT
+        out = ratios >= least
         if out.sum() < max(ENOUGH_SPOTS, 0.02 * self.num_scans):
             return None
         ratio = float(np.quantile(ratios[out], 0.1, method='lower'))
         size, divergence, sigma = self._size.estimate()
         # below the dimmest reflectors, and as far above everything white as they allow
-        contrast = min(self._p.contrast, max(math.sqrt(ratio), BELOW * ratio))
+        contrast = min(max(self._p.contrast, least), max(math.sqrt(ratio), BELOW * ratio, least))
         detector = replace(
             self._p, contrast=contrast, divergence=divergence,
             sigma_range=max(self._p.sigma_range, min(float(np.median(self._noise)), NOISY)),
@@ -195,6 +203,14 @@ def range_noise(ranges: Array) -> float:
         return 0.0
     bent = np.abs(ranges[:-2] - 2.0 * ranges[1:-1] + ranges[2:])[met]
     return float(np.median(bent)) / (0.6745 * math.sqrt(6.0))
+
+
+def intensity_noise(bright: Array) -> float:
+    """Noise of the logarithm of intensities (n,): what neighbouring beams differ by."""
+    log = np.log(bright[bright > 0.0])
+    if len(log) < MIN_BEAMS:
+        return 0.0
+    return float(np.median(np.abs(np.diff(log)))) / (0.6745 * math.sqrt(2.0))
 
 
 def octave_of(ranges: Array) -> NDArray[np.int64]:
