@@ -94,6 +94,9 @@ def replay(
             result.extra = survey_figures(slam.back_end)
         result.inputs = fates(slam.counts, bag.skipped, inputs.topics)
         result.topics = inputs.sources()
+        for stream, why in slam.synchronizer.inputs.first_errors.items():
+            if stream in result.topics and not result.inputs[stream]['used']:
+                result.topics[stream] += f'; none is used: {why}'
         detected = str(slam.synchronizer.reflectors)
         if detected and 'reflectors' not in result.topics:
             result.topics['reflectors'] = f'intensities of the scans: {detected}'

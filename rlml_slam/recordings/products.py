@@ -21,6 +21,9 @@ from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.closures.closure_table import closure_table
 from rlml_slam.slam.offline.slam import Slam
 
+NAMES = {
+    'scan': 'scans', 'reflectors': 'messages with reflectors', 'odom': 'messages with odometry'
+}  # fmt: skip
 MANY = 0.4  # of a stream: with a clock of its own, one of two lidars has about half of the scans
 OF_USED = (
     'no_returns',
@@ -96,17 +99,18 @@ def fates(
 def refused(inputs: InputCounts) -> str:
     """How many scans or reflectors were late or ahead of all others, '' unless they are many.
 
-    Of odometry and the IMU there is more than enough where a recording is merely out of order.
+    Of odometry there is more than enough where a recording is merely out of order; where none is
+    valid, that is a problem as well. An IMU without turn rates is none.
     """
     out = []
-    for stream in MEASURED:
+    for stream, name in NAMES.items():
         fate = inputs.counts.get(stream, Counter())
-        wrong, every = fate['late'] + fate['future'], sum(fate.values())
-        every -= sum(fate[what] for what in OF_USED)
+        every = sum(fate.values()) - sum(fate[what] for what in OF_USED)
+        wrong = fate['late'] + fate['future'] if stream in MEASURED else 0
+        wrong = every if fate['invalid'] == every else wrong
         if wrong > MANY * every:
-            what = 'scans' if stream == 'scan' else 'messages with reflectors'
             first = inputs.first_errors[stream]
-            out.append(f'{wrong} of {every} {what} were not used; the first: {first}')
+            out.append(f'{wrong} of {every} {name} were not used; the first: {first}')
     return '; '.join(out)
 
 

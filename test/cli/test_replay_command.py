@@ -22,7 +22,7 @@ from rlml_slam.ros.bags.bag import BagWriter
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_bag
 from rlml_slam.sensing.synchronization.input_counts import InputCounts
-from rlml_slam.types import Detections, Scan
+from rlml_slam.types import Detections, Imu, Scan
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
 SECOND = 1_000_000_000
@@ -149,6 +149,23 @@ def test_scans_of_another_clock_are_a_problem(ahead, why, tmp_path, capsys):
     assert said is not None
     assert int(said[1]) > 0.7 * int(said[2])
     assert why in said[3]
+
+
+def test_odometry_and_imu_of_which_none_can_be_used_are_explained(tmp_path, capsys):
+    with BagWriter(tmp_path / 'bag') as bag:
+        for k in range(20, 60):
+            t, frames = k * SECOND // 10, ('map', 'base_link')
+            bag.write('/odom', encode.odometry(make_bag, t, frames, np.zeros(3), np.eye(3)), t)
+            imu = encode.imu(make_bag, Imu(t, 0.0), 'base_link', 0.01)
+            imu.angular_velocity_covariance[0] = -1.0
+            bag.write('/imu', imu, t)
+            bag.write('/scan', encode.laser_scan(make_bag, made_scan(t)), t)
+    arguments = ['replay', str(tmp_path / 'bag'), '--out', str(tmp_path / 'out'), '--no-report']
+    assert main(arguments) == 1
+    said = capsys.readouterr()
+    assert re.search(r'input imu .*; none is used: imu: angular_velocity is marked', said.out)
+    why = '40 of 40 messages with odometry were not used; the first: odom: header.frame_id is'
+    assert why in said.err
 
 
 def test_only_a_large_share_of_late_scans_is_a_problem():
