@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import copy
 import struct
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -274,6 +276,16 @@ def test_detections_survive_the_round_trip(make):
     np.testing.assert_array_equal(got.diameters, want.diameters)
     # sigmas travel as float32
     np.testing.assert_allclose(got.cov, want.cov, rtol=1e-5, atol=1e-9)
+
+
+def test_id_that_several_reflectors_have_is_none(make):
+    """Many drivers leave 0 in a field that they do not fill."""
+    want = replace(some_detections(), ids=np.array([0, 0, 7, -1, 0]))
+    got = decode.detections(encode.detections(make, want), NOISE)
+    assert got.ids.tolist() == [ANONYMOUS, ANONYMOUS, 7, ANONYMOUS, ANONYMOUS]
+    poses = [encode.pose(make, np.array([*at, 0.0])) for at in want.points]
+    device = SimpleNamespace(header=encode.header(make, STAMP, 'laser'), poses=poses, ids=want.ids)
+    assert decode.detections_of_poses(device, NOISE).ids.tolist() == got.ids.tolist()
 
 
 def test_empty_cloud_means_looked_and_saw_none(make):

@@ -158,6 +158,7 @@ def detections(msg: Any, noise: Reflector, topic: str = 'reflectors') -> Detecti
     x, y are required; id, diameter, sigma_range [m] and sigma_bearing [rad] are optional, and
     ``noise`` stands in for the sigmas where they are missing, NaN or not positive. Points that
     are not finite are absent points in a cloud that is not dense, and an error in a dense one.
+    An id that several points have is none.
     """
     cloud = read_cloud(msg, topic)
     missing = {'x', 'y'} - set(cloud.dtype.names or ())
@@ -183,7 +184,7 @@ def detections(msg: Any, noise: Reflector, topic: str = 'reflectors') -> Detecti
         frame(msg.header.frame_id),
         points,
         detection_covariance(points, sigma_r, sigma_b, noise.sigma_fallback),
-        np.where(known, ids, ANONYMOUS).astype(np.int64),
+        _unique(np.where(known, ids, ANONYMOUS).astype(np.int64)),
         _positive(diameters, np.nan),
     )
 
@@ -200,9 +201,15 @@ def detections_of_poses(msg: Any, noise: Reflector, topic: str = 'reflector_pose
         frame(msg.header.frame_id),
         points,
         detection_covariance(points, sigma_r, sigma_b, noise.sigma_fallback),
-        getattr(msg, 'ids', np.full(n, ANONYMOUS, dtype=np.int64)),
+        _unique(getattr(msg, 'ids', np.full(n, ANONYMOUS, dtype=np.int64))),
         np.full(n, np.nan),
     )
+
+
+def _unique(ids: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The ids (n,), ANONYMOUS where several reflectors have one: it is a default of the driver."""
+    _, which, times = np.unique(ids, return_inverse=True, return_counts=True)
+    return np.where(times[which] == 1, ids, ANONYMOUS)
 
 
 def _positive(values: Array, otherwise: float) -> Array:
