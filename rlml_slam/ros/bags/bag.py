@@ -254,9 +254,10 @@ def choose_topics(
         if len(fitting) > 1 and stream in without:
             continue
         if len(fitting) > 1:
+            several = ', or several lidars with scan_topics' if stream == 'scan' else ''
             raise BagError(
                 f'several topics fit {stream}: {", ".join(sorted(fitting))}; '
-                f'name one with the parameter {parameter}'
+                f'name one with the parameter {parameter}{several}'
             )
         if fitting:
             chosen[stream] = fitting[0]
