@@ -139,7 +139,8 @@ class FrontEnd:
     ) -> Matches:
         """Add new reflectors and insert the scan into the submaps, unless they contradict them."""
         matches = self._reflectors.grow(observation, matches, contradicted)
-        self._scans.insert(observation, scan, contradicted and scan.misfit)
+        broken = self._scans.insert(observation, scan, contradicted and scan.misfit)
+        self._map.doubt(broken and not matches.agree_with_map)
         return matches
 
     def _evaluate_health(
@@ -208,12 +209,12 @@ class FrontEnd:
 
         Reflectors keep their positions; the submaps were built elsewhere and start again.
         """
-        T_local_map = se2.inverse(self.T_map_local)
+        T_map_local, T_local_map = self.T_map_local, se2.inverse(self.T_map_local)
         pose = se2.compose(T_local_map, T_map_base)
         cov = se2.rotate_cov(cov, T_local_map[2])
         saved = self._map.saved
         if saved is not None:
-            before, motion, T_map_local = self.state, self._motion, self.T_map_local
+            before, motion = self.state, self._motion
             self.reset(pose, cov)
             self.use_map(saved.reflectors, saved.grid)
             self.state.take_systematic_errors(before)
@@ -223,7 +224,6 @@ class FrontEnd:
             self._scans.start_new_submaps()
             self._motion.forget_velocity()
             self._reflectors.forget_slip()
-            T_map_local = self.T_map_local
         # the reference keyframe of the graph is where the robot was before
         self._correction = Correction(T_map_local)
         self._jumped = True

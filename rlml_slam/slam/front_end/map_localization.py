@@ -36,11 +36,17 @@ class MapLocalization:
         self.use_grid(grid)
         self.confirmation.begin()
 
+    def doubt(self, broken: bool) -> None:
+        """Where the way is ``broken``, the next scan is matched, and the map has to confirm it."""
+        if broken and self.saved is not None:
+            self.use_map(self.saved.reflectors, self.saved.grid)
+            self.confirmation.reason = 'scans fit none before: the map has to confirm the pose'
+
     def use_grid(self, grid: OccupancyGrid | None) -> None:
         """Replace the grid of the map, None for none."""
         assert self.saved is not None
         self.saved = replace(self.saved, grid=grid)
-        self._grid = None
+        self._grid, self.grid_match = None, GridMatch(math.nan)
         if grid is not None and is_mapped(grid):
             self._grid = GridLocalizer(grid, self._p)
 
@@ -76,7 +82,7 @@ class MapConfirmation:
         self._since: int | None = None  # stamp of the newest frame with no evidence against it
 
     def begin(self) -> None:
-        """A map was loaded."""
+        """A map was loaded, or the robot may be elsewhere in it."""
         self._is_needed = self.is_pending = True
         self.reason = 'start pose not confirmed: nothing has matched the saved map yet'
 

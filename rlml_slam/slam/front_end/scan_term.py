@@ -233,25 +233,27 @@ class ScanTerm:
         least = AS_USUAL * self.kidnapping.usual
         return known < MIN_KNOWN or found.score - (1.0 - known) * UNKNOWN < known * least
 
-    def insert(self, observation: Observation, evidence: ScanEvidence, contradicts: bool) -> None:
+    def insert(self, observation: Observation, evidence: ScanEvidence, contradicts: bool) -> bool:
         """Insert the scan into the submaps; a new submap clones the pose as its anchor.
 
         A single scan without a match is more likely a bad scan (a wrong stamp) than a new place,
         and would disturb the next matches: it is inserted only if none matches for
         ``input_timeout``. A scan that ``contradicts`` the submap would hide that the robot is
-        lost.
+        lost. Returns whether the way of the robot is broken: the scan fits none before it.
         """
         if observation.points is None or observation.origin is None or contradicts:
-            return
+            return False
         if len(observation.points) < self._p.scan_match.min_points:
-            return
-        if evidence.used or self.submaps.target is None:
+            return False
+        fits = evidence.used or self.submaps.target is None
+        if fits:
             self._last_fit = observation.stamp
         elif observation.stamp - self._last_fit < self._p.health.input_timeout * 1e9:
-            return
+            return False
         if evidence.used and not self._motion.has_odometry and self._is_uncertain_in_submap():
             self.submaps.start_again()
-        self.submaps.insert(self._state, observation.points, observation.origin)
+        inserted = self.submaps.insert(self._state, observation.points, observation.origin)
+        return inserted and not fits
 
     def _is_uncertain_in_submap(self) -> bool:
         """Whether the position in the submap is too uncertain to insert scans.

@@ -7,10 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from made_worlds import ROOM, drive, errors, observations
 
 from rlml_slam.cli.main import main
+from rlml_slam.motion import STILL
 from rlml_slam.params import Node, Parameters, Simulator
 from rlml_slam.recordings.bag_replay import Given, replay
+from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.store import map_file
 from rlml_slam.types import Level
 
@@ -69,3 +72,39 @@ def test_robot_carried_where_nothing_is_mapped_is_lost_until_it_comes_to_what_is
     off = np.hypot(*(path.poses[:, :2] - np.stack([x, y], axis=-1)).T)
     assert np.median(off) < 0.05
     assert np.mean(off > 0.5) < 0.15  # the seconds in which it maps nothing
+
+
+@pytest.fixture(scope='module')
+def walls():
+    """The map of a room, of its walls alone."""
+    slam = Slam(Parameters())
+    path = drive((0.5, 0.0, 4.0), (0.0, 0.8, 4.0), (0.5, 0.2, 6.0))
+    slam.process(observations(ROOM, path, reflectors=False))
+    slam.finish()
+    return slam.map()
+
+
+@pytest.mark.parametrize(
+    ('before', 'after'),
+    [
+        ((1.12, 1.05, 0.26), (2.27, 1.36, -2.98)),
+        ((0.7, 1.61, 2.6), (0.25, 0.5, -1.07)),
+        ((0.18, -0.97, -0.3), (1.79, -0.69, -2.69)),
+        ((0.54, 1.84, 0.0), (0.49, 0.67, 2.97)),
+    ],
+)
+def test_robot_carried_before_it_ever_moved_does_not_trust_new_submaps(walls, before, after):
+    """A submap of one scan tells no places apart; the next scans were another way, and OK."""
+    path = np.vstack([[before] * 15, drive((0.4, 0.1, 4.0), start=after)])
+    seen = observations(ROOM, path, reflectors=False, rng=np.random.default_rng(1))
+    seen[15] = replace(seen[15], motion=STILL)
+    slam = Slam(Parameters(node=Node(mode='localization')), search_delay=1.0)
+    slam.use_map(walls)
+    slam.session.start_at(0, path[0], np.diag([0.01, 0.01, 0.003]))
+    frames = slam.process(seen)
+    distance, _ = errors(np.array([f.T_map_base for f in frames]), path)
+    is_ok = np.array([f.health.level == Level.OK for f in frames])
+    assert is_ok[14]
+    assert (is_ok & (distance > 0.5)).sum() <= 12  # scans, of 10 Hz
+    assert is_ok[-1]
+    assert distance[-1] < 0.1
