@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import errno
 import importlib
+import io
 import os
 import shlex
 import sys
@@ -22,7 +24,7 @@ from typing import Any, TypeAlias
 from rlml_slam.errors import RlmlError
 from rlml_slam.version import __version__
 
-INTERRUPTED = 130  # what a shell reports for Ctrl-C
+INTERRUPTED, BROKEN_PIPE = 130, 141  # what a shell reports for Ctrl-C, and for `… | head`
 
 
 @dataclass(frozen=True)
@@ -125,6 +127,8 @@ def main(
 ) -> int:
     """Run one command line of the command ``prog``; the exit code."""
     module: ModuleType | None = None
+    if isinstance(sys.stdout, io.TextIOWrapper):  # not every terminal has ±, or all file names
+        sys.stdout.reconfigure(errors='backslashreplace')
     try:
         if '_ARGCOMPLETE' in os.environ:
             complete(table, prog)
@@ -135,7 +139,7 @@ def main(
             parser.error('a command is missing')
         args.command_line = shlex.join([prog, *arguments])
         code = int(module.run(args))
-        sys.stdout.flush()
+        print(end='', flush=True)  # which a closed stdout takes as well
         return code
     except RlmlError as e:
         print(f'{prog}: {e}', file=sys.stderr)
@@ -143,10 +147,15 @@ def main(
     except KeyboardInterrupt:
         print(f'{prog}: interrupted', file=sys.stderr)
         return INTERRUPTED
-    except BrokenPipeError:
-        # the reader of our output went away, e.g. `rlml … | head`
+    except OSError as e:
+        if e.errno not in (errno.EPIPE, errno.ENOSPC):
+            raise
+        # the reader of our output went away, or its disk is full: what still waits goes nowhere
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+        if e.errno == errno.EPIPE:
+            return BROKEN_PIPE
+        print(f'{prog}: cannot write: {e.strerror}', file=sys.stderr)
+        return int(getattr(module, 'ERROR_CODE', 1))
 
 
 def complete(table: Table, prog: str) -> None:

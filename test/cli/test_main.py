@@ -144,6 +144,31 @@ def test_interrupt_is_exit_code_130(monkeypatch, capsys):
     assert run_with(monkeypatch, run) == 130
 
 
+@pytest.mark.parametrize(
+    ('output', 'code', 'said'),
+    [
+        ('', 141, ''),  # a pipe that nobody reads
+        ('> /dev/full', 1, 'rlml: cannot write: No space left on device\n'),
+        ('>&-', 0, ''),
+        ('> out.txt', 0, ''),
+    ],
+)
+def test_output_that_goes_nowhere_is_no_traceback(output, code, said, tmp_path):
+    (tmp_path / 'a.tum').write_text('1.0 1 2 0 0 0 0 1\n2.0 1 2 0 0 0 0 1\n')
+    (tmp_path / 'r').write_text('1 2 0 0 0 0 0 0\n')
+    line = f'"{sys.executable}" -m rlml_slam.cli.main evaluate relations a.tum r {output}'
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        ['bash', '-c', line], cwd=tmp_path, stdout=writer, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, 'PYTHONIOENCODING': 'ascii', 'PYTHONPATH': os.getcwd()},
+    )  # fmt: skip
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (code, said)
+    if output == '> out.txt':
+        assert r'0.0000 \xb1 0.0000 m' in (tmp_path / 'out.txt').read_text()
+
+
 def test_missing_package_is_named(capsys):
     table = {'do': Command('rlml_slam.cli.no_such_module', 'something')}
     assert main(['do'], table) == 1
