@@ -12,6 +12,7 @@ from typing import Any
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.datasets.tum import read_tum
 from rlml_slam.errors import ParameterError
+from rlml_slam.evaluation.metrics import run_errors
 from rlml_slam.evaluation.run_record import Truth
 from rlml_slam.maps import saved_map, survey
 from rlml_slam.maps.saved_map import SavedMap
@@ -92,6 +93,8 @@ def run(args: argparse.Namespace) -> int:
         )
     source = source_of(args.bag)
     result.origin = replace(result.origin, command=args.command_line, source=source)
+    if truth and run_errors(result) is None and not result.problem:
+        result.problem = f'{args.truth}: no errors: it has nothing at the stamps of this bag'
     figures = write_outputs(result, args.out, not args.no_report, args.map)
     return print_summary(result, figures, args.out, args.json, not args.no_report)
 

@@ -86,12 +86,14 @@ def trajectory_errors(
     """Errors of an estimate against the truth interpolated to its stamps.
 
     ``aligned``: the estimate is first moved by the SE(2) transform that fits its positions best.
-    Raises InputError if the two share no time.
+    Raises InputError if the two share no time, or too little to align.
     """
     at, known = interpolate(truth, estimate.stamps, max_gap)
     if not known.any():
         raise InputError('the trajectory and its truth have no time in common')
     poses, at = estimate.poses[known], at[known]
+    if aligned and len(at) < 2:
+        raise InputError('the trajectory and its truth have one pose in common: too few to align')
     T = se2.align(poses[:, :2], at[:, :2]) if aligned else np.zeros(3)
     errors = se2.compose(T, poses) - at
     errors[:, 2] = se2.wrap(errors[:, 2])

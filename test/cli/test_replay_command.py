@@ -109,6 +109,17 @@ def test_given_truth_is_aligned(mapped, tmp_path, capsys):
     assert f['ate_rmse_m'] < 1e-6
 
 
+@pytest.mark.parametrize('stamps', [[5e12, 6e12], [2e9, 6e12]])
+def test_truth_that_says_nothing_of_the_bag_is_a_problem(stamps, tmp_path, capsys):
+    """Of another time, or of one pose, to which any path can be aligned without an error."""
+    write_tum(tmp_path / 't.tum', Trajectory(np.array(stamps, dtype=np.int64), np.zeros((2, 3))))
+    arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out'), '--no-report']
+    assert main([*arguments, '--truth', str(tmp_path / 't.tum')]) == 1
+    said = capsys.readouterr()
+    assert said.err.endswith('t.tum: no errors: it has nothing at the stamps of this bag\n')
+    assert 'RMSE, aligned' not in said.out
+
+
 def test_summary_says_which_topic_was_taken(tmp_path, capsys):
     config = tmp_path / 'c.yaml'
     config.write_text('/**:\n  ros__parameters:\n    scan_topic: front/scan\n')
