@@ -71,10 +71,11 @@ def revoke(path: Path, number: int) -> str:
 
 def read(folder: Path) -> list[dict[str, str]]:
     """The rows of a folder's closures.csv, or of a saved map; MapError if there is none."""
-    if folder.is_file():
+    whole = folder / 'map.rlml' if folder.is_dir() else folder
+    if whole.is_file():  # closures.csv may be of before one was revoked
         back_end = BackEnd(Parameters())
-        map_file.restore(map_file.load(folder), back_end)
-        return parse(closure_table(back_end.loop_closer.records), str(folder))
+        map_file.restore(map_file.load(whole), back_end)
+        return parse(closure_table(back_end.loop_closer.records), str(whole))
     path = folder / 'closures.csv'
     try:
         return parse(path.read_text(encoding='utf-8'), str(path))

@@ -101,6 +101,8 @@ def run(args: argparse.Namespace) -> int:
 
 def load_known(path: Path) -> SavedMap:
     """A map to localize in: a .rlml file, a .yaml of nav2 or a .csv of reflectors, a folder."""
+    if (path / 'map.rlml').exists():
+        path /= 'map.rlml'  # as the nodes: the text beside it may be older than a --revoke
     if path.suffix in ('.yaml', '.csv') or path.is_dir():
         return saved_map.load(path)
     content = map_file.load(path)

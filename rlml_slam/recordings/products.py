@@ -73,7 +73,7 @@ def collect(slam: Slam | EkfSlam, log: FrameLog, name: str, truth: Truth | None)
         np.array([u.wall_ms for u in slam.updates]),
         truth=truth,
         problem=problem,
-        closure_table=closure_table(tried),
+        closure_table=closure_table(tried) if indices else '',
         reflector_states=tuple(back_end.reflector_states()),
     )
 

@@ -13,6 +13,7 @@ import pytest
 
 from rlml_slam import se2
 from rlml_slam.cli.main import main
+from rlml_slam.cli.replay import load_known
 from rlml_slam.datasets.tum import Trajectory, read_tum, write_tum
 from rlml_slam.maps import occupancy
 from rlml_slam.params import Parameters
@@ -22,6 +23,7 @@ from rlml_slam.ros.bags.bag import BagWriter
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_bag
 from rlml_slam.sensing.synchronization.input_counts import InputCounts
+from rlml_slam.slam.store import map_file
 from rlml_slam.types import Detections, Imu, Scan
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
@@ -82,6 +84,7 @@ def test_bag_is_localized_in_the_map_that_another_replay_made(mapped, tmp_path):
     f = json.loads((tmp_path / 'out' / 'metrics.json').read_text())
     assert f['keyframes'] == 0
     assert f['health']['OK'] > 0.95
+    assert not (tmp_path / 'out' / 'closures.csv').exists()
     for name in ('map.pgm', 'map.yaml', 'reflectors.csv'):
         assert (tmp_path / 'out' / name).read_bytes() == (mapped / name).read_bytes()
     found = read_tum(tmp_path / 'out' / 'trajectory.tum')
@@ -89,6 +92,17 @@ def test_bag_is_localized_in_the_map_that_another_replay_made(mapped, tmp_path):
     error = se2.between(mapped.poses, found.poses)[10:]
     assert np.hypot(error[:, 0], error[:, 1]).max() < 0.04
     assert np.abs(error[:, 2]).max() < 0.02
+
+
+def test_map_of_a_folder_is_the_one_from_which_a_closure_was_revoked(mapped, tmp_path, capsys):
+    """Its grid, its reflectors and its closures are in other files as well, which are older."""
+    shutil.copytree(mapped, tmp_path / 'run')
+    assert main(['closures', str(tmp_path / 'run' / 'map.rlml'), '--revoke', '0']) == 0
+    revoked = map_file.saved_map(map_file.load(tmp_path / 'run' / 'map.rlml'))
+    assert load_known(tmp_path / 'run').id == revoked.id
+    capsys.readouterr()
+    assert main(['closures', str(tmp_path / 'run')]) == 0
+    assert ' 1 revoked' in capsys.readouterr().out
 
 
 def test_folder_without_a_map_is_refused(tmp_path, capsys):
