@@ -57,6 +57,16 @@ def test_reflectors_beside_the_grid_belong_to_the_map(name, tmp_path):
         folder.load(name)
 
 
+def test_image_of_an_older_map_is_set_aside_where_the_new_one_has_none(tmp_path):
+    folder = MapFolder(str(tmp_path))
+    folder.save('hall', SavedMap(no_reflectors(), GRID))
+    image = (tmp_path / 'hall.pgm').read_bytes()
+    folder.save('hall', SavedMap(no_reflectors()))
+    assert folder.load('hall').grid is None
+    assert (tmp_path / 'hall.pgm.previous').read_bytes() == image
+    assert (tmp_path / 'hall.yaml.previous').exists()
+
+
 def test_image_that_was_edited_after_the_whole_map_is_pointed_out(tmp_path):
     whole = tmp_path / 'hall.rlml'
     whole.write_bytes(b'')

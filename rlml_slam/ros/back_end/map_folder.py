@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rlml_slam.errors import MapError, NoMapError
 from rlml_slam.maps import nav2_map, reflector_file, saved_map, survey
-from rlml_slam.maps.atomic_file import PREVIOUS
+from rlml_slam.maps.atomic_file import PREVIOUS, set_aside
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.maps.survey import Survey
 from rlml_slam.slam.store import map_file
@@ -66,7 +66,7 @@ class MapFolder:
     def save(self, name: str, saved: SavedMap) -> Path:
         """Write name.csv, and name.pgm with name.yaml where there is a grid.
 
-        Without one, those of an older map of the name are removed: they would be read with this.
+        Without one, those of an older map of the name are set aside: they would be read with this.
         """
         path = self.path(name)
         try:
@@ -77,12 +77,7 @@ class MapFolder:
         if saved.grid is not None:
             nav2_map.save(saved.grid, path)
             return path
-        for suffix in ('.yaml', '.pgm'):
-            old = path.with_name(path.name + suffix)
-            try:
-                old.unlink(missing_ok=True)
-            except OSError as e:
-                raise MapError(f'{old}: of an older map, cannot be removed: {e.strerror}') from e
+        set_aside(*(path.with_name(path.name + suffix) for suffix in ('.yaml', '.pgm')))
         return path
 
     def whole(self, name: str) -> Path:
