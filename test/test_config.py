@@ -169,6 +169,12 @@ def test_names_of_frames_lose_the_slash_that_ros_1_allowed(of):
             assert getattr(group, d.field) == d.default
 
 
+@pytest.mark.parametrize('name', ['', '/'])
+def test_frame_without_a_name_is_refused(name):
+    with pytest.raises(ParameterError, match=rf"base_frame = '{name}' is no name of a frame"):
+        from_mapping({'base_frame': name})
+
+
 def test_whole_number_that_python_does_not_print_is_refused_by_its_name():
     with pytest.raises(ParameterError, match='odom_timeout = a number that is too long to print'):
         from_mapping({'odom_timeout': 1 << 20000})

@@ -99,7 +99,11 @@ def _checked(prefix: str, f: dataclasses.Field[Any], value: Any) -> Any:
             raise refuse('is not a string')
         if m['choices'] and value not in m['choices']:
             raise refuse(f'is not one of {", ".join(m["choices"])}')
-        return value.lstrip('/') if f.name.endswith('_frame') else value  # ROS 1 allowed a slash
+        if not f.name.endswith('_frame'):
+            return value
+        if not value.strip('/'):
+            raise refuse('is no name of a frame')
+        return value.lstrip('/')  # ROS 1 allowed a slash
     if isinstance(f.default, tuple):
         if isinstance(value, str) or not isinstance(value, list | tuple):
             raise refuse('is not a list')
