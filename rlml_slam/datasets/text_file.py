@@ -36,7 +36,7 @@ def read_lines(path: str | Path) -> Iterator[tuple[int, str]]:
                 size += len(raw)
                 if len(raw) == MAX_LINE or size > MAX_SIZE:
                     raise FileFormatError(f'{path}:{number}: a line or the file is too long')
-                line = raw.decode('utf-8', errors='replace').strip()
+                line = raw.decode('utf-8-sig', errors='replace').strip()
                 if line and not line.startswith('#'):
                     yield number, line
     except (EOFError, lzma.LZMAError, gzip.BadGzipFile, zlib.error) as e:

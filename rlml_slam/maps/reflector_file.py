@@ -41,7 +41,7 @@ def save(reflectors: Reflectors, path: str | Path) -> None:
 def load(path: str | Path) -> Reflectors:
     """Read a table. Raises MapError if there is none, FileFormatError naming the line if bad."""
     try:
-        text = Path(path).read_text(encoding='utf-8')
+        text = Path(path).read_text(encoding='utf-8-sig')
     except OSError as e:
         raise MapError(f'{path}: cannot be read: {e.strerror}') from e
     except UnicodeDecodeError as e:
@@ -50,7 +50,8 @@ def load(path: str | Path) -> Reflectors:
     if not lines or tuple(lines[0].split(',')) != COLUMNS:
         raise FileFormatError(f'{path}: line 1: not the columns of a reflector map')
     try:
-        rows = [_row(f'{path}: line {k}', row) for k, row in enumerate(csv.reader(lines[1:]), 2)]
+        table = enumerate(csv.reader(lines[1:]), 2)
+        rows = [_row(f'{path}: line {k}', row) for k, row in table if row]
     except csv.Error as e:
         raise FileFormatError(f'{path}: {e}') from e
     values = np.array(rows).reshape(-1, len(COLUMNS))

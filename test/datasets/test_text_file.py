@@ -32,6 +32,11 @@ def test_truncated_archive_is_named(tmp_path, pack):
         list(read_lines(path))
 
 
+def test_mark_of_an_editor_at_the_beginning_is_no_text(tmp_path):
+    (tmp_path / 'a.tum').write_text('# stamp\n1.0\n', 'utf-8-sig')
+    assert list(read_lines(tmp_path / 'a.tum')) == [(2, '1.0')]
+
+
 def test_missing_file_is_named(tmp_path):
     with pytest.raises(FileFormatError, match=r'missing\.txt: cannot be read: No such file'):
         list(read_lines(tmp_path / 'missing.txt'))

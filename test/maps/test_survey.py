@@ -44,6 +44,13 @@ def test_reflectors_of_a_map_are_a_survey(tmp_path):
     np.testing.assert_allclose(found.diameters, diameters)
 
 
+def test_table_that_an_editor_has_saved_is_read(tmp_path):
+    table = tmp_path / 'reflectors.csv'
+    row = '0,7,1.5,-2.25,1e-4,0,1e-4,3,'
+    table.write_text('\n'.join([','.join(reflector_file.COLUMNS), '', row, '']), 'utf-8-sig')
+    np.testing.assert_array_equal(reflector_file.load(table).ids, [7])
+
+
 @pytest.mark.parametrize(
     ('text', 'ids'),
     [
