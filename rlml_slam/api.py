@@ -58,7 +58,9 @@ def read_parameters(
     that has no parameters.
     """
     values = {} if path is None else read_yaml(path, Parameters)
-    found: Parameters = from_mapping({**values, **(changes or {})}, Parameters)
+    for name, value in (changes or {}).items():
+        values[name] = value.tolist() if isinstance(value, np.generic | np.ndarray) else value
+    found: Parameters = from_mapping(values, Parameters)
     return found
 
 
@@ -260,7 +262,10 @@ class Slam:
         self._is_localizing = known is not None
         self._log = FrameLog()
         for frame_id, pose in (sensor_poses or {}).items():
-            self._system.set_sensor_pose(frame_id, np.asarray(pose, dtype=np.float64))
+            place = np.asarray(pose, dtype=np.float64)
+            if place.shape != (3,) or not np.isfinite(place).all():
+                raise InputError(f'sensor_poses: {frame_id}: {pose} is not x, y, heading')
+            self._system.set_sensor_pose(frame_id, place)
 
     def add(self, measurement: Measurement) -> list[Frame]:
         """One measurement; the frames that it made ready, in the order of their stamps.

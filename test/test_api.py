@@ -156,6 +156,25 @@ def test_parameters_are_read_and_checked(tmp_path):
         rlml_slam.read_parameters(changes={'use_odm': False})
 
 
+def test_numbers_of_numpy_are_parameters():
+    found = rlml_slam.read_parameters(
+        changes={
+            'back_end.keyframes_per_place': np.int64(3), 'motion.max_gap': np.float32(0.5),
+            'laser_pose': np.array([0.5, 0.0, 0.0]), 'use_odom': np.bool_(False),
+        }
+    )  # fmt: skip
+    assert found.back_end.keyframes_per_place == 3
+    assert found.motion.max_gap == 0.5
+    assert found.node.laser_pose == (0.5, 0.0, 0.0)
+    assert found.node.use_odom is False
+
+
+@pytest.mark.parametrize('pose', [[0.2, 0.0], [0.2, 0.0, np.nan], np.zeros((1, 3))])
+def test_what_is_no_pose_of_a_sensor_is_refused(pose):
+    with pytest.raises(rlml_slam.RlmlError, match=r'sensor_poses: laser: .* is not x, y, heading'):
+        rlml_slam.Slam(sensor_poses={'laser': pose})
+
+
 def test_other_things_are_no_measurements():
     with pytest.raises(rlml_slam.RlmlError, match='int is no measurement'):
         rlml_slam.Slam().add(3)
