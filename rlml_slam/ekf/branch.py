@@ -39,6 +39,9 @@ from rlml_slam.types import ANONYMOUS, Motion, Reflectors, Status
 # squared Mahalanobis distance of the poses and distance [m] of landmarks below which two branches
 # are equal
 EQUAL_POSE, EQUAL_POINT = 0.1, 0.1
+MAX_BRANCHES = 32
+MAX_MEASUREMENTS = 64  # of all branches in a frame: with many at once there are fewer branches
+MAX_VALUES = 2e7  # of all covariances: with very many landmarks there are fewer branches
 
 
 @dataclass(frozen=True)
@@ -220,6 +223,8 @@ class Branch:
             for i, n in zip(new.tolist(), times.tolist(), strict=True):
                 if n >= self._p.ekf.min_sightings:
                     out = [child for b in out for child in b._add_landmark(frame, i, n)]
+                    most = most_branches(len(seen.z), len(self.filter.x))
+                    out = sorted(out, key=lambda b: -b.weight)[:most]
         for b in out:
             b._forget_candidates(frame.stamp)
         return out
@@ -317,6 +322,12 @@ class Branch:
             return False
         gap = self.filter.landmarks()[a] - other.filter.landmarks()[b]
         return bool((np.abs(gap) < EQUAL_POINT).all())
+
+
+def most_branches(measurements: int, size: int) -> int:
+    """Number of branches at most, with so many measurements and values in the state."""
+    affordable = min(MAX_VALUES / size**2, MAX_MEASUREMENTS / max(measurements, 1))
+    return int(np.clip(affordable, 2, MAX_BRANCHES))
 
 
 def _copy(value: Any) -> Any:

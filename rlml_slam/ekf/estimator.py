@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam import se2
-from rlml_slam.ekf.branch import Associations, Branch, MeasuredFrame
+from rlml_slam.ekf.branch import Associations, Branch, MeasuredFrame, most_branches
 from rlml_slam.ekf.extraction import Measured, measure
 from rlml_slam.ekf.filter import Filter
 from rlml_slam.ekf.likelihood import DECORRELATION
@@ -32,9 +32,6 @@ from rlml_slam.slam.front_end.map_localization import MapConfirmation
 from rlml_slam.slam.landmarks.delayed_association import SLIP2
 from rlml_slam.types import Frame, Observation, Reflectors, Status
 
-MAX_BRANCHES = 32
-MAX_MEASUREMENTS = 64  # of all branches in a frame: with many at once there are fewer branches
-MAX_VALUES = 2e7  # of all covariances: with very many landmarks there are fewer branches
 MAX_LOG_RATIO = 10.0  # of the weights of the best branch and one that is dropped
 BLIND = 3.0  # [s] without a landmark after which wheel slip would not be noticed
 MAP_TRAVEL, MAP_TURN = 0.3, 0.25  # [m], [rad] between two scans that are drawn into the grid
@@ -126,7 +123,7 @@ class Estimator:
         frame = MeasuredFrame(seen, stamp, weight, self._mapping, key_of)
         self.branches = _best(
             [child for b in self.branches for child in b.update(frame)],
-            MAX_MEASUREMENTS / max(len(seen.z), 1),
+            len(seen.z),
         )
         self._next_key = next(keys)
         if (self.branches[0].associations.statuses == Status.USED).any():
@@ -234,7 +231,7 @@ class Estimator:
         return render(np.array(poses), list(points), list(origins), resolution)
 
 
-def _best(branches: Sequence[Branch], affordable: float) -> list[Branch]:
+def _best(branches: Sequence[Branch], measurements: int) -> list[Branch]:
     """The likely branches, the likeliest first, without duplicates."""
     different: list[Branch] = []
     for b in sorted(branches, key=lambda b: -b.weight):
@@ -243,8 +240,7 @@ def _best(branches: Sequence[Branch], affordable: float) -> list[Branch]:
             different.append(b)
         else:
             twin.weight = float(np.logaddexp(twin.weight, b.weight))
-    size = max(len(b.filter.x) for b in different)
-    most = int(np.clip(min(MAX_VALUES / size**2, affordable), 2, MAX_BRANCHES))
+    most = most_branches(measurements, max(len(b.filter.x) for b in different))
     different.sort(key=lambda b: -b.weight)
     best = different[0].weight
     kept = [b for b in different[:most] if b.weight > best - MAX_LOG_RATIO]

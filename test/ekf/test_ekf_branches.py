@@ -8,12 +8,13 @@ import pytest
 from made_worlds import ROOM, drive, observations
 
 from rlml_slam import se2
+from rlml_slam.ekf.branch import Branch
 from rlml_slam.ekf.estimator import Estimator
 from rlml_slam.ekf.filter import Filter
 from rlml_slam.ekf.matching import Matcher
 from rlml_slam.estimation.landmark_models import POINT
 from rlml_slam.params import EkfParameters, from_mapping
-from rlml_slam.types import Detections, Motion, Observation
+from rlml_slam.types import ANONYMOUS, Detections, Motion, Observation
 
 LOOP = drive((0.5, 0.0, 4.0), (0.5, 1.2, 5.2), (0.5, 0.0, 6.0), (0.5, 1.2, 5.2), (0.5, 0.0, 3.0))
 BLIND = slice(60, 110)
@@ -128,3 +129,26 @@ def test_close_landmarks_that_tell_different_ids_are_never_made_one():
     found = estimator.reflectors()
     assert sorted(found.ids) == [7, 8]
     assert found.points[np.argsort(found.ids)] == pytest.approx(pair, abs=1e-6)
+
+
+def test_many_ambiguous_landmarks_at_once_have_no_more_branches_than_a_frame_can_pay(monkeypatch):
+    """Each that fits two doubled the branches: 16 of them in one scan took all of the memory."""
+    grid = np.stack(np.meshgrid(1.0 + np.arange(4.0), np.arange(4.0)), -1).reshape(-1, 2)
+    copies, copy = [], Branch.copy
+
+    def count(branch):
+        copies.append(1)
+        assert len(copies) < 1000
+        return copy(branch)
+
+    monkeypatch.setattr(Branch, 'copy', count)
+    estimator = Estimator(EkfParameters())
+    R = np.broadcast_to(0.02**2 * np.eye(2), (16, 2, 2))
+    ids, none = np.full(16, ANONYMOUS), np.full(16, np.nan)
+    for k in range(1, 60):
+        # between the 30th and the 31st scan, the robot may have gone anywhere within some metres
+        cov = np.diag([1.0, 1.0, 0.01]) if k == 31 else 1e-6 * np.eye(3)
+        seen = Detections(100_000_000 * k, 'base_link', grid, R, ids, none)
+        estimator.process(Observation(seen.stamp, Motion(np.zeros(3), cov), detections=seen))
+    assert copies
+    assert np.abs(estimator.filter.pose).max() < 0.1
