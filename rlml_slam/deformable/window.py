@@ -28,6 +28,8 @@ from rlml_slam.se2 import Array, transform, wrap
 from rlml_slam.types import ANONYMOUS, Detections, Motion, Status
 
 SLOTS = 4  # features are given room in steps of this many
+# candidates at one time; each takes room in every step of the window, and ghosts are many
+MAX_CANDIDATES = 8
 
 
 @dataclass(frozen=True)
@@ -208,6 +210,9 @@ class DeformableWindow:
         for i in np.flatnonzero((status == Status.USED) | (status == Status.NEW)).tolist():
             point, id = detections.points[i], int(detections.ids[i])
             new = status[i] == Status.NEW
+            if new and len(self._tracks) - len(self._confirmed()) >= MAX_CANDIDATES:
+                status[i] = Status.GHOST
+                continue
             slot = self._start_track(point) if new else slots[association.match[i]]
             keys[i] = self._see(slot, stamp, id, point, info[i])
         return keys, status

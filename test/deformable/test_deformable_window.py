@@ -170,6 +170,13 @@ def test_anonymous_features_are_followed_among_ghosts():
     assert e[:3] @ np.linalg.solve(P[:3, :3], e[:3]) < 16.3  # 99.9 % of chi^2 with 3
 
 
+def test_many_ghosts_take_a_bounded_room():
+    """Five in each scan took room for 130 features, and an update half a second."""
+    estimates, _, window = follow(steps(60, ids=False, false_detections=5.0))
+    assert len(estimates[-1].features.keys) >= 6
+    assert window._w.active.shape[1] <= 48
+
+
 def test_lone_ghost_is_never_a_feature_and_keys_are_never_reused():
     run = steps(100, false_detections=0.0)
     ghost = run[50].detections
