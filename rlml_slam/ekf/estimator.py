@@ -179,6 +179,8 @@ class Estimator:
                 unconfirmed=in_map.reason,
                 is_lost=in_map.is_lost,
                 contradicted=lasts and not in_map.is_pending,
+                maps=self._mapping,
+                position=pose[:2],
             ),
         )
         return Frame(

@@ -169,6 +169,28 @@ def test_ghost_never_enters_the_state():
     assert np.hypot(*(estimator.reflectors().points - [-3.0, -3.0]).T).min() > 2.0
 
 
+def test_a_long_way_while_mapping_is_uncertain_but_not_lost():
+    """The position is uncertain in the frame of the start, but not in the map around the robot."""
+    estimator, step = Estimator(EkfParameters()), np.array([0.5, 0.0, 0.0])
+    posts = np.array([[1.5 * k, 3.0 * (-1) ** k] for k in range(200)])
+    for k in range(1, 501):
+        p = posts - [0.5 * k, 0.0]
+        near = np.flatnonzero(np.hypot(*p.T) < 6.0)
+        m = len(near)
+        seen = Detections(
+            k * 100_000_000, 'base_link', p[near], np.tile(4e-3 * np.eye(2), (m, 1, 1)), near,
+            np.full(m, np.nan),
+        )  # fmt: skip
+        motion = Motion(step, np.diag([0.02, 0.02, 0.01]) ** 2)
+        frame = estimator.process(Observation(seen.stamp, motion, detections=seen))
+    assert estimator.pose_cov[1, 1] > 2.0**2
+    assert frame.health.level == Level.DEGRADED
+    blind = Motion(step, np.diag([0.3, 0.3, 0.01]) ** 2)
+    for k in range(501, 581):
+        frame = estimator.process(Observation(k * 100_000_000, blind))
+    assert frame.health.level == Level.LOST
+
+
 @pytest.mark.parametrize('ids', [False, True])
 def test_robot_that_is_carried_while_it_maps_is_lost_and_maps_nothing_twice(ids):
     estimator = Estimator(EkfParameters())
