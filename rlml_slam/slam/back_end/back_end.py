@@ -217,15 +217,13 @@ class BackEnd:
         return closure
 
     @property
-    def _has_changed(self) -> bool:
-        """Whether closures or sightings were added since the last solve."""
+    def _has_changed(self) -> bool:  # since the last solve
         return self.loop_closer.changed or self.reflector_graph.changed
 
     def optimize(self, final: bool = False) -> None:
         """Solve eq. 13, merge reflectors, align with the survey, check closures, correct.
 
-        Solved is what came since the last time, and once more after each step that changed the
-        graph. ``final``: by the batch solver, and a selection of closures is not put off.
+        Solved is what came since the last time, or, at the end, all by the batch solver.
         """
         if len(self.keyframes) < 2:
             return
@@ -264,9 +262,8 @@ class BackEnd:
 
     def _align_with_survey(self) -> bool:
         """Whether the survey changed the graph; pending hypotheses keep the current frame."""
-        if self.survey_frame is None or self.delayed_association.pending:
-            return False
-        return self.survey_frame.update()
+        frame, undecided = self.survey_frame, self.delayed_association.pending
+        return frame is not None and not undecided and frame.update()
 
     def _correct_local_frame(self) -> None:
         """Set ``T_map_local`` and its covariance from the newest keyframe."""
@@ -280,13 +277,16 @@ class BackEnd:
         self.known = newest_covariance(self.solver, bound, records, self.keyframes, T)
 
     def finish(self) -> None:
-        """Add what was collected since the last keyframe, decide associations, optimize."""
-        if self.interval is not None and self.keyframes:
+        """Add what came since the last keyframe, decide what is pending, optimize."""
+        if self.interval is not None:
             self._add_sightings(self.interval)
             self.interval = Interval(self.keyframes[-1].T_local)
             if self.delayed_association.decide(final=True):
                 self.optimize_after_join()
             self.optimize(final=True)
+            if self.loop_closer.decide_pending():
+                self._join_reflectors()
+                self.optimize(final=True)
 
     def belief(self) -> Belief | None:
         """Newest keyframe and all reflectors, with joint covariance; None without reflectors."""

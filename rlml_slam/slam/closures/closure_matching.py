@@ -21,11 +21,15 @@ from rlml_slam.matching.scans.scan_match import linearize, match
 from rlml_slam.matching.scans.search_pyramid import Pyramid
 from rlml_slam.matching.scans.submap import P_MIN, Submap
 from rlml_slam.matching.scans.visibility import hidden_share
-from rlml_slam.params import Parameters
+from rlml_slam.params import LoopClosure, Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.closure_candidates import Candidate
 from rlml_slam.slam.closures.closure_consistency import REPEATED_WRONG
-from rlml_slam.slam.closures.keyframe_submap import WEAK_INFORMATION, KeyframeSubmap
+from rlml_slam.slam.closures.keyframe_submap import (
+    WEAK_INFORMATION,
+    KeyframeSubmap,
+    edge_of_match,
+)
 from rlml_slam.slam.closures.local_map import Surroundings, local_map
 from rlml_slam.slam.closures.loop_closure import Closure
 from rlml_slam.slam.keyframes import Keyframe
@@ -75,6 +79,12 @@ class Match:
             self.m.anchor.index, self.key.index, self.T_grid_key, self.score, edge, why,
             self.overlap, self.second, number,
         )  # fmt: skip
+
+    def edge(self, p: LoopClosure) -> tuple[int, int, Array, Array]:
+        """Keyframes i, j, the pose of j in i (3,), and its information (3, 3)."""
+        floor = np.array(p.variance_floor)
+        measured = edge_of_match(self.m.T_anchor_grid, self.T_grid_key, self.information, floor)
+        return self.m.anchor.index, self.key.index, *measured
 
 
 class SearchResult(NamedTuple):

@@ -10,7 +10,7 @@ A closure that the scan match proposes passes four checks, each in a file of its
 4. monitoring after each solve: inconsistent ones are disabled (closure_monitor.py).
 
 In the graph it has a robust loss besides. Rejected closures are recorded, those that lack support
-stay pending.
+stay pending; at the end they are judged by all closures together (pending_closures.py).
 """
 
 from __future__ import annotations
@@ -35,9 +35,10 @@ from rlml_slam.slam.closures.closure_matching import UNDECIDED, ClosureMatcher, 
 from rlml_slam.slam.closures.closure_monitor import ClosureMonitor
 from rlml_slam.slam.closures.closure_records import ClosureRecords
 from rlml_slam.slam.closures.constellation_closure import ConstellationMatch
-from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap, edge_of_match
+from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap
 from rlml_slam.slam.closures.local_map import Surroundings
 from rlml_slam.slam.closures.loop_closure import Closure
+from rlml_slam.slam.closures.pending_closures import confirmed
 from rlml_slam.slam.closures.weak_match import keep_best
 from rlml_slam.slam.keyframes import FoundPose, Keyframe
 from rlml_slam.types import EdgeKind, Frame
@@ -186,34 +187,26 @@ class LoopCloser:
         matches = [r for r in results if isinstance(r, Match)]
         out = [r for r in results if isinstance(r, Closure)]
         if matches:
-            out += self._add_consistent(matches)
+            tested = [*self._pending, *matches]
+            out += self._accept(tested, _consistent(self._solver, tested, self._p), len(matches))
+        return self._record(out)
+
+    def decide_pending(self) -> bool:
+        """At the end: whether pending ones were added that all closures together confirm."""
+        right = confirmed(self._graph, self.records, self._pending, self._p)
+        return bool(self._record(self._accept(self._pending, right, 0)))
+
+    def _record(self, out: Sequence[Closure]) -> tuple[Closure, ...]:
         self.records.extend(out)
         for closure in out:
             self.tried[closure.accepted] += 1
         self._rejected.update((c.i, c.j) for c in out if not c.accepted)
         return tuple(out)
 
-    def _add_consistent(self, new: Sequence[Match]) -> list[Closure]:
-        """Add the consistent ones of the ``new`` and the pending matches; keep the others."""
-        matches, num_pending = [*self._pending, *new], len(self._pending)
-        deltas, informations = edge_of_match(
-            np.array([c.m.T_anchor_grid for c in matches]),
-            np.array([c.T_grid_key for c in matches]),
-            np.array([c.information for c in matches]),
-            np.array(self._p.loop_closure.variance_floor),
-        )
-        consistent = is_consistent(
-            self._solver,
-            np.array([(c.m.anchor.index, c.key.index) for c in matches], dtype=np.int64),
-            deltas,
-            np.asarray(np.linalg.inv(informations), dtype=np.float64),
-            uniform(np.array([c.search_area for c in matches])),
-            np.array([c.log_odds for c in matches]),
-            np.array([c.view_range for c in matches]),
-            np.array([c.weak or c.wide for c in matches]),
-        )
-        out = []
-        for n, (c, is_added) in enumerate(zip(matches, consistent.tolist(), strict=True)):
+    def _accept(self, matches: list[Match], right: Sequence[bool], num_new: int) -> list[Closure]:
+        """Add the ``right`` matches, the others are pending; the last ``num_new`` are new."""
+        out, num_pending = [], len(matches) - num_new
+        for n, (c, is_added) in enumerate(zip(matches, right, strict=True)):
             if is_added:
                 why = 'consistent' if n >= num_pending else 'consistent with later closures'
                 out.append(c.closure(c.source + why, self._add_edge(c), self._num_accepted))
@@ -225,17 +218,14 @@ class LoopCloser:
         if accepted:
             self.tried[False] -= self.records.remove_rejected(accepted)
             self._rejected -= accepted
-        left = [c for c, added in zip(matches, consistent.tolist(), strict=True) if not added]
+        left = [c for c, is_added in zip(matches, right, strict=True) if not is_added]
         left.sort(key=lambda c: not c.weak)  # stable: of too many, weak ones go first
         self._pending = left[-MAX_PENDING:]
         return out
 
     def _add_edge(self, c: Match) -> int:
-        floor = np.array(self._p.loop_closure.variance_floor)
-        delta, information = edge_of_match(c.m.T_anchor_grid, c.T_grid_key, c.information, floor)
         self.changed = True
-        i, j = c.m.anchor.index, c.key.index
-        return self._graph.add_edge(EdgeKind.CLOSURE, i, j, delta, information)
+        return self._graph.add_edge(EdgeKind.CLOSURE, *c.edge(self._p.loop_closure))
 
     def take_reflector_pairs(self) -> list[tuple[int, int]]:
         """Keys of reflectors joined by the closures that were added since the last call."""
@@ -300,3 +290,19 @@ class LoopCloser:
         self._num_solved = self._num_accepted
         rejected, accepted = arrays['closures_tried'].tolist()
         self.tried = {True: accepted, False: rejected}
+
+
+def _consistent(solver: OnlineSolver, matches: Sequence[Match], p: Parameters) -> list[bool]:
+    """Of each match, whether it is consistent with the graph, alone or with others."""
+    edges = [c.edge(p.loop_closure) for c in matches]
+    consistent = is_consistent(
+        solver,
+        np.array([(i, j) for i, j, _, _ in edges], dtype=np.int64),
+        np.array([delta for _, _, delta, _ in edges]),
+        np.asarray(np.linalg.inv(np.array([edge[3] for edge in edges])), dtype=np.float64),
+        uniform(np.array([c.search_area for c in matches])),
+        np.array([c.log_odds for c in matches]),
+        np.array([c.view_range for c in matches]),
+        np.array([c.weak or c.wide for c in matches]),
+    )
+    return [bool(c) for c in consistent]

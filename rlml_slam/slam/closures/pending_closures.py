@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which pending closures are right, judged by all closures together, once all of them are known.
+
+After a long loop the covariance of the graph is often many times too small, and then the check of
+each closure as it comes (closure_consistency.py) asks for more viewpoints than a drive has. The
+selection among all closures finds how far errors really are from their covariances
+(graph/robust/closure_selection.py), and takes groups that agree as one. It is made on a copy of
+the graph: closures that were accepted before are not touched, and pending ones that it refutes
+leave no trace.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+
+import numpy as np
+
+from rlml_slam.graph import Graph, select_closures
+from rlml_slam.params import Parameters
+from rlml_slam.slam.closures.closure_matching import Match
+from rlml_slam.slam.closures.closure_records import ClosureRecords
+from rlml_slam.slam.closures.loop_closure import State
+from rlml_slam.types import EdgeKind
+
+MIN_VIEWS = 2  # keyframes that one closure needs, as a pending one is not enough alone
+
+
+def confirmed(
+    graph: Graph, records: ClosureRecords, pending: Sequence[Match], p: Parameters
+) -> list[bool]:
+    """Of each pending match, whether it is right; of those of one keyframe, none."""
+    if len({c.key.index for c in pending}) < MIN_VIEWS:
+        return [False] * len(pending)
+    trial = deepcopy(graph)
+    edges = [trial.add_edge(EdgeKind.CLOSURE, *c.edge(p.loop_closure)) for c in pending]
+    revoked = [c.edge for c in records.accepted() if c.status.state is State.REVOKED]
+    chosen = select_closures(trial, p.solver, np.array(revoked, np.int64))
+    right = np.isin(edges, chosen.edges[chosen.accepted])
+    views = {c.key.index for c, is_right in zip(pending, right, strict=True) if is_right}
+    return [bool(r) for r in right & (len(views) >= MIN_VIEWS)]

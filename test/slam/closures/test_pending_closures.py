@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""At the end, pending closures are judged by all closures together."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from made_laps import LAP, SIGMA, true, two_laps
+
+from rlml_slam import se2
+from rlml_slam.graph.batch.solver import optimize
+from rlml_slam.graph.incremental.online_solver import OnlineSolver
+from rlml_slam.graph.model.graph import Graph
+from rlml_slam.matching.scans.submap import Submap
+from rlml_slam.params import Parameters
+from rlml_slam.slam.closures.closure_matching import Match
+from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap
+from rlml_slam.slam.closures.loop_closer import LoopCloser
+from rlml_slam.slam.keyframes import Keyframe
+from rlml_slam.types import EdgeKind
+
+P = Parameters()
+BEND = np.array([0.0, 0.0, 0.15])  # of the way before the second lap, where sigma is .005 rad
+
+
+def bent(rng):
+    """Two laps; between them the robot turned further than the front end says, and surely."""
+    steps, graph = two_laps(rng), Graph()
+    deltas = steps.edges.measured.copy()
+    deltas[LAP - 1] = se2.compose(deltas[LAP - 1], BEND)
+    graph.add_pose(true(0), fixed=True)
+    for k, delta in enumerate(deltas):
+        graph.add_pose(se2.compose(graph.poses[-1], delta))
+        graph.add_edge(EdgeKind.ODOMETRY, k, k + 1, delta, np.diag(SIGMA**-2))
+    return graph
+
+
+def matched(graph, i, j, rng, shift=(0.0, 0.0, 0.0)):
+    """A weak match of keyframe j with the submap of keyframe i, off by ``shift``."""
+    anchor, key = (Keyframe(k, k, graph.poses[k], np.eye(3), None, np.zeros(2), k) for k in (i, j))
+    delta = se2.between(true(i), se2.compose(np.array(shift), true(j)))
+    delta = se2.compose(delta, SIGMA * rng.standard_normal(3))
+    place = KeyframeSubmap(anchor, Submap(), size=1, T_anchor_grid=np.zeros(3))
+    return Match(
+        place, key, delta, np.diag(SIGMA**-2), 0.5, 0.9, 0.5, 36.0, np.log(0.1),
+        view_range=50.0, weak=True,
+    )  # fmt: skip
+
+
+def closer_of(graph, rng, nodes, shifts=None):
+    closer = LoopCloser(P, OnlineSolver(graph))
+    shifts = np.zeros((len(nodes), 3)) if shifts is None else shifts
+    for (i, j), shift in zip(nodes, shifts, strict=True):
+        closer._add([matched(graph, i, j, rng, shift)])
+    return closer
+
+
+NODES = [(k, k + LAP) for k in range(40, 70, 5)]
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_group_that_a_too_certain_graph_refuses_enters_at_the_end(seed):
+    rng = np.random.default_rng(seed)
+    graph = bent(rng)
+    closer = closer_of(graph, rng, NODES)
+    assert not [c for c in closer.records if c.accepted]  # at one viewpoint, by their range
+    count, before = len(graph.edges.nodes), graph.poses.copy()
+    assert closer.decide_pending()
+    accepted = [c for c in closer.records if c.accepted]
+    assert len(accepted) >= len(NODES) - 1
+    assert len(graph.edges.nodes) == count + len(accepted)
+    assert [c.number for c in accepted] == list(range(len(accepted)))
+    assert closer.tried[True] == len(accepted)
+    assert closer.tried[True] + closer.tried[False] == len(NODES)
+    np.testing.assert_array_equal(graph.poses, before)  # the solver is to move them
+    optimize(graph)
+    last = se2.between(true(60), true(60 + LAP)) - se2.between(
+        graph.poses[60], graph.poses[60 + LAP]
+    )
+    assert np.hypot(*last[:2]) < 0.2
+    assert not closer.decide_pending()
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_wrong_pending_closures_and_single_ones_stay_out_at_the_end(seed):
+    rng = np.random.default_rng(seed)
+    graph = bent(rng)
+    shifts = rng.uniform((-3.0, -3.0, -0.5), (3.0, 3.0, 0.5), (len(NODES), 3))
+    count = len(graph.edges.nodes)
+    assert not closer_of(graph, rng, NODES, shifts).decide_pending()
+    assert not closer_of(graph, rng, NODES[:1]).decide_pending()
+    assert len(graph.edges.nodes) == count
