@@ -144,7 +144,7 @@ def test_many_ambiguous_landmarks_at_once_have_no_more_branches_than_a_frame_can
     R = np.broadcast_to(0.02**2 * np.eye(2), (16, 2, 2))
     ids, none = np.full(16, ANONYMOUS), np.full(16, np.nan)
     for k in range(1, 60):
-        # between the 30th and the 31st scan, the robot may have gone anywhere within some metres
+        # between the 30th and the 31st scan, the robot may be anywhere within some metres
         cov = np.diag([1.0, 1.0, 0.01]) if k == 31 else 1e-6 * np.eye(3)
         seen = Detections(100_000_000 * k, 'base_link', grid, R, ids, none)
         estimator.process(Observation(seen.stamp, Motion(np.zeros(3), cov), detections=seen))
