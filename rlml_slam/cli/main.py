@@ -151,7 +151,8 @@ def main(
         if e.errno not in (errno.EPIPE, errno.ENOSPC):
             raise
         # the reader of our output went away, or its disk is full: what still waits goes nowhere
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if sys.stdout is not None:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if e.errno == errno.EPIPE:
             return BROKEN_PIPE
         print(f'{prog}: cannot write: {e.strerror}', file=sys.stderr)

@@ -21,7 +21,7 @@ from rlml_slam.ekf.filter import Filter
 from rlml_slam.ekf.likelihood import DECORRELATION
 from rlml_slam.ekf.matching import Matcher
 from rlml_slam.estimation.health import HealthInputs, HealthMonitor, ScanEvidence
-from rlml_slam.estimation.kidnapping_detection import KidnappingDetection, agree_with_map
+from rlml_slam.estimation.kidnapping_detection import agree_with_map
 from rlml_slam.estimation.landmark_models import POINT, line_model
 from rlml_slam.estimation.smoother import Smoothed, Start, smooth
 from rlml_slam.maps.occupancy import OccupancyGrid, render
@@ -59,7 +59,6 @@ class Estimator:
         self.branches = [Branch(self._p, self._matcher, filter_)]
         self.health = HealthMonitor(self._p.health)
         self.confirmation = MapConfirmation(self._p)
-        self.kidnapping = KidnappingDetection(self._p.health)
         self.fates: Counter[str] = Counter()
         self._mapping = self._p.node.mode == 'mapping'
         self._last_stamp: int | None = None
@@ -121,22 +120,15 @@ class Estimator:
             self._since = np.zeros(2)
         keys = itertools.count(self._next_key)
         key_of = cache(lambda i: next(keys))
-        # what a robot sees that was carried away is not new
-        mapping = self._mapping and self.kidnapping.since is None
-        frame = MeasuredFrame(seen, stamp, weight, mapping, key_of)
+        frame = MeasuredFrame(seen, stamp, weight, self._mapping, key_of)
         self.branches = _best(
             [child for b in self.branches for child in b.update(frame)],
             len(seen.z),
         )
         self._next_key = next(keys)
-        statuses = self.branches[0].associations.statuses
-        used = int((statuses == Status.USED).sum())
-        if used:
+        if (self.branches[0].associations.statuses == Status.USED).any():
             self._last_used = stamp
-        # lines and spikes change from place to place
-        if self._p.ekf.extractor == 'reflectors' and len(statuses):
-            self.kidnapping.check(stamp, False, False, len(statuses), used, not self._mapping)
-        self.fates.update(Status(s).name for s in statuses)
+        self.fates.update(Status(s).name for s in self.branches[0].associations.statuses)
 
     def _draw(self, observation: Observation) -> None:
         """Keep a scan for the grid where the robot has moved since the last one kept."""
@@ -166,8 +158,6 @@ class Estimator:
         in_map = self.confirmation
         agree = agree_with_map(n, used)
         in_map.check(observation.stamp, travel, n, used, agree, GridMatch(math.nan))
-        self.kidnapping.holds(observation.stamp)
-        lasts = self.kidnapping.has_lasted(observation.stamp, self._p.health.lost_time)
         health = self.health.evaluate(
             observation.stamp,
             HealthInputs(
@@ -178,7 +168,6 @@ class Estimator:
                 cov_map=cov,
                 unconfirmed=in_map.reason,
                 is_lost=in_map.is_lost,
-                contradicted=lasts and not in_map.is_pending,
                 maps=self._mapping,
                 position=pose[:2],
             ),

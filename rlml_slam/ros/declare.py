@@ -12,7 +12,8 @@ import contextlib
 import difflib
 import math
 import sys
-from collections.abc import Callable, Mapping
+from array import array
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -98,7 +99,7 @@ def _change(
     try:
         for p in given:
             d = known.get(p.name)
-            if d is None or node.get_parameter(p.name).value == p.value:
+            if d is None or _is_same(node.get_parameter(p.name).value, p.value):
                 continue  # rclpy's own, and what `ros2 param load` gives as it is
             group = getattr(parameters, d.group)
             before.append((group, d, getattr(group, d.field)))
@@ -114,6 +115,13 @@ def _change(
     for group, d, value in before:
         node.get_logger().info(f'{d.field}: {value} is now {getattr(group, d.field)}')
     return SetParametersResult(successful=True)
+
+
+def _is_same(value: Any, given: Any) -> bool:
+    """Whether two values of a parameter are equal; a list comes as an array over the wire."""
+    if isinstance(value, str) or not isinstance(value, Sequence | array):
+        return bool(value == given)
+    return isinstance(given, Sequence | array) and list(value) == list(given)
 
 
 def pace(timer: Any) -> Check:

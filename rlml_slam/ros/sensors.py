@@ -10,11 +10,13 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
+import numpy as np
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
+from rlml_slam import se2
 from rlml_slam.errors import InputError
 from rlml_slam.params import Node, Parameters
 from rlml_slam.ros.codecs.decode import frame, known_stamp
@@ -265,7 +267,7 @@ class Sensors:
             self._assumed.add(sensor)
         if sensor in self._assumed and self._is_placed(msg):
             self._assumed.discard(sensor)
-            if self._p.node.mode == 'mapping':  # a saved map shows by itself where the robot is
+            if _sits_elsewhere(self._feed, self._p.node, sensor):
                 self._start_again(f'{stream}: the place of {sensor!r} is on /tf_static only now')
         if len(seen) < MAX_SENSORS:
             seen.add(sensor)
@@ -321,6 +323,19 @@ def _others(node: Any, kinds: dict[str, str], known: set[str]) -> str:
         if t in kinds and topic not in known and not topic.startswith(own)
     ]
     return f'; of these types there are {", ".join(found[:8])}' if found else ''
+
+
+def _sits_elsewhere(feed: SensorInput[Any], n: Any, sensor: str) -> bool:
+    """Whether a map was begun with another place of a sensor than that of /tf_static.
+
+    A saved map shows by itself where the robot is.
+    """
+    try:
+        pose = feed.extrinsics.pose(n.base_frame, sensor)
+    except InputError:  # not planar: the feed refuses and counts its messages
+        return False
+    is_near = pose is not None and np.abs(se2.between(np.array(n.laser_pose), pose)).max() < 1e-3
+    return n.mode == 'mapping' and not (is_near and feed.hangs(sensor) == n.laser_upside_down)
 
 
 def _place(msg: Any) -> str:

@@ -76,10 +76,12 @@ def test_answers_are_deferred_for_reflectors_alone(extractor, delayed_associatio
     assert Matcher(params).defers is delayed_association
 
 
-@pytest.mark.parametrize('seed', range(4))
-def test_nearest_neighbour_waits_until_what_it_took_for_others_agrees(seed):
-    estimator, _, _ = run(blinded(seed), 'nearest')
-    assert np.hypot(*(estimator.trajectory()[1][-1] - LOOP[-1])[:2]) < 0.1
+def test_nearest_neighbour_takes_them_for_others():
+    worst = 0.0
+    for seed in range(4):
+        estimator, _, _ = run(blinded(seed), 'nearest')
+        worst = max(worst, float(np.hypot(*(estimator.trajectory()[1][-1] - LOOP[-1])[:2])))
+    assert worst > 0.1
 
 
 def test_one_branch_is_enough_where_landmarks_stay_in_view():

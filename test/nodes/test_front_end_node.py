@@ -475,6 +475,29 @@ def test_parameter_serves_where_nobody_tells_the_place_of_the_laser(live):
     np.testing.assert_allclose(node.last.observation.origin, [0.3, 0.1])
 
 
+@pytest.mark.parametrize(
+    'place', [{}, {'laser_pose': [0.2, 0.0, 0.0]}, {'rotation': (0.6, 0.0, 0.0, 0.8)}]
+)
+def test_map_goes_on_where_the_place_of_the_laser_comes_late_and_is_no_other(live, place):
+    """The same as ``laser_pose``, or not planar, which is refused; or with none at all."""
+    given = {k: v for k, v in place.items() if k == 'laser_pose'}
+    node = live.start(FrontEndNode, **given)
+    node.sensors._has_tf = node.sensors._waits = True
+    messages = list(room(seconds=6.0))
+    for stream, msg in messages[: len(messages) // 2]:
+        node.sensors.add(stream, msg)
+    before = node.control.session.session
+    late = encode.transform(make, SECOND, ('base_link', 'laser'), np.array([0.2, 0.0, 0.0]))
+    if 'rotation' in place:
+        r = late.transform.rotation
+        r.x, r.y, r.z, r.w = place['rotation']
+    if place:
+        node.sensors.extrinsics.add(decode.transforms(late))
+    for stream, msg in messages[len(messages) // 2 :]:
+        node.sensors.add(stream, msg)
+    assert node.control.session.session == before
+
+
 def test_front_end_starts_again_where_the_place_of_the_laser_comes_late(live):
     node = live.start(FrontEndNode)
     node.sensors._has_tf = node.sensors._waits = True

@@ -87,7 +87,8 @@ def test_words_that_yaml_takes_for_booleans_are_words(make_node, word):
 def test_parameters_that_were_dumped_are_loaded(make_node):
     node = make_node()
     declare(node)
-    dumped = [node.get_parameter(d.name) for d in declarations(Parameters)]
+    known = [node.get_parameter(d.name) for d in declarations(Parameters)]
+    dumped = [Parameter.from_parameter_msg(p.to_parameter_msg()) for p in known]  # over the wire
     assert all(result.successful for result in node.set_parameters(dumped))
     other = Parameter('odom_frame', value='other')
     assert not node.set_parameters_atomically([*dumped, other]).successful

@@ -50,6 +50,7 @@ NEARER = 1.5  # times as bright as nearer ones is a diffuse surface at most; mor
 FULL = 4  # octave from which on diffuse light falls with range: 2 m
 STANDS_OUT = 2.5  # least ratio of a reflector to that
 NOISE = 7.0  # sigmas of noisy intensities; half of them are between a wide surface and its darkest
+MOST_NOISE = 6.0  # logarithm of what noise may ask for: within the bounds of the contrast
 BELOW = 0.75  # share of the ratio of dim reflectors at which the threshold is
 SCANS = 200  # newest ones whose range noise is remembered
 SPOTS = 2000  # newest bright spots that are remembered
@@ -154,7 +155,8 @@ class ReflectorCalibration:
 
     def _stands_out(self) -> float:
         """Least ratio of a reflector to what is diffuse: none is noise."""
-        return max(STANDS_OUT, math.exp(NOISE * float(np.median(self._speckle or 0.0))))
+        noise = math.exp(min(NOISE * float(np.median(self._speckle or 0.0)), MOST_NOISE))
+        return max(STANDS_OUT, noise)
 
     def estimate(self) -> Calibration | None:
         """What the spots have in common, None if they are too few."""
@@ -169,6 +171,8 @@ class ReflectorCalibration:
         size, divergence, sigma = self._size.estimate()
         # below the dimmest reflectors, and as far above everything white as they allow
         contrast = min(max(self._p.contrast, least), max(math.sqrt(ratio), BELOW * ratio, least))
+        if math.isinf(ratio):  # nothing diffuse returns, whose noise that would be
+            contrast = self._p.contrast
         detector = replace(
             self._p, contrast=contrast, divergence=divergence,
             sigma_range=max(self._p.sigma_range, min(float(np.median(self._noise)), NOISY)),

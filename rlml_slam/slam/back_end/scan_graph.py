@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -119,22 +120,30 @@ class ScanGraph:
             m.centre = m.centre + (T[:2] - m.centre) / m.size
 
     def _finish(self, new: KeyframeSubmap) -> None:
-        """Finish a submap that shows something new; it replaces the older ones that it covers."""
+        """Finish a submap that shows a change; it replaces the older ones that it covers."""
         new.submap.complete()
         if self._p.back_end.keyframes_per_place:
-            if self._shows_the_same(new):
+            covered = [m for m in self.finished if self._is_covered(m, new)]
+            if self._adds_nothing(new, self.finished) and all(
+                self._adds_nothing(m, [new]) for m in covered
+            ):
                 return
-            self.finished = [m for m in self.finished if not self._is_covered(m, new)]
+            self.finished = [m for m in self.finished if m not in covered]
         self.finished.append(new)
 
-    def _shows_the_same(self, new: KeyframeSubmap) -> bool:
-        """Whether finished submaps have the walls of a new one, which would add its error."""
-        poses, left = self._graph.poses, new.walls
-        for m in self.finished:
-            T = se2.between(m.grid_pose(poses), new.grid_pose(poses))
-            gap, _ = m.wall_tree.query(se2.transform(T, left), distance_upper_bound=SAME_PLACE)
+    def _adds_nothing(self, m: KeyframeSubmap, others: Sequence[KeyframeSubmap]) -> bool:
+        """Whether other submaps have the walls of one, which would add its error to the map."""
+        poses, left = self._graph.poses, m.walls
+        for other in others:
+            T = se2.between(other.grid_pose(poses), m.grid_pose(poses))
+            middle = se2.transform(T, m.centre[None])[0]
+            if math.dist(middle, other.centre) > m.reach + other.reach:
+                continue
+            gap, _ = other.wall_tree.query(se2.transform(T, left), distance_upper_bound=SAME_PLACE)
             left = left[np.isinf(gap)]
-        return len(left) <= CHANGED * len(new.walls)
+            if len(left) <= CHANGED * len(m.walls):
+                return True
+        return False
 
     def _is_covered(self, old: KeyframeSubmap, new: KeyframeSubmap) -> bool:
         """Whether the walls of one submap are known to another one."""

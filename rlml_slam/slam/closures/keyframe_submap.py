@@ -43,6 +43,11 @@ class KeyframeSubmap:
         return self.submap.walls()
 
     @cached_property
+    def reach(self) -> float:
+        """Distance [m] of the farthest wall from the centre."""
+        return float(np.hypot(*(self.walls - self.centre).T).max(initial=0.0))
+
+    @cached_property
     def wall_tree(self) -> cKDTree:
         """The walls, for a search of the nearest one."""
         return cKDTree(self.walls)

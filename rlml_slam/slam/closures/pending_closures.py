@@ -19,6 +19,7 @@ import numpy as np
 from rlml_slam.graph import Graph, select_closures
 from rlml_slam.params import Parameters
 from rlml_slam.slam.closures.closure_matching import Match
+from rlml_slam.slam.closures.closure_monitor import MAJORITY
 from rlml_slam.slam.closures.closure_records import ClosureRecords
 from rlml_slam.slam.closures.loop_closure import State
 from rlml_slam.types import EdgeKind
@@ -29,13 +30,17 @@ MIN_VIEWS = 2  # keyframes that one closure needs, as a pending one is not enoug
 def confirmed(
     graph: Graph, records: ClosureRecords, pending: Sequence[Match], p: Parameters
 ) -> list[bool]:
-    """Of each pending match, whether it is right; of those of one keyframe, none."""
+    """Of each pending match, whether it is right; none if they are of one keyframe."""
     if len({c.key.index for c in pending}) < MIN_VIEWS:
         return [False] * len(pending)
     trial = deepcopy(graph)
     edges = [trial.add_edge(EdgeKind.CLOSURE, *c.edge(p.loop_closure)) for c in pending]
     revoked = [c.edge for c in records.accepted() if c.status.state is State.REVOKED]
     chosen = select_closures(trial, p.solver, np.array(revoked, np.int64))
-    right = np.isin(edges, chosen.edges[chosen.accepted])
+    active = np.isin(chosen.edges, np.flatnonzero(graph.edges.enabled))
+    if chosen.accepted[active].sum() < MAJORITY * active.sum():
+        return [False] * len(pending)  # it takes them instead of those that are accepted
+    # what alone connects two parts was not tested
+    right = np.isin(edges, chosen.edges[chosen.accepted & np.isfinite(chosen.evidence)])
     views = {c.key.index for c, is_right in zip(pending, right, strict=True) if is_right}
     return [bool(r) for r in right & (len(views) >= MIN_VIEWS)]
