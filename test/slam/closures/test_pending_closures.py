@@ -14,8 +14,10 @@ from rlml_slam.graph.model.graph import Graph
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import Parameters
 from rlml_slam.slam.closures.closure_matching import Match
+from rlml_slam.slam.closures.closure_records import ClosureRecords
 from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap
 from rlml_slam.slam.closures.loop_closer import LoopCloser
+from rlml_slam.slam.closures.pending_closures import confirmed
 from rlml_slam.slam.keyframes import Keyframe
 from rlml_slam.types import EdgeKind
 
@@ -90,3 +92,22 @@ def test_wrong_pending_closures_and_single_ones_stay_out_at_the_end(seed):
     assert not closer_of(graph, rng, NODES, shifts).decide_pending()
     assert not closer_of(graph, rng, NODES[:1]).decide_pending()
     assert len(graph.edges.nodes) == count
+
+
+@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('is_cut', [False, True])
+def test_group_that_contradicts_accepted_closures_stays_out(is_cut, seed):
+    """Between two parts without motion a selection takes the largest group, untested."""
+    rng = np.random.default_rng(seed)
+    whole, graph = bent(rng), Graph()
+    graph.add_pose(whole.poses[0], fixed=True)
+    graph.add_poses(whole.poses[1:])
+    for (i, j), delta in zip(whole.edges.nodes.tolist(), whole.edges.measured, strict=True):
+        if i != LAP - 1 or not is_cut:
+            graph.add_edge(EdgeKind.ODOMETRY, i, j, delta, np.diag(SIGMA**-2))
+    for k in range(20, 23):
+        edge = matched(graph, k, k + LAP, rng).edge(P.loop_closure)
+        graph.add_edge(EdgeKind.CLOSURE, *edge)
+    optimize(graph)
+    wrong = [matched(graph, k, k + LAP, rng, (3.0, 0.0, 0.0)) for k in range(40, 48)]
+    assert not any(confirmed(graph, ClosureRecords(), wrong, P))
