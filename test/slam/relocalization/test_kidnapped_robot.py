@@ -94,7 +94,7 @@ def walls():
     ],
 )
 def test_robot_carried_before_it_ever_moved_does_not_trust_new_submaps(walls, before, after):
-    """A submap of one scan tells no places apart; the next scans were another way, and OK."""
+    """A submap of one scan fits in many places; the next scans were another way, and OK."""
     path = np.vstack([[before] * 15, drive((0.4, 0.1, 4.0), start=after)])
     seen = observations(ROOM, path, reflectors=False, rng=np.random.default_rng(1))
     seen[15] = replace(seen[15], motion=STILL)
