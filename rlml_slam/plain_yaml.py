@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import yaml
@@ -13,7 +14,15 @@ MAX_CHARACTERS = 1 << 20
 MAX_EVENTS = 50_000  # values, beginnings and ends: 0.5 s with libyaml
 MAX_DEPTH = 50  # lists and mappings in each other
 MAX_SCALAR = 10_000  # characters of a value: 1:1:1... is a number to the base of 60
-LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)  # PyYAML without libyaml is slower
+
+
+class _Loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)):  # type: ignore[misc]
+    """8e-5 is a number, as in YAML 1.2 and ROS; without libyaml it is slower."""
+
+
+_Loader.add_implicit_resolver(
+    'tag:yaml.org,2002:float', re.compile(r'[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$'), '-+.0123456789'
+)
 
 
 def _check(text: str) -> None:
@@ -22,7 +31,7 @@ def _check(text: str) -> None:
     Also for too many values, too long ones, and too many in each other.
     """
     depth = 0
-    for count, event in enumerate(yaml.parse(text, LOADER)):
+    for count, event in enumerate(yaml.parse(text, _Loader)):
         if isinstance(event, yaml.AliasEvent):
             raise ValueError(f'an alias is not allowed here: line {event.start_mark.line + 1}')
         depth += isinstance(event, yaml.CollectionStartEvent)
@@ -39,7 +48,7 @@ def parse_yaml(text: str, source: str) -> Any:
         raise FileFormatError(f'{source}: {len(text)} characters, more than {MAX_CHARACTERS}')
     try:
         _check(text)
-        return yaml.load(text, LOADER)
+        return yaml.load(text, _Loader)
     # some values (the 99th of a month) are errors of Python's own
     except (yaml.YAMLError, ValueError, TypeError, OverflowError, RecursionError) as e:
         reason = str(e).splitlines() or [type(e).__name__]

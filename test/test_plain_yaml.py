@@ -19,6 +19,11 @@ def test_plain_values_are_read():
     }
 
 
+def test_exponents_need_no_point():
+    assert parse_yaml('[8e-05, 1E3, -.5e+2, 2.e1]', 'f') == [8e-05, 1e3, -50.0, 20.0]
+    assert parse_yaml('[1e, e5, 1e5x, 0x1e5]', 'f') == ['1e', 'e5', '1e5x', 0x1E5]
+
+
 @pytest.mark.parametrize(
     ('text', 'why'),
     [
