@@ -28,7 +28,7 @@ class BackEnd(Group):
     )
     scan_edge_variance_floor: tuple[float, ...] = param(
         (1e-4, 1e-4, 4e-6),
-        'variance added to every scan edge: the error that keyframes of one submap share',
+        'variance of the error that all keyframes of one submap share',
         'm², m², rad²',
         0.0,
         100.0,

@@ -63,25 +63,30 @@ class Selection:
 
 
 def select_closures(
-    graph: Graph, parameters: params.Solver | None = None, excluded: Ints | None = None
-) -> Selection:
+    graph: Graph, parameters: params.Solver | None = None, excluded: Ints | None = None,
+    least_scale: float = 0.0,
+) -> Selection:  # fmt: skip
     """Enable the consistent closures and disable all others.
 
     The edges ``excluded`` stay disabled in any case. All other factors are trusted: odometry and
-    scan edges have no robust loss here, and the estimate is the optimum of that. Raises
-    SolverError like ``optimize``.
+    scan edges have no robust loss here, and the estimate is the optimum of that. Their
+    covariances are scaled as short loops show, by ``least_scale`` at least: short loops do not
+    show the errors of a long way that come from a few places. Raises SolverError like
+    ``optimize``.
     """
     losses = graph.losses
     # a robust loss would let a wrong closure tear the way apart, and then all would fit
     graph.losses = replace(losses, closure=Loss(), odometry=Loss(), scan=Loss())
     try:
-        return _Selector(graph, parameters or params.Solver(), excluded).run()
+        return _Selector(graph, parameters or params.Solver(), excluded, least_scale).run()
     finally:
         graph.losses = losses
 
 
 class _Selector:
-    def __init__(self, graph: Graph, parameters: params.Solver, excluded: Ints | None) -> None:
+    def __init__(
+        self, graph: Graph, parameters: params.Solver, excluded: Ints | None, least_scale: float
+    ) -> None:
         e = graph.edges
         self._graph, self._parameters = graph, parameters
         is_closure = e.kinds == FactorKind.CLOSURE
@@ -94,6 +99,7 @@ class _Selector:
         spanning_forest = SpanningForest(graph, trusted)
         area = extent2(spanning_forest.poses)
         self._groups = group(spanning_forest, self._nodes, self._z, self._cov, area)
+        self._scale = max(self._groups.scale, least_scale)
         self._bridges = _bridges(spanning_forest, self._nodes, self._groups, allowed)
         if self._bridges.any():
             bridges = self._edges[self._bridges]
@@ -112,9 +118,7 @@ class _Selector:
         """Accept closures, then review all of them."""
         self._grow()
         self._review()
-        return Selection(
-            self._edges, self._accepted, self._evidence, self._groups.scale, self._solves
-        )
+        return Selection(self._edges, self._accepted, self._evidence, self._scale, self._solves)
 
     def _grow(self) -> None:
         """Accept closures until none of the rest is more likely right than wrong."""
@@ -261,7 +265,7 @@ class _Selector:
         e_in, S_in = left_out(self._graph, marginals, self._edges[inside])
         both = np.concatenate([inside, outside])
         e, S = np.concatenate([e_in, e_out]), np.concatenate([S_in, S_out])
-        scale = self._groups.scale
+        scale = self._scale
         wrong = near_by(self._graph.poses, self._z[inside], scale * S_in)
         tested, values = np.zeros(len(self._edges), np.bool_), np.zeros(len(self._edges))
         if len(both):
@@ -270,7 +274,7 @@ class _Selector:
         return tested, values
 
     def _evidence_of(self, e: Array, S: Array) -> Array:
-        return evidence(e, S, self._groups.scale, self._wrong)
+        return evidence(e, S, self._scale, self._wrong)
 
 
 def _bridges(forest: SpanningForest, nodes: Ints, groups: Groups, allowed: Flags) -> Flags:

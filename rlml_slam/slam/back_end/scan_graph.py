@@ -94,7 +94,9 @@ class ScanGraph:
         if found.score < p.min_score or key.index == m.anchor.index:
             return
         information = scan_information.information(m.submap, points, found.pose, p)
-        floor = np.array(self._p.back_end.scan_edge_variance_floor)
+        # so many keyframes are in the same two submaps: the mean of their edges has all of it
+        sharing = self._p.back_end.submap_size / 2
+        floor = sharing * np.array(self._p.back_end.scan_edge_variance_floor)
         delta, information = edge_of_match(m.T_anchor_grid, found.pose, information, floor)
         self._graph.add_edge(EdgeKind.SCAN, m.anchor.index, key.index, delta, information)
 

@@ -25,6 +25,9 @@ MIN_BASELINE = 1.0  # [m] between two viewpoints that count as more than one
 # Probability that a wrong place which fits from one viewpoint also fits from the next one; among
 # the wrong matches of two real logs the share was lower.
 REPEATED_WRONG = 0.1
+# share of the log odds of a weak match that its support for others lacks: where a place need not
+# fit well, a wrong one fits again more often
+REPEATED_WEAK = 0.75
 FALSE_AGREEMENT = 0.1  # expected number of accidental agreements among the pending closures
 
 
@@ -53,10 +56,13 @@ def is_consistent(
     # a weak or wide match may not enter alone, wherever the graph expects it
     alone = np.where(weak, np.minimum(alone, 0.0), alone)
     agree = _agreement(graph, between, nodes, deltas, covs, wrong)
+    odds = np.broadcast_to(log_odds, len(nodes))
     ranges, positions = np.broadcast_to(view_range, len(nodes)), graph.poses[:, :2]
-    views = np.array([_num_viewpoints(positions, j[row], ranges[row]) for row in agree])
+    together = np.array(
+        [_log_odds(positions, j[row], ranges[row], np.minimum(odds[row], 0.0)) for row in agree]
+    )
     # prior odds 1 : 1; of verified matches about 1 % are wrong
-    return np.asarray(log_odds + alone - (views - 1) * math.log(REPEATED_WRONG) > 0.0)
+    return np.asarray(np.maximum(odds, 0.0) + alone + together > 0.0)
 
 
 class _RelativeCovariance:
@@ -106,17 +112,24 @@ def _agreement(
     return out
 
 
-def _num_viewpoints(positions: Array, poses: Ints, ranges: Array) -> float:
-    """Number of independent viewpoints of the poses (k,), in the order of driving.
+def _log_odds(positions: Array, poses: Ints, ranges: Array, odds: Array) -> float:
+    """Log odds of matches that agree, of the poses (k,), eq. 58: their sum over viewpoints.
 
     ``positions`` (n, 2) are those of all poses, ``ranges`` (k,) [m] the median ranges of the
-    scans. A viewpoint counts as a new one after a travel of the median range, and as a share of
-    one before.
+    scans, ``odds`` (k,) the log odds of each match alone, at most 0. In the order of driving, a
+    viewpoint counts as a new one after a travel of the median range, and as a share of one before.
+    Of the matches from one viewpoint the best counts.
     """
-    poses, first = np.unique(poses, return_index=True)
-    count, last = 1.0, positions[poses[0]]
-    for position, median in zip(positions[poses], ranges[first].tolist(), strict=True):
-        travel = math.dist(position, last)
-        if travel >= MIN_BASELINE:
-            count, last = count + min(travel / max(median, MIN_BASELINE), 1.0), position
-    return count
+    shares, best, last = list[float](), list[float](), positions[poses.min()]
+    for k in np.argsort(poses, kind='stable').tolist():
+        travel = math.dist(positions[poses[k]], last)
+        if not shares or travel >= MIN_BASELINE:
+            shares.append(min(travel / max(float(ranges[k]), MIN_BASELINE), 1.0))
+            best.append(-math.inf)
+            last = positions[poses[k]]
+        best[-1] = max(best[-1], float(odds[k]))
+    further = [
+        u * (REPEATED_WEAK * b - math.log(REPEATED_WRONG))
+        for u, b in zip(shares, best, strict=True)
+    ]
+    return best[0] + sum(further[1:])

@@ -36,7 +36,9 @@ def confirmed(
     trial = deepcopy(graph)
     edges = [trial.add_edge(EdgeKind.CLOSURE, *c.edge(p.loop_closure)) for c in pending]
     revoked = [c.edge for c in records.accepted() if c.status.state is State.REVOKED]
-    chosen = select_closures(trial, p.solver, np.array(revoked, np.int64))
+    revoked_edges = np.array(revoked, np.int64)
+    # covariances of this graph are right for what is short: errors of a long way are not smaller
+    chosen = select_closures(trial, p.solver, revoked_edges, least_scale=1.0)
     active = np.isin(chosen.edges, np.flatnonzero(graph.edges.enabled))
     if chosen.accepted[active].sum() < MAJORITY * active.sum():
         return [False] * len(pending)  # it takes them instead of those that are accepted

@@ -27,6 +27,7 @@ from rlml_slam.params import BackEnd as BackEndParameters
 from rlml_slam.params import LoopClosure, Node, Parameters
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.closures.closure_candidates import candidates
+from rlml_slam.slam.closures.closure_consistency import _RelativeCovariance
 from rlml_slam.slam.closures.closure_matching import ClosureMatcher
 from rlml_slam.slam.closures.keyframe_submap import TURN, KeyframeSubmap, edge_of_match
 from rlml_slam.slam.keyframes import FoundPose, Interval, Keyframe, Sighting
@@ -503,6 +504,22 @@ def test_no_submap_spans_a_pose_or_a_point_that_is_wrong(spoiled):
     assert len(sizes) > before > 0  # others begin behind it
     assert 0 < min(sizes) <= max(sizes) < 1_000_000
     assert back_end.keyframes[-1].stamp > frames[half + 20].stamp
+
+
+@pytest.mark.parametrize('size', [10, 40])
+def test_error_that_keyframes_of_a_submap_share_does_not_average_out(size):
+    p = BackEndParameters(submap_size=size, keyframes_per_place=0)
+    floor = np.array(p.scan_edge_variance_floor)
+    closures = LoopClosure(enabled=False)
+    parameters = Parameters(back_end=p, loop_closure=closures)
+    back_end, _ = run(frames_along(LAP, BLOCK, scan=True), parameters)
+    anchors = np.array([m.anchor.index for m in back_end.scan_graph.finished])
+    back_end.solver.solve()
+    covs = _RelativeCovariance(back_end.solver, anchors).covs(anchors[:-1], anchors[1:])
+    assert len(covs) >= 2
+    # an edge to each of the two submaps; the odometry beside them is worth less
+    heading = covs[:, 2, 2] / floor[2]
+    assert ((heading > 1.0) & (heading < 4.0)).all()
 
 
 def test_edge_of_a_scan_that_leaves_a_direction_open_enters_the_graph():

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from made_laps import COV, LAP, true, two_laps
@@ -13,7 +15,11 @@ from rlml_slam.graph.incremental.online_solver import OnlineSolver
 from rlml_slam.graph.model.graph import Graph
 from rlml_slam.graph.robust.inlier_evidence import uniform
 from rlml_slam.graph.robust.spanning_forest import SpanningForest
-from rlml_slam.slam.closures.closure_consistency import _RelativeCovariance, is_consistent
+from rlml_slam.slam.closures.closure_consistency import (
+    REPEATED_WRONG,
+    _RelativeCovariance,
+    is_consistent,
+)
 from rlml_slam.types import EdgeKind
 
 WRONG = uniform(6.0)
@@ -24,13 +30,16 @@ def graph():
     return two_laps(np.random.default_rng(3))
 
 
-def tried(graph, ends, shift=(0.0, 0.0, 0.0), view_range=0.0):
+def tried(graph, ends, shift=(0.0, 0.0, 0.0), view_range=0.0, log_odds=0.0):
     """Whether closures (i, j) may enter which say that the true places are off by a shift."""
     nodes = np.array(ends)
     off = se2.compose(np.asarray(shift, dtype=np.float64), true(nodes[:, 1]))
     deltas = se2.between(true(nodes[:, 0]), off)
     covs = np.broadcast_to(COV, (len(nodes), 3, 3))
-    return is_consistent(OnlineSolver(graph), nodes, deltas, covs, WRONG, view_range=view_range)
+    weak = np.asarray(log_odds) < 0.0
+    return is_consistent(
+        OnlineSolver(graph), nodes, deltas, covs, WRONG, log_odds, view_range, weak
+    )
 
 
 def sure(graph):
@@ -97,6 +106,35 @@ def test_views_of_the_same_walls_count_as_one(graph):
     ends = [(k, k + LAP) for k in range(5, 70, 5)]
     assert tried(sharp, ends, far, view_range=1.0).all()
     assert not tried(sharp, ends, far, view_range=5.0).any()
+
+
+def test_weak_matches_support_others_less(graph):
+    ends, weakest = [(k, k + LAP) for k in range(5, 70, 5)], math.log(REPEATED_WRONG)
+    odds = np.zeros(len(ends))
+    assert tried(graph, ends[:2], log_odds=[weakest, 0.0]).any()
+    assert not tried(graph, ends[:2], log_odds=[weakest, 0.1 * weakest]).any()
+    assert not tried(graph, ends[:2], log_odds=weakest).any()
+    odds[:6] = weakest
+    assert tried(graph, ends, log_odds=odds).all()
+
+
+def test_of_one_viewpoint_the_best_match_counts(graph):
+    ends = [(5, 5 + LAP), (25, 25 + LAP), (26, 25 + LAP)]
+    weakest = math.log(REPEATED_WRONG)
+    assert tried(graph, ends, log_odds=[0.5 * weakest, weakest, 0.6 * weakest]).all()
+    assert not tried(graph, ends, log_odds=[0.5 * weakest, weakest, weakest]).any()
+
+
+def test_weaker_matches_need_more_viewpoints(graph):
+    ends = [(k, k + LAP) for k in range(5, 70, 5)]
+
+    def asked(odds):
+        return next(
+            n for n in range(1, len(ends) + 1) if tried(graph, ends[:n], log_odds=odds).any()
+        )
+
+    asked_of = [asked(share * math.log(REPEATED_WRONG)) for share in (0.1, 0.6, 1.0)]
+    assert asked_of == [2, 3, 6]
 
 
 def test_wrong_ones_that_disagree_help_no_one(graph):

@@ -25,6 +25,16 @@ P = Parameters()
 BEND = np.array([0.0, 0.0, 0.15])  # of the way before the second lap, where sigma is .005 rad
 
 
+class NoNoise(np.random.Generator):
+    """Draws nothing but zeros."""
+
+    def __init__(self):
+        super().__init__(np.random.PCG64(0))
+
+    def standard_normal(self, size=None):
+        return np.zeros(size)
+
+
 def bent(rng):
     """Two laps; between them the robot turned further than the front end says, and surely."""
     steps, graph = two_laps(rng), Graph()
@@ -81,6 +91,15 @@ def test_group_that_a_too_certain_graph_refuses_enters_at_the_end(seed):
     )
     assert np.hypot(*last[:2]) < 0.2
     assert not closer.decide_pending()
+
+
+def test_short_loops_that_fit_too_well_do_not_make_a_long_way_surer():
+    """The bend is one of 3 sigma; that neighbours agree exactly changes nothing."""
+    graph = bent(NoNoise())
+    closer = closer_of(graph, NoNoise(), NODES)
+    assert not [c for c in closer.records if c.accepted]
+    assert closer.decide_pending()
+    assert len([c for c in closer.records if c.accepted]) == len(NODES)
 
 
 @pytest.mark.parametrize('seed', range(8))
