@@ -24,6 +24,12 @@ def test_exponents_need_no_point():
     assert parse_yaml('[1e, e5, 1e5x, 0x1e5]', 'f') == ['1e', 'e5', '1e5x', 0x1E5]
 
 
+def test_long_texts_of_digits_are_no_numbers():
+    """Where the cost is the square of the length, this takes a minute."""
+    text = '1' * 9990 + 'x'
+    assert parse_yaml('\n'.join(80 * [f'- {text}']), 'f') == 80 * [text]
+
+
 @pytest.mark.parametrize(
     ('text', 'why'),
     [

@@ -11,12 +11,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rich.console import Console
 from rich.progress import Progress
 
-from rlml_slam.errors import ParameterError
+from rlml_slam.errors import FileFormatError, ParameterError
 from rlml_slam.params import SimulatorParameters, from_mapping, read_yaml
+from rlml_slam.plain_yaml import parse_yaml
 from rlml_slam.ros.bags.bag import BagWriter
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_bag
@@ -82,9 +82,9 @@ def _assignment(text: str) -> tuple[str, Any]:
     if not equals:
         raise ParameterError(f'--set {text}: is not NAME=VALUE')
     try:
-        return name.strip(), yaml.safe_load(value)
-    except yaml.YAMLError as e:
-        raise ParameterError(f'--set {text}: the value is not YAML') from e
+        return name.strip(), parse_yaml(value, f'--set {text}')
+    except FileFormatError as e:
+        raise ParameterError(str(e)) from e
 
 
 def run(args: argparse.Namespace) -> int:

@@ -26,11 +26,16 @@ def test_the_order_of_the_beams_does_not_matter(voxel, most):
     np.testing.assert_array_equal(thin(POINTS[::-1], voxel, most), kept[::-1])
 
 
-def test_a_mirrored_scan_is_thinned_alike():
-    flip = np.array([1.0, -1.0])
-    np.testing.assert_array_equal(
-        thin((POINTS * flip)[::-1], 0.1, 300), (thin(POINTS, 0.1, 300) * flip)[::-1]
-    )
+@pytest.mark.parametrize('digits', [2, 3, 9])
+def test_a_mirrored_scan_is_thinned_alike(digits):
+    """Ranges are often rounded, so that neighbours have the same."""
+    beams = np.radians(np.arange(-134.9, 135.0, 0.25))
+    ranges = np.round(3.0 + np.sin(3.0 * beams + 0.5), digits)
+    points = ranges[:, None] * np.column_stack([np.cos(beams), np.sin(beams)])
+    flip, kept = np.array([1.0, -1.0]), thin(points, 0.1, 100000)
+    assert len(kept) < 0.5 * len(points)
+    np.testing.assert_array_equal(thin(points[::-1], 0.1, 100000), kept[::-1])
+    np.testing.assert_array_equal(thin((points * flip)[::-1], 0.1, 100000), (kept * flip)[::-1])
 
 
 def test_thinning_again_changes_nothing():

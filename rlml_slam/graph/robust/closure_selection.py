@@ -52,7 +52,7 @@ class Selection:
     """``edges`` (k,) are the closures, ``accepted`` (k,) whether they are in the graph.
 
     ``evidence`` (k,) is the log ratio of right to wrong when each was tested last, infinite for
-    one that alone connects two parts. ``scale`` of the covariances, as found.
+    one that alone connects two parts. ``scale`` of the covariances, as found or the least.
     """
 
     edges: Ints

@@ -12,13 +12,16 @@ import numpy as np
 from rlml_slam.compiled import brief
 from rlml_slam.se2 import Array
 
+TIE = 1e-6  # [m] ranges that differ by less are equal, then the point farther ahead is the farther
+
 
 def thin(points: Array, voxel: float, max_points: int) -> Array:
     """The points ``(n, 2)`` kept, in their order: the middle of each voxel, then evenly chosen.
 
     ``voxel`` [m], 0 keeps all; of an even number in a voxel, the nearer of both in the middle is
     kept. Of more than ``max_points`` that remain, every (n / max_points)-th is kept. Points that
-    are not finite are dropped. Points in reverse order give the same points in reverse order.
+    are not finite are dropped. Points in reverse order give the same points in reverse order, but
+    for the middle one of an odd number out of an even one.
     """
     points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
     return thin_points(points, voxel, max_points)
@@ -60,9 +63,10 @@ def thin_points(points: Array, voxel: float, max_points: int) -> Array:
             kept[k], lower[slot] = True, k
             count += 1
         elif passed[slot] == counts[slot] // 2:
-            near = lower[slot]
-            if np.hypot(points[k, 0], points[k, 1]) < np.hypot(points[near, 0], points[near, 1]):
-                kept[k], kept[near] = True, False
+            q = lower[slot]
+            more = np.hypot(points[k, 0], points[k, 1]) - np.hypot(points[q, 0], points[q, 1])
+            if more < -TIE or (more < TIE and abs(points[k, 0]) < abs(points[q, 0])):
+                kept[k], kept[q] = True, False
         passed[slot] += 1
     m = min(count, max_points)
     out = np.empty((m, 2))

@@ -58,9 +58,7 @@ def is_consistent(
     agree = _agreement(graph, between, nodes, deltas, covs, wrong)
     odds = np.broadcast_to(log_odds, len(nodes))
     ranges, positions = np.broadcast_to(view_range, len(nodes)), graph.poses[:, :2]
-    together = np.array(
-        [_log_odds(positions, j[row], ranges[row], np.minimum(odds[row], 0.0)) for row in agree]
-    )
+    together = _together(positions, j, ranges, np.minimum(odds, 0.0), agree)
     # prior odds 1 : 1; of verified matches about 1 % are wrong
     return np.asarray(np.maximum(odds, 0.0) + alone + together > 0.0)
 
@@ -109,6 +107,23 @@ def _agreement(
     S = S + B @ between.covs(i[b], i[a]) @ np.swapaxes(B, 1, 2)
     density = np.maximum(wrong[a], wrong[b])  # that of the smaller search area
     out[a, b] = out[b, a] = evidence(e, S, 1.0, density) > math.log(k / FALSE_AGREEMENT)
+    return out
+
+
+def _together(
+    positions: Array, poses: Ints, ranges: Array, odds: Array, agree: NDArray[np.bool_]
+) -> Array:
+    """Log odds (k,) of each match with those that agree with it (k, k); others as _log_odds.
+
+    Matches that are weaker than one are left out where that is better for it: they never harm.
+    """
+    out = np.empty(len(poses))
+    for row in np.unique(agree, axis=0):
+        of = np.flatnonzero((agree == row).all(axis=1))
+        least = np.unique(odds[row])
+        parts = [row & (odds >= weakest) for weakest in least]
+        each = [_log_odds(positions, poses[p], ranges[p], odds[p]) for p in parts]
+        out[of] = np.maximum.accumulate(each)[np.searchsorted(least, odds[of])]
     return out
 
 

@@ -122,7 +122,26 @@ def test_of_one_viewpoint_the_best_match_counts(graph):
     ends = [(5, 5 + LAP), (25, 25 + LAP), (26, 25 + LAP)]
     weakest = math.log(REPEATED_WRONG)
     assert tried(graph, ends, log_odds=[0.5 * weakest, weakest, 0.6 * weakest]).all()
+    assert tried(graph, ends, log_odds=[0.5 * weakest, 0.6 * weakest, weakest]).any()
     assert not tried(graph, ends, log_odds=[0.5 * weakest, weakest, weakest]).any()
+
+
+def test_matches_that_are_weaker_never_harm(graph):
+    weakest = math.log(REPEATED_WRONG)
+    strong = [(20, 20 + LAP), (30, 30 + LAP)]
+    for shift in ((0.7, 0.0, 0.0), (0.85, 0.0, 0.0), (1.0, 0.0, 0.0)):
+        for count in (1, 2):
+            before = tried(graph, strong[:count], shift, 10.0)
+            both = tried(
+                graph, [(16, 16 + LAP), *strong[:count]], shift, 10.0, [weakest] + count * [0.0]
+            )
+            assert (both[1:] >= before).all()
+
+
+def test_odds_of_what_proposed_a_match_are_its_own(graph):
+    far, sharp = (2.0, 0.0, 0.0), sure(graph)
+    ends = [(5, 5 + LAP), (25, 25 + LAP)]
+    assert tried(sharp, ends, far, log_odds=[100.0, 0.0]).tolist() == [True, False]
 
 
 def test_weaker_matches_need_more_viewpoints(graph):
