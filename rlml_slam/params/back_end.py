@@ -28,7 +28,7 @@ class BackEnd(Group):
     )
     scan_edge_variance_floor: tuple[float, ...] = param(
         (1e-4, 1e-4, 4e-6),
-        'variance that keyframes of one submap share; an edge gets submap_size / 2 times it',
+        'variance that keyframes of a submap share; times submap_size / 2 without reflectors',
         'm², m², rad²',
         0.0,
         100.0,

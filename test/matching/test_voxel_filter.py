@@ -15,7 +15,7 @@ def test_keeps_the_middle_point_of_every_voxel_in_order():
     for cell in np.unique(np.floor(POINTS / 0.5), axis=0):
         (there,) = np.nonzero((np.floor(POINTS / 0.5) == cell).all(axis=1))
         both = there[(len(there) - 1) // 2], there[len(there) // 2]
-        middle.append(min(both, key=lambda k: np.hypot(*POINTS[k])))
+        middle.append(min(both, key=lambda k: np.abs(POINTS[k]) @ (1.0, np.sqrt(2.0))))
     assert len(middle) < len(POINTS)
     np.testing.assert_array_equal(kept, POINTS[np.sort(middle)])
 

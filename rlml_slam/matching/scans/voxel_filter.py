@@ -7,21 +7,23 @@ each voxel, a robot that drives along corridors slowly turns in its map, always 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from rlml_slam.compiled import brief
 from rlml_slam.se2 import Array
 
-TIE = 1e-6  # [m] ranges that differ by less are equal, then the point farther ahead is the farther
+TILT = math.sqrt(2.0)  # so that no wall at right angles to the robot has points that are equal
 
 
 def thin(points: Array, voxel: float, max_points: int) -> Array:
     """The points ``(n, 2)`` kept, in their order: the middle of each voxel, then evenly chosen.
 
-    ``voxel`` [m], 0 keeps all; of an even number in a voxel, the nearer of both in the middle is
-    kept. Of more than ``max_points`` that remain, every (n / max_points)-th is kept. Points that
-    are not finite are dropped. Points in reverse order give the same points in reverse order, but
-    for the middle one of an odd number out of an even one.
+    ``voxel`` [m], 0 keeps all; of the two in the middle of an even number, the one with the
+    smaller |x| + 1.4 |y| is kept. Of more than ``max_points`` that remain, every
+    (n / max_points)-th is kept. Points that are not finite are dropped. Points in reverse order
+    give the same points in reverse order, but for the middle one of an odd number out of an even.
     """
     points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
     return thin_points(points, voxel, max_points)
@@ -64,8 +66,8 @@ def thin_points(points: Array, voxel: float, max_points: int) -> Array:
             count += 1
         elif passed[slot] == counts[slot] // 2:
             q = lower[slot]
-            more = np.hypot(points[k, 0], points[k, 1]) - np.hypot(points[q, 0], points[q, 1])
-            if more < -TIE or (more < TIE and abs(points[k, 0]) < abs(points[q, 0])):
+            x, y = abs(points[k, 0]) - abs(points[q, 0]), abs(points[k, 1]) - abs(points[q, 1])
+            if x + TILT * y < 0.0:
                 kept[k], kept[q] = True, False
         passed[slot] += 1
     m = min(count, max_points)

@@ -94,11 +94,19 @@ class ScanGraph:
         if found.score < p.min_score or key.index == m.anchor.index:
             return
         information = scan_information.information(m.submap, points, found.pose, p)
-        # so many keyframes are in the same two submaps: the mean of their edges has all of it
-        sharing = self._p.back_end.submap_size / 2
-        floor = sharing * np.array(self._p.back_end.scan_edge_variance_floor)
+        floor = self._shared(key) * np.array(self._p.back_end.scan_edge_variance_floor)
         delta, information = edge_of_match(m.T_anchor_grid, found.pose, information, floor)
         self._graph.add_edge(EdgeKind.SCAN, m.anchor.index, key.index, delta, information)
+
+    def _shared(self, key: Keyframe) -> float:
+        """Factor of the variance that keyframes of a submap share, for one edge.
+
+        So many keyframes are in the same two submaps: the mean of their edges is to have all
+        of it. Where reflectors are seen, these tie the submaps together, and the edges hold the
+        keyframes of one submap against each other, where the error that they share cancels.
+        """
+        seen = self._graph.sightings.nodes[-1:, 0]
+        return 1.0 if key.index - 1 in seen else self._p.back_end.submap_size / 2
 
     def _insert(self, key: Keyframe, points: Array) -> None:
         """Insert a scan into the active submaps; each starts half-way through the one before."""

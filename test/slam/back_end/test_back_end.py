@@ -522,6 +522,18 @@ def test_error_that_keyframes_of_a_submap_share_does_not_average_out(size):
     assert ((heading > 1.0) & (heading < 2.2)).all()
 
 
+def test_where_reflectors_are_seen_the_edges_hold_the_keyframes_of_a_submap():
+    floor = np.array(BackEndParameters().scan_edge_variance_floor)
+
+    def last_edge(reflectors):
+        graph = run(frames_along(CURVE, scan=True, reflectors=reflectors))[0].graph
+        scans = np.flatnonzero(graph.edges.kinds == EDGE_KINDS[EdgeKind.SCAN])
+        return np.linalg.inv(graph.edges.information[scans[-1]])[2, 2] / floor[2]
+
+    assert last_edge(reflectors=True) < 5.0  # its own variance besides
+    assert last_edge(reflectors=False) > 15.0
+
+
 def test_edge_of_a_scan_that_leaves_a_direction_open_enters_the_graph():
     graph, floor = Graph(), np.array(Parameters().back_end.scan_edge_variance_floor)
     for pose in (np.zeros(3), np.array([1.0, 0.0, 0.2])):
