@@ -84,7 +84,7 @@ def _assignment(text: str) -> tuple[str, Any]:
     try:
         return name.strip(), parse_yaml(value, f'--set {text}')
     except FileFormatError as e:
-        raise ParameterError(str(e)) from e
+        raise ParameterError(f'--set {text}: the value is not YAML') from e
 
 
 def run(args: argparse.Namespace) -> int:
