@@ -73,7 +73,7 @@ def source(
         'bag_player',
         {
             'bag': Path(args.bag).resolve(), 'rate': float(args.rate),
-            'wait_for_subscribers': LISTENERS,
+            'wait_for_subscribers': LISTENERS, 'wait_for_topic': inputs.topics[sensor],
         },
         progress,
         system,

@@ -40,6 +40,7 @@ class BagPlayerNode(Node):
         self.playback = Playback(self, self.bag)
         for topic, count in self.playback.unknown.items():
             self.get_logger().warning(f'type not installed: {topic}, {count} messages left out')
+        self.playback.listeners(self.parameters.wait_for_topic)  # refused now, not while it waits
         self._messages = self.playback.messages()
         self._next = next(self._messages, None)
         self._wall = wall
@@ -55,9 +56,11 @@ class BagPlayerNode(Node):
         """Publish what is due; raises SystemExit after the last message."""
         now = self._wall()
         if self._pace is None:
-            if self.playback.listeners() < self.parameters.wait_for_subscribers:
+            p = self.parameters
+            if self.playback.listeners(p.wait_for_topic) < p.wait_for_subscribers:
                 self._began = now
-            if now - self._began < self.parameters.start_delay:
+                return
+            if now - self._began < p.start_delay:
                 return
             self._pace = PlaybackClock(self.parameters.rate, now)
         for _ in range(BATCH):

@@ -191,6 +191,7 @@ class Player(Group, prefix=''):
     wait_for_subscribers: int = param(
         0, 'playback starts when a topic has this many subscribers', '', 0, 100
     )
+    wait_for_topic: str = param('', 'topic whose subscribers are counted; empty: any of the bag')
     start_delay: float = param(1.0, 'delay before playback starts, for discovery', 's', 0.0, 600.0)
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 
 from by_messages import decisions
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -52,7 +53,7 @@ class ByProcesses(Driver):
         monkeypatch.setenv(DELAY, str(scenario.delay / PACE))
         self._hear('rlml/frames', DEEP, self._heard)
         for topic, qos in COMMANDS.items():
-            self._hear(topic, qos, lambda m, topic=topic: self._commands.append((topic, m)))
+            self._hear(topic, qos, partial(self._heard_command, topic))
         live.listen('reflector_map_points', CLOUD, LATCHED)
         live.listen('/rosout', 'rcl_interfaces/msg/Log', LOGS)
         self._sensors = {
@@ -63,6 +64,14 @@ class ByProcesses(Driver):
 
     def _hear(self, topic, qos, use):
         self._live.ear.create_subscription(rclpy_class(CLOUD), topic, use, qos)
+
+    def _heard_command(self, topic, msg, info):
+        """A command; two topics come in any order, the stamps of DDS are those of their sender."""
+        self._commands.append((info['source_timestamp'], topic, msg))
+
+    def _decisions(self):
+        sent = sorted(self._commands, key=lambda command: command[0])
+        return decisions([(topic, msg) for _, topic, msg in sent])
 
     def _heard(self, msg):
         record = read_record(msg).of
@@ -146,7 +155,7 @@ class ByProcesses(Driver):
             self._due = max(self._due, time.monotonic())
 
     def _is_decided(self):
-        return len(decisions(self._commands)) >= len(self.scenario.decisions)
+        return len(self._decisions()) >= len(self.scenario.decisions)
 
     def _spin(self, seconds):
         end = time.monotonic() + seconds
@@ -207,4 +216,4 @@ class ByProcesses(Driver):
             assert code == 0, text
             assert 'Traceback' not in text, text
         out.kept = len([*self.folder.glob('*.lost-*')])
-        out.decisions = decisions(self._commands)
+        out.decisions = self._decisions()

@@ -11,6 +11,8 @@ from live import LATCHED, ROOM, ROOT
 from rclpy.qos import QoSProfile
 
 from rlml_slam import se2
+from rlml_slam.errors import BagError
+from rlml_slam.nodes.bag_player import BagPlayerNode
 from rlml_slam.ros.bags.bag import BagReader
 from rlml_slam.ros.codecs import decode
 
@@ -18,6 +20,7 @@ DEEP = QoSProfile(depth=2000)
 SECOND = 1_000_000_000
 PLAY = ('-p', 'rate:=10.0', '-p', 'clock_rate:=10.0', '-p', 'wait_for_subscribers:=1')
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+SCAN = 'sensor_msgs/msg/LaserScan'
 
 
 def ended(process):
@@ -47,6 +50,22 @@ def test_bag_player_publishes_all_of_a_bag_with_a_clock_and_ends(live, start):
     # the clock goes on to the end, at 10 Hz
     assert last - ticks[-1] < SECOND // 5
     assert set(np.diff(ticks)) == {SECOND // 10}
+
+
+def test_bag_player_counts_the_subscribers_of_one_topic(live):
+    """Two that hear the truth alone are no reason to begin: the front end may not be there yet."""
+    wait = {'wait_for_subscribers': 2, 'wait_for_topic': '/scan', 'start_delay': 0.0}
+    player = live.start(BagPlayerNode, bag=str(ROOM), **wait)
+    with player.bag:
+        for topic, kind in (('/ground_truth', 'nav_msgs/msg/Odometry'), ('/scan', SCAN)):
+            assert player.published == 0
+            for _ in range(2):
+                live.listen(topic, kind)
+            live.spin_until(lambda topic=topic: player.playback.listeners(topic) == 2)
+            player.tick()
+        assert player.published > 0
+        with pytest.raises(BagError, match='no topic /nothing of an installed type'):
+            player.playback.listeners('/nothing')
 
 
 def test_processes_map_a_recording_and_stop_cleanly(live, start):

@@ -43,9 +43,15 @@ class Playback:
         if not self._publishers:
             raise BagError(f'{bag.path}: no topic of it has an installed type')
 
-    def listeners(self) -> int:
-        """The largest number of subscriptions that a topic has."""
-        return max(p.get_subscription_count() for p in self._publishers.values())
+    def listeners(self, topic: str = '') -> int:
+        """The number of subscriptions that a topic has; without one, the largest of all topics.
+
+        Raises BagError if nothing is published on the topic.
+        """
+        if topic and topic not in self._publishers:
+            raise BagError(f'{self._bag.path}: no topic {topic} of an installed type')
+        counted = [self._publishers[topic]] if topic else self._publishers.values()
+        return max(p.get_subscription_count() for p in counted)
 
     def messages(self) -> Iterator[tuple[int, str, bytes]]:
         """(log time [ns], topic, serialized message) in order."""
