@@ -22,6 +22,7 @@ from rlml_slam.errors import ParameterError, RlmlError
 from rlml_slam.params import Parameters
 from rlml_slam.ros.declare import Check, declare
 from rlml_slam.ros.kernels import prepare
+from rlml_slam.ros.run import SIGNALS
 
 BELOW = 'shadow'
 # what a node hears from the other end; all else is from the robot and its user
@@ -52,6 +53,7 @@ class ManagedNode(LifecycleNode):
         self.exits = ExitStack()
         self.params: Any = declare(self, of, self.checks)
         prepare(self)
+        SIGNALS.is_held = True  # until the node is made, so that it is there to be ended
         self._is_managing = True
         self._service_change_state.callback = self._answer(self._service_change_state.callback)
         if self.params.node.autostart:

@@ -23,14 +23,18 @@ from rlml_slam.ros.usage import answered
 WAIT = 0.2  # [s] after which a signal is looked for where nothing comes
 
 
-class _Signals:
+class Signals:
     """SIGINT, SIGTERM, SIGHUP: end the spinning, or what comes before it at once.
 
-    Those of rclpy take the topics away first, and whoever still publishes or logs fails.
+    Those of rclpy take the topics away first, and whoever still publishes or logs fails. While
+    ``is_held``, a signal is only noted: a node that is interrupted while it begins its threads
+    would leave them running, and the process with them.
     """
 
-    def __init__(self) -> None:
-        self.came = self.is_spinning = False
+    came = is_held = False
+
+    def install(self) -> None:
+        """Take over the signals of this process."""
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._on_signal)
         if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup wants it
@@ -38,8 +42,11 @@ class _Signals:
 
     def _on_signal(self, _number: int, _frame: object) -> None:
         self.came = True
-        if not self.is_spinning:
+        if not self.is_held:
             raise KeyboardInterrupt
+
+
+SIGNALS = Signals()
 
 
 def run(*factories: Callable[[], Any]) -> int:
@@ -57,15 +64,19 @@ def run(*factories: Callable[[], Any]) -> int:
         print(f'rlml_slam: {_cause(e)}', file=sys.stderr)
         return 1
     nodes: list[Any] = []
-    executor, signals = SingleThreadedExecutor(), _Signals()
+    executor = SingleThreadedExecutor()
     try:
+        SIGNALS.install()
         for factory in factories:
             nodes.append(factory())
             executor.add_node(nodes[-1])
+            SIGNALS.is_held = False
+            if SIGNALS.came:
+                raise KeyboardInterrupt
         # what is there now stays: looking through all of it again and again would hold up poses
         gc.freeze()
-        signals.is_spinning = True
-        _spin(executor, nodes, signals)
+        SIGNALS.is_held = True
+        _spin(executor, nodes)
     except (RlmlError, NameValidationException, InvalidNodeNameException) as e:
         print(f'rlml_slam: {e}', file=sys.stderr)
         return 1
@@ -78,6 +89,7 @@ def run(*factories: Callable[[], Any]) -> int:
     except SystemExit as e:
         return int(e.code or 0)
     finally:
+        SIGNALS.is_held = True
         for node in nodes:
             node.destroy_node()
         executor.shutdown(timeout_sec=1.0)
@@ -85,12 +97,12 @@ def run(*factories: Callable[[], Any]) -> int:
     return 0
 
 
-def _spin(executor: Any, nodes: list[Any], signals: _Signals) -> None:
+def _spin(executor: Any, nodes: list[Any]) -> None:
     """Spin; an error that nobody expected is logged, and the nodes go on.
 
     What they have mapped is worth more than a process that ends.
     """
-    while rclpy.utilities.ok() and not signals.came:
+    while rclpy.utilities.ok() and not SIGNALS.came:
         try:
             executor.spin_once(timeout_sec=WAIT)
         except (MapError, FileFormatError, ExternalShutdownException):

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -114,6 +116,28 @@ def test_both_in_one_process_stop_cleanly(live, start, number):
     assert live.ear.count_subscribers('rlml/frames') == 0
     both.interrupt(number)
     assert ended(both)[0] == 0
+
+
+INTERRUPTED = """
+import os, signal, sys, threading
+from rlml_slam.ros.managed_node import ManagedNode
+from rlml_slam.ros.run import run
+
+class Node(ManagedNode):
+    def build(self):
+        end = threading.Event()
+        threading.Thread(target=end.wait).start()
+        os.kill(os.getpid(), signal.SIGINT)
+        self.exits.callback(end.set)
+
+sys.exit(run(lambda: Node('interrupted')))
+"""
+
+
+def test_signal_while_a_node_is_made_leaves_no_thread_behind():
+    words = [sys.executable, '-c', INTERRUPTED]
+    done = subprocess.run(words, cwd=ROOT, timeout=60.0, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, '')
 
 
 @pytest.mark.parametrize('node', ['front_end', 'back_end', 'slam', 'simulator', 'bag_player'])
