@@ -37,12 +37,12 @@ UNREAD: dict[str, tuple[str, ...]] = {
     'deformable_slam.yaml': (
         'motion.scale_error_sigma', 'motion.scale_error_sigma_without_lidar',
         'motion.scale_error_time', 'motion.drift_sigma',
-        'estimate_odometry_delay',
+        'estimate_odometry_delay', 'trust_ids',
     ),
     'reflector_detector.yaml': (
         'motion.scale_error_sigma', 'motion.scale_error_sigma_without_lidar',
         'motion.scale_error_time', 'motion.drift_sigma',
-        'local_frame', 'use_scan', 'use_reflectors', 'estimate_odometry_delay',
+        'local_frame', 'use_scan', 'use_reflectors', 'estimate_odometry_delay', 'trust_ids',
         # the topics of all streams but those that it reads, and reflectors, which it publishes
         *(row[0] for s, row in STREAMS.items() if s not in ('scan', 'odom', 'imu', 'reflectors')),
         'mode', 'map_directory', 'map_file_name', 'map_start_pose',

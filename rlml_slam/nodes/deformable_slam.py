@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import sys
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -41,7 +42,9 @@ class DeformableSlamNode(ManagedNode):
         self._updates = 0
         self.answers = EstimatePublisher(self, p)
         self.velocity = VelocityInput(self, p.node, self.slam.announce)
-        shared = Parameters(node=p.node, motion=p.motion, reflector=p.reflector)
+        # the few features of a carrier may be all that is ever seen
+        node = replace(p.node, trust_ids=True)
+        shared = Parameters(node=node, motion=p.motion, reflector=p.reflector)
         streams = [s for s in STREAMS if s != 'scan']
         self.sensors = Sensors(self, shared, streams, self.process, self.restart)
         self.health = HealthPublisher(self, self.sensors, self.figures)

@@ -57,6 +57,9 @@ class Node(Group, prefix=''):
         1,
         10_000,
     )
+    trust_ids: bool = param(
+        False, 'ids 0, 1, 2 … are used even before a message shows that they do not count its rows'
+    )
     use_odom: bool = param(True, 'use odometry; false: constant-velocity model')
     use_imu: bool = param(True, 'use the yaw rate of the IMU, if there is one')
     filter_stamps: bool = param(

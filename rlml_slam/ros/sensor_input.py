@@ -4,7 +4,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
 
 from rlml_slam import se2
 from rlml_slam.errors import InputError
@@ -17,7 +20,7 @@ from rlml_slam.ros.tf_odometry import TfOdometry
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.mirror import mirrored_detections, mirrored_scan
 from rlml_slam.sensing.synchronization.input_counts import InputCounts
-from rlml_slam.types import Detections, Imu, Odometry, Scan
+from rlml_slam.types import ANONYMOUS, Detections, Imu, Odometry, Scan
 
 Out = TypeVar('Out')
 # stream of the sequencer -> parameter with the topic's name, type, whether the only topic of the
@@ -94,6 +97,7 @@ class SensorInput(Generic[Out]):
         self.use_extrinsics(Extrinsics())
         self._placed = {params.node.base_frame}
         self.odom_frames = ('', '')  # of the topic's newest message
+        self._named: set[str] = set()  # streams whose ids are more than numbers of rows
 
     def use_extrinsics(self, tree: Extrinsics) -> None:
         """Take over the transforms that are known."""
@@ -164,8 +168,20 @@ class SensorInput(Generic[Out]):
             up = self.extrinsics.up(self._p.node.base_frame, frame(msg.header.frame_id))
             return decode.imu(msg, up=up)
         read = decode.detections_of_poses if hasattr(msg, 'poses') else decode.detections
-        seen = read(msg, self._p.reflector)
+        seen = self._with_names(stream, read(msg, self._p.reflector), size)
         return mirrored_detections(seen) if self.hangs(seen.frame_id) else seen
+
+    def _with_names(self, stream: str, seen: Detections, size: int) -> Detections:
+        """The detections, without ids while they may be the numbers of the rows of each message.
+
+        Such ids grow from row to row, and none is larger than the number of rows, ``size``.
+        """
+        known = seen.ids[seen.ids != ANONYMOUS]
+        if len(known) and ((np.diff(known) <= 0).any() or known[-1] > size):
+            self._named.add(stream)
+        if stream in self._named or self._p.node.trust_ids:
+            return seen
+        return replace(seen, ids=np.full(len(seen), ANONYMOUS, dtype=np.int64))
 
     def _odometry(self, msg: Any) -> Odometry:
         """The topic's pose, of base: by way of the static transforms where it has another child.

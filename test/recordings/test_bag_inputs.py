@@ -4,17 +4,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from rlml_slam.params import Parameters
 from rlml_slam.recordings.bag_inputs import BagInputs
+from rlml_slam.recordings.bag_replay import replay
 from rlml_slam.ros.bags.bag import BagReader, BagWriter
-from rlml_slam.ros.codecs import encode
+from rlml_slam.ros.codecs import decode, encode
 from rlml_slam.ros.codecs.message_types import make_bag
 from rlml_slam.types import Scan
 
+ROOM = Path(__file__).resolve().parents[2] / 'bags' / 'room'
 PLACE = np.array([0.3, 0.1, 0.0])
 
 
@@ -74,3 +77,19 @@ def test_a_broken_transform_costs_none_of_its_message(tmp_path):
     assert extrinsics.pose('base_link', 'camera') is None
     for child in ('laser', 'imu'):
         np.testing.assert_allclose(extrinsics.pose('base_link', child), [0.3, 0.1, 0.0])
+
+
+def test_ids_that_count_the_rows_of_each_message_change_nothing(tmp_path):
+    """As if they were not there; taken for names, one of the seven reflectors is missing."""
+    with BagReader(ROOM) as source, BagWriter(tmp_path / 'counted') as bag:
+        for topic in source.topics.values():
+            bag.add_topic(topic.name, topic.msgtype, source.is_latched(topic.name))
+        for time, topic, message in source.messages():
+            if topic == '/reflectors':
+                seen = decode.detections(message, Parameters().reflector)
+                ids = np.arange(len(seen), dtype=np.int64)
+                message = encode.detections(make_bag, replace(seen, ids=ids))
+            bag.write(topic, message, time)
+    plain, counted = (replay(bag, Parameters()) for bag in (ROOM, tmp_path / 'counted'))
+    assert np.array_equal(counted.frames.poses, plain.frames.poses)
+    assert counted.reflectors.points.tobytes() == plain.reflectors.points.tobytes()

@@ -115,3 +115,32 @@ def test_farthest_range_of_inf_makes_no_range_of_inf():
     (scan,) = feed._target.given
     assert np.isfinite(scan.range_max)
     assert len(project(scan, np.zeros(3), np.zeros(3), 30.0)) == len(ranges) - 1
+
+
+@pytest.mark.parametrize(
+    ('rows', 'used'),
+    [
+        # numbers of the rows, from 0 or 1 on, and where rows were left out
+        ([[0], [0, 1], [0, 1, 2], [0, 1]], [False] * 4),
+        ([[1, 2, 3], [1], [1, 2]], [False] * 3),
+        ([[0, 2, -1], [0, 1, 3, -1]], [False] * 2),
+        # names: one message shows it for all that follow
+        ([[7]], [True]),
+        ([[0, 1], [1, 0], [0]], [False, True, True]),
+        ([[0, 1, 2], [2, 9], [0, 1], []], [False, True, True, True]),
+        ([[-1, -1], [0], [4, 4], [5]], [False, False, False, True]),
+    ],
+)
+def test_ids_are_used_once_they_are_more_than_numbers_of_rows(rows, used):
+    feed = SensorInput(Parameters(), Target(), InputCounts())
+    for ids, are_used in zip(rows, used, strict=True):
+        n = len(ids)
+        seen = Detections(
+            5, 'laser', np.arange(2.0 * n).reshape(n, 2) + 1.0, np.tile(np.eye(2), (n, 1, 1)),
+            np.array(ids, dtype=np.int64), np.full(n, np.nan),
+        )  # fmt: skip
+        feed.add('reflectors', encode.detections(make_bag, seen))
+        got = feed._target.given[-1].ids.tolist()
+        assert got == (ids if are_used else [-1] * n)
+    feed.add('reflectors', encode.detections(make_bag, SEEN))
+    assert len(feed._target.given) == len(rows) + 1
