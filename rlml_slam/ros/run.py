@@ -35,6 +35,7 @@ class Signals:
 
     def install(self) -> None:
         """Take over the signals of this process."""
+        self.came = self.is_held = False
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._on_signal)
         if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup wants it

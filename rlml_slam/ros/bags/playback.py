@@ -48,6 +48,7 @@ class Playback:
 
         Raises BagError if nothing is published on the topic.
         """
+        topic = topic and '/' + topic.lstrip('/')
         if topic and topic not in self._publishers:
             raise BagError(f'{self._bag.path}: no topic {topic} of an installed type')
         counted = [self._publishers[topic]] if topic else self._publishers.values()

@@ -6,7 +6,8 @@ is proportional to the true motion. The measured motion must not replace it in t
 its noise would bias the estimate towards zero by noise^2 / motion^2 (errors in variables). The
 motion estimated just before has about the same size and independent noise, so it serves as the
 instrument of instrumental variables (Reiersøl 1941). A motion below the noise floor carries no
-information about the scale.
+information about the scale. With a lidar, stretches of some seconds measure it instead (eq. 65):
+where odometry is late, that instrument is biased.
 """
 
 from __future__ import annotations
@@ -19,13 +20,19 @@ import numpy as np
 from rlml_slam import se2
 from rlml_slam.estimation.correction import positive
 from rlml_slam.estimation.odometry_noise import OdometryNoise
+from rlml_slam.estimation.scale_error import ScaleError
 from rlml_slam.params import MotionNoise, Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.deskew import sweep_time
 from rlml_slam.sensing.velocity_deskew import Sweep
 from rlml_slam.slam.front_end.constant_velocity import ConstantVelocity
 from rlml_slam.slam.front_end.joint_state import (
+    BIAS,
+    DRIFT,
+    GATE,
+    SPEED,
     STANDING,
+    TURN,
     JointState,
     begin_sweep,
     end_sweep,
@@ -39,6 +46,7 @@ from rlml_slam.types import Motion, Observation
 # [ns] shortest time over which a velocity is computed. Scans that arrive in a burst are too close:
 # a pose error of 2 mm would be 0.4 m/s over 5 ms, and is .04 m/s over this time.
 MIN_INTERVAL = 50_000_000
+SCALES = slice(SPEED, TURN + 1)
 WHOLE = 0.9  # share of a sweep from which on the next stamp counts as its end, for its jitter
 
 
@@ -56,6 +64,10 @@ class MotionTerm:
         self._constant_velocity = ConstantVelocity(params.motion)
         self._hypotheses = MotionHypotheses(params)
         self._odometry_noise = OdometryNoise(params.motion)
+        self._scale_errors = {SPEED: ScaleError(), TURN: ScaleError()}
+        # before the corrections: pose, scale errors and their covariance
+        self._held = np.zeros(3), np.zeros(2), np.zeros((2, 2))
+        self._known = np.zeros((3, 3))  # covariance in the submap, after the corrections
         self._predicted: tuple[Array, Array] | None = None  # pose in the submap, covariance
         self._odometry = STANDING  # the newest motion that it measured
         self.has_lidar = False
@@ -69,6 +81,7 @@ class MotionTerm:
         self.velocity = np.zeros(3)
         self._is_velocity_known = False
         self._hypotheses.forget()
+        self._begin_stretch()
         self._since: tuple[int, Array] | None = None  # stamp and pose of the last velocity
         # of the newest observation's sweep: its time [s], and the covariance of its motion
         self._sweep: tuple[float, Array] | None = None
@@ -96,7 +109,9 @@ class MotionTerm:
             self._constant_velocity.predict(state, dt, motion)
             return
         walk, kept = p.imu_bias_walk**2 * dt, math.exp(-dt / p.scale_error_time)
-        heading, cov = float(state.x[2]), self._sweep_within(motion, dt)
+        before, cov = state.pose, self._sweep_within(motion, dt)
+        if not np.array_equal(self._known, relative(state.x, state.P)[1]):
+            self._begin_stretch()  # in another submap, or moved: the pose is known otherwise
         if cov is not None:
             motion = replace(motion, cov=positive(motion.cov - cov))
         if motion.known and dt > FRESH and not self.has_lidar:
@@ -105,9 +120,10 @@ class MotionTerm:
             expected = expected_motion(self.velocity, dt, p) if motion.known else STANDING
             state.predict(motion, walk, kept, expected)
         if cov is not None:
-            end_sweep(state.x, state.P, heading)
+            end_sweep(state.x, state.P, float(before[2]))
         self._begin_sweep(state, observation)
         self._predicted = relative(state.x, state.P)
+        self._held = before, state.x[SCALES].copy(), state.P[SCALES, SCALES].copy()
 
     def _sweep_within(self, motion: Motion, dt: float) -> Array | None:
         """Covariance (3, 3) of the newest sweep where all of it is within this motion.
@@ -150,9 +166,43 @@ class MotionTerm:
             assert self._predicted is not None
             now = relative(state.x, state.P)
             self._odometry_noise.learn(observation.motion, self._predicted, now)
+            if self.has_lidar:
+                self._learn_scale_errors(state, observation.motion, now)
+                self._known = now[1]
             motion = state.corrected(observation.motion)
             observation = self._placed(state, observation)
         return replace(observation, motion=motion)
+
+    def _begin_stretch(self) -> None:
+        for error in self._scale_errors.values():
+            error.forget()
+
+    def _learn_scale_errors(
+        self, state: JointState, motion: Motion, now: tuple[Array, Array]
+    ) -> None:
+        """Take back what the corrections say of them; at the end of a stretch, measure them.
+
+        ``now`` is the pose (3,) in the submap, and its covariance (3, 3).
+        """
+        before, state.x[SCALES], state.P[SCALES, SCALES] = self._held
+        if not motion.known or self.interval > FRESH:
+            self._begin_stretch()
+            return
+        moved = (
+            motion.delta + state.x[BIAS] * motion.bias_gain + state.x[DRIFT] * motion.drift_gain
+        )
+        went, cov = se2.between(before, state.pose), se2.rotate_cov(now[1], -now[0][2])
+        for row, axis, gain in ((SPEED, 0, moved[0]), (TURN, 2, motion.turn_gain[2])):
+            rest = went[axis] - moved[axis]
+            rest = se2.wrapped(rest) if row == TURN else rest
+            # that as estimated: the noise of odometry would bias the error (errors in variables)
+            gain = (gain + rest) / (1.0 + state.x[row]) if gain else 0.0
+            found = self._scale_errors[row].add(
+                rest, (gain, motion.drift_gain[axis]), motion.cov[axis, axis], self.interval,
+                cov[axis, axis],
+            )  # fmt: skip
+            if found is not None:
+                measure_scale_error(state, row, *found)
 
     def _placed(self, state: JointState, observation: Observation) -> Observation:
         """The observation with its end points where its sweep is by the state as it is now."""
@@ -180,6 +230,22 @@ class MotionTerm:
             return np.zeros((3, 3))
         moved = se2.rotation3(heading) @ self.velocity * sigma
         return np.outer(moved, moved)
+
+
+def measure_scale_error(state: JointState, row: int, rest: float, H: Array, R: float) -> None:
+    """Update the scale error in ``row`` by a stretch (eq. 65); nothing else moves.
+
+    ``H`` (2,) is by the scale error and the drift. A pose that moved would have to turn with its
+    anchor (:meth:`JointState.turn_with_anchor`).
+    """
+    columns = np.array([row, DRIFT])
+    PH = H @ state.P[columns]
+    v, S = rest - H[0] * state.x[row], PH[columns] @ H + R
+    if v * v < GATE * S:  # else the wheels slip
+        K = PH[row] / S
+        state.x[row] += K * v
+        state.P[row] -= K * PH
+        state.P[:, row] = state.P[row]
 
 
 def expected_motion(velocity: Array, dt: float, noise: MotionNoise) -> Array:

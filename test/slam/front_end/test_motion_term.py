@@ -96,6 +96,85 @@ def test_noise_of_the_wheels_is_not_taken_for_a_share():
     assert P[1, 1] == pytest.approx(NOISE.scale_error_sigma[1] ** 2, rel=0.02)
 
 
+def with_lidar(rng, shares, speeds, late=0.0, dt=0.2, sigma=SIGMA, new_submap=0):
+    """Errors (3,) of scale errors and drift and their sigmas, of a robot with a lidar.
+
+    ``speeds`` (n, 2) [m/s, rad/s] are those of each second; its odometry is ``late`` [s] and errs
+    by ``shares``. ``sigma`` (3,) is that of a pose, in whose direction nothing is seen where it is
+    inf. A submap begins after ``new_submap`` steps each.
+    """
+    state = JointState(np.zeros(3), np.zeros((3, 3)), 0.0, wheels=ERRORS)
+    term, pose = MotionTerm(Parameters()), np.zeros(3)
+    sums = np.concatenate([np.zeros((1, 2)), np.cumsum(speeds, axis=0)])
+    seen = np.isfinite(sigma)
+    rows, H = np.flatnonzero(seen), np.eye(3)[seen][:, seen]
+
+    def until(t):  # way and turn
+        return sums[int(t)] + (t - int(t)) * speeds[int(t)]
+
+    for k in range(int((len(speeds) - 2) / dt)):
+        t = 1.0 + k * dt
+        v, w = (until(t + dt) - until(t)) / dt
+        pose = se2.compose(pose, se2.exp(np.array([v, 0.0, w]) * dt))
+        noise = np.array([NOISE.speed_noise * v, NOISE.turn_noise * abs(w)])
+        noise += NOISE.speed_noise_floor, NOISE.turn_noise_floor
+        noise *= np.sqrt(NOISE.noise_interval * dt)
+        wheels = until(t + dt - late) - until(t - late)
+        wheels = (wheels - [0.0, shares[2] * wheels[0]]) / (1.0 + np.array(shares[:2]))
+        way, turn = wheels + noise * rng.standard_normal(2)
+        delta = np.array([way * np.cos(0.5 * turn), way * np.sin(0.5 * turn), turn])
+        by_heading = np.array([-0.5 * delta[1], 0.5 * delta[0], 1.0])
+        cov = np.diag([noise[0], 0.01, 0.0]) ** 2
+        cov += noise[1] ** 2 * np.outer(by_heading, by_heading)
+        motion = Motion(delta, cov, turn_gain=turn * by_heading, drift_gain=way * by_heading)
+        o = Observation(
+            int(k * dt * SECOND), motion, np.eye(2), np.zeros(2), odom_pose=np.zeros(3)
+        )
+        term.predict(state, o)
+        error = pose - state.pose
+        error[seen] += sigma[seen] * rng.standard_normal(len(rows))
+        error[2] = se2.wrapped(error[2])
+        state.apply(rows, H, np.diag(sigma[seen] ** 2), error[seen])
+        term.corrected(state, o)
+        if new_submap and k % new_submap == 0:
+            state.clone_pose(0, 0.0, 1e-6 * np.eye(3))
+    return state.x[WHEELS] - shares, np.sqrt(np.diag(state.P[WHEELS, WHEELS]))
+
+
+def stop_and_go(rng, steps=200):
+    """Speeds of a robot that begins and ends to drive and to turn all the time."""
+    return np.stack([rng.integers(0, 3, steps) / 2.0, 0.8 * rng.integers(-1, 2, steps)], -1)
+
+
+@pytest.mark.parametrize('late', [0.03, 0.0, -0.03])
+def test_odometry_that_is_late_has_no_scale_error(late):
+    """Taken from single steps, the error of the turn is .15 with a sigma of .015."""
+    generators = [np.random.default_rng(k) for k in range(5)]
+    drives = [with_lidar(rng, (0.02, -0.05, 0.0), stop_and_go(rng), late) for rng in generators]
+    error, sigma = (np.array(part)[:, :2] for part in zip(*drives, strict=True))
+    assert (sigma < [0.012, 0.03]).all()
+    assert (np.abs(error).mean(axis=0) < sigma.mean(axis=0)).all()
+    assert (np.abs(error) < 3.0 * sigma).all()
+
+
+@pytest.mark.parametrize('turning', [0.5, -0.5])
+def test_scale_error_and_drift_of_one_curve_are_not_separated(turning):
+    speeds, errors = np.tile([0.8, turning], (32, 1)), []
+    for k in range(40):
+        rng = np.random.default_rng(k)
+        error, sigma = with_lidar(rng, ERRORS * rng.standard_normal(3), speeds)
+        errors.append(error / sigma)
+    assert (np.mean(np.square(errors), axis=0) < 1.6).all()  # p = .01 each
+
+
+def test_a_new_submap_measures_no_scale_error():
+    """Along a corridor without an end, the pose in a submap that begins there is sure at once."""
+    sigma = np.array([np.inf, 0.01, 0.001])
+    rng, speeds = np.random.default_rng(0), np.tile([0.8, 0.0], (102, 1))
+    _, found = with_lidar(rng, (0.04, 0.0, 0.0), speeds, sigma=sigma, new_submap=25)
+    assert found[0] > 0.95 * ERRORS[0]
+
+
 def test_from_the_first_scan_on_the_wheels_err_less():
     """Until then only odometry leads from one reflector to the next."""
     state = JointState(np.zeros(3), np.zeros((3, 3)), 0.0, wheels=WITHOUT_LIDAR)
