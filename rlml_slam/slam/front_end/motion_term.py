@@ -192,6 +192,8 @@ class MotionTerm:
             motion.delta + state.x[BIAS] * motion.bias_gain + state.x[DRIFT] * motion.drift_gain
         )
         went, cov = se2.between(before, state.pose), se2.rotate_cov(now[1], -now[0][2])
+        if motion.bias_gain[2] != 0.0:  # a gyro turned it: of the wheels, nothing is known
+            self._scale_errors[TURN].forget()
         for row, axis, gain in ((SPEED, 0, moved[0]), (TURN, 2, motion.turn_gain[2])):
             rest = went[axis] - moved[axis]
             rest = se2.wrapped(rest) if row == TURN else rest
