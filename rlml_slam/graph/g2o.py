@@ -17,7 +17,7 @@ import gzip
 import io
 import zlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -32,18 +32,20 @@ from rlml_slam.graph.model.graph import Graph
 from rlml_slam.se2 import Array, rotation
 from rlml_slam.types import EdgeKind
 
-# upper triangle of the information matrix by rows, and in TORO's order
 MAX_SIZE = 1 << 31  # bytes, unpacked
 LARGEST = 1e150  # its square is finite
+# entries of the information matrix: upper triangle by rows, and in TORO's order
 UPPER_3 = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 TORO_3 = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
 UPPER_2 = ((0, 0), (0, 1), (1, 1))
+UPPER_1 = ((0, 0),)
 
-# tag: number of ids, number of values (measured + information)
-TAGS = {
-    'VERTEX_SE2': (1, 3), 'VERTEX2': (1, 3), 'VERTEX_XY': (1, 2),
-    'EDGE_SE2': (2, 9), 'EDGE2': (2, 9), 'EDGE_SE2_XY': (2, 5),
-    'EDGE_PRIOR_SE2': (1, 9), 'EDGE_PRIOR_XY': (1, 5), 'EDGE_RANGE_SE2_XY': (2, 2),
+# tag: number of ids, number of measured values, entries of the information that follow
+TAGS: dict[str, tuple[int, int, tuple[tuple[int, int], ...]]] = {
+    'VERTEX_SE2': (1, 3, ()), 'VERTEX2': (1, 3, ()), 'VERTEX_XY': (1, 2, ()),
+    'EDGE_SE2': (2, 3, UPPER_3), 'EDGE2': (2, 3, TORO_3), 'EDGE_SE2_XY': (2, 2, UPPER_2),
+    'EDGE_PRIOR_SE2': (1, 3, UPPER_3), 'EDGE_PRIOR_XY': (1, 2, UPPER_2),
+    'EDGE_RANGE_SE2_XY': (2, 1, UPPER_1),
 }  # fmt: skip
 ALIASES = {'VERTEX_POINT_XY': 'VERTEX_XY', 'EDGE_POINT_XY': 'EDGE_SE2_XY'}
 
@@ -62,9 +64,37 @@ class GraphFile:
 class _Lines:
     """The lines of one tag: ids, values, and line numbers for messages."""
 
+    path: Path
+    tag: str
     ids: list[list[int]] = field(default_factory=list)
     values: list[list[float]] = field(default_factory=list)
     numbers: list[int] = field(default_factory=list)
+
+    def error(self, k: int, what: str) -> FileFormatError:
+        """What is wrong with the k-th of these lines."""
+        return FileFormatError(f'{self.path}:{self.numbers[k]}: {what}')
+
+    def factors(self, *indices: Mapping[int, int]) -> tuple[NDArray[np.int64], Array, Array]:
+        """Nodes (k, n), measured values (k, d) and information (k, d, d), checked.
+
+        ``indices`` (n,) are those of the vertices by id, for each node of a factor.
+        """
+        rows = []
+        for k, ids in enumerate(self.ids):
+            try:
+                rows.append([known[i] for known, i in zip(indices, ids, strict=True)])
+            except KeyError as error:
+                raise self.error(k, f'unknown vertex {error.args[0]}') from None
+        _, d, entries = TAGS[self.tag]
+        values = np.array(self.values, dtype=np.float64).reshape(-1, d + len(entries))
+        information = np.zeros((len(values), d, d))
+        for column, (r, c) in enumerate(entries, d):
+            information[:, r, c] = information[:, c, r] = values[:, column]
+        good = is_positive_definite(information)
+        if not good.all():
+            raise self.error(int(np.argmin(good)), 'information is not positive definite')
+        nodes = np.array(rows, dtype=np.int64).reshape(-1, len(indices))
+        return nodes, values[:, :d], information
 
 
 def read_graph(path: Path | str, losses: Losses | None = None) -> GraphFile:
@@ -76,14 +106,19 @@ def read_graph(path: Path | str, losses: Losses | None = None) -> GraphFile:
     """
     path = Path(path)
     lines, fixed, skipped = _parse(path)
+    vertices = _vertices(lines['VERTEX_SE2'], lines['VERTEX2'])
+    if not vertices:
+        ends = {i for tag in ('EDGE_SE2', 'EDGE2') for pair in lines[tag].ids for i in pair}
+        vertices = {i: [0.0, 0.0, 0.0] for i in sorted(ends)}
+    points = _vertices(lines['VERTEX_XY'])
     graph = Graph(losses)
-    pose_ids = _add_vertices(path, graph, lines)
-    landmark_ids = _add_landmarks(path, graph, lines)
-    poses = {int(v): k for k, v in enumerate(pose_ids)}
-    landmarks = {int(v): k for k, v in enumerate(landmark_ids)}
-    _add_edges(path, graph, lines, poses)
-    _add_sightings(path, graph, lines, poses, landmarks)
-    _add_priors(path, graph, lines, poses, landmarks)
+    graph.add_poses(list(vertices.values()))
+    graph.add_landmarks(list(points.values()))
+    poses = {i: k for k, i in enumerate(vertices)}
+    landmarks = {i: k for k, i in enumerate(points)}
+    _add_edges(graph, lines, poses)
+    _add_sightings(graph, lines, poses, landmarks)
+    _add_priors(graph, lines, poses, landmarks)
     for number, node in fixed:
         if node in poses:
             graph.fixed_poses[poses[node]] = True
@@ -91,14 +126,15 @@ def read_graph(path: Path | str, losses: Losses | None = None) -> GraphFile:
             graph.fixed_landmarks[landmarks[node]] = True
         else:
             raise FileFormatError(f'{path}:{number}: FIX of unknown vertex {node}')
-    if len(pose_ids) and not (fixed or len(graph.pose_priors) or len(graph.landmark_priors)):
+    if len(poses) and not (fixed or len(graph.pose_priors) or len(graph.landmark_priors)):
         graph.fixed_poses[0] = True
     if not (lines['VERTEX_SE2'].ids or lines['VERTEX2'].ids):
         initialize(graph, 'spanning_tree')
+    pose_ids, landmark_ids = (np.array(list(ids), dtype=np.int64) for ids in (poses, landmarks))
     return GraphFile(graph, pose_ids, landmark_ids, dict(skipped))
 
 
-def _parse(path: Path) -> tuple[dict[str, _Lines], list[tuple[int, int]], Counter[str]]:
+def _text(path: Path) -> str:
     try:
         raw = path.read_bytes()
         if raw[:2] == b'\x1f\x8b':
@@ -106,16 +142,19 @@ def _parse(path: Path) -> tuple[dict[str, _Lines], list[tuple[int, int]], Counte
                 raw = f.read(MAX_SIZE + 1)
         if len(raw) > MAX_SIZE:
             raise ValueError(f'more than {MAX_SIZE} bytes')
-        text = raw.decode('ascii')
+        return raw.decode('ascii')
     except UnicodeDecodeError as error:
         message = f'{path}: no g2o or TORO file, which is ASCII: byte {error.start} is not'
         raise FileFormatError(message) from None
     except (ValueError, OSError, EOFError, zlib.error) as error:
         raise FileFormatError(f'{path}: cannot be read: {error}') from None
-    lines = {tag: _Lines() for tag in TAGS}
+
+
+def _parse(path: Path) -> tuple[dict[str, _Lines], list[tuple[int, int]], Counter[str]]:
+    lines = {tag: _Lines(path, tag) for tag in TAGS}
     fixed: list[tuple[int, int]] = []
     skipped: Counter[str] = Counter()
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(_text(path).splitlines(), 1):
         words = line.split()
         if not words or words[0].startswith('#'):
             continue
@@ -123,11 +162,11 @@ def _parse(path: Path) -> tuple[dict[str, _Lines], list[tuple[int, int]], Counte
         if tag == 'FIX':
             fixed += [(number, node) for node in _ids(path, number, words[1:])]
         elif tag in TAGS:
-            num_ids, num_values = TAGS[tag]
-            if len(words) != 1 + num_ids + num_values:
+            num_ids, num_measured, entries = TAGS[tag]
+            num = num_ids + num_measured + len(entries)
+            if len(words) != 1 + num:
                 raise FileFormatError(
-                    f'{path}:{number}: {tag} has {len(words) - 1} values instead of '
-                    f'{num_ids + num_values}'
+                    f'{path}:{number}: {tag} has {len(words) - 1} values instead of {num}'
                 )
             lines[tag].ids.append(_ids(path, number, words[1 : 1 + num_ids]))
             lines[tag].values.append(_values(path, number, words[1 + num_ids :]))
@@ -163,115 +202,51 @@ def _values(path: Path, number: int, words: Sequence[str]) -> list[float]:
     return values
 
 
-def _add_vertices(path: Path, graph: Graph, lines: dict[str, _Lines]) -> NDArray[np.int64]:
-    vertices = [lines['VERTEX_SE2'], lines['VERTEX2']]
-    ids = [i[0] for one in vertices for i in one.ids]
-    values = [v for one in vertices for v in one.values]
-    if not ids:
-        ends = {i for tag in ('EDGE_SE2', 'EDGE2') for pair in lines[tag].ids for i in pair}
-        ids = sorted(ends)
-        values = [[0.0, 0.0, 0.0]] * len(ids)
-    _unique(path, ids, [n for one in vertices for n in one.numbers])
-    graph.add_poses(np.array(values, dtype=np.float64).reshape(-1, 3))
-    return np.array(ids, dtype=np.int64)
-
-
-def _add_landmarks(path: Path, graph: Graph, lines: dict[str, _Lines]) -> NDArray[np.int64]:
-    one = lines['VERTEX_XY']
-    ids = [i[0] for i in one.ids]
-    _unique(path, ids, one.numbers)
-    graph.add_landmarks(np.array(one.values, dtype=np.float64).reshape(-1, 2))
-    return np.array(ids, dtype=np.int64)
-
-
-def _unique(path: Path, ids: list[int], numbers: list[int]) -> None:
-    seen: set[int] = set()
-    for i, number in zip(ids, numbers, strict=False):
-        if i in seen:
-            raise FileFormatError(f'{path}:{number}: vertex {i} is declared twice')
-        seen.add(i)
-
-
-def _nodes(path: Path, one: _Lines, maps: tuple[dict[int, int], ...]) -> NDArray[np.int64]:
-    rows = []
-    for ids, number in zip(one.ids, one.numbers, strict=True):
-        try:
-            rows.append([known[i] for known, i in zip(maps, ids, strict=True)])
-        except KeyError as error:
-            raise FileFormatError(f'{path}:{number}: unknown vertex {error.args[0]}') from None
-    return np.array(rows, dtype=np.int64).reshape(-1, len(maps))
-
-
-def _symmetric(values: Array, order: tuple[tuple[int, int], ...], d: int) -> Array:
-    out = np.zeros((len(values), d, d))
-    for column, (r, c) in enumerate(order):
-        out[:, r, c] = out[:, c, r] = values[:, column]
+def _vertices(*tags: _Lines) -> dict[int, list[float]]:
+    """Values by id, in the order of the lines."""
+    out: dict[int, list[float]] = {}
+    for lines in tags:
+        for k, ((i,), values) in enumerate(zip(lines.ids, lines.values, strict=True)):
+            if i in out:
+                raise lines.error(k, f'vertex {i} is declared twice')
+            out[i] = values
     return out
 
 
-def _add_edges(path: Path, graph: Graph, lines: dict[str, _Lines], poses: dict[int, int]) -> None:
-    for tag, order in (('EDGE_SE2', UPPER_3), ('EDGE2', TORO_3)):
-        one = lines[tag]
-        nodes = _nodes(path, one, (poses, poses))
-        v = np.array(one.values, dtype=np.float64).reshape(-1, 9)
-        info = _symmetric(v[:, 3:], order, 3)
-        _check(path, one, info, nodes)
+def _add_edges(graph: Graph, lines: Mapping[str, _Lines], poses: Mapping[int, int]) -> None:
+    for one in (lines['EDGE_SE2'], lines['EDGE2']):
+        nodes, measured, information = one.factors(poses, poses)
+        same = nodes[:, 0] == nodes[:, 1]
+        if same.any():
+            raise one.error(int(np.argmax(same)), 'both ends are the same vertex')
         kinds = [
             EdgeKind.ODOMETRY if near else EdgeKind.CLOSURE
             for near in np.abs(nodes[:, 0] - nodes[:, 1]) == 1
         ]
-        graph.add_edges(kinds, nodes, v[:, :3], info)
-
-
-def _check(path: Path, one: _Lines, information: Array, nodes: NDArray[np.int64]) -> None:
-    good = is_positive_definite(information)
-    if not good.all():
-        number = one.numbers[int(np.argmin(good))]
-        raise FileFormatError(f'{path}:{number}: information is not positive definite')
-    same = nodes[:, 0] == nodes[:, -1] if nodes.shape[1] == 2 else np.zeros(len(nodes), np.bool_)
-    if same.any():
-        number = one.numbers[int(np.argmax(same))]
-        raise FileFormatError(f'{path}:{number}: both ends are the same vertex')
+        graph.add_edges(kinds, nodes, measured, information)
 
 
 def _add_sightings(
-    path: Path, graph: Graph, lines: dict[str, _Lines], poses: dict[int, int],
-    landmarks: dict[int, int],
+    graph: Graph, lines: Mapping[str, _Lines], poses: Mapping[int, int],
+    landmarks: Mapping[int, int],
 ) -> None:  # fmt: skip
-    one = lines['EDGE_SE2_XY']
-    nodes = _nodes(path, one, (poses, landmarks))
-    v = np.array(one.values, dtype=np.float64).reshape(-1, 5)
-    info = _symmetric(v[:, 2:], UPPER_2, 2)
-    _check(path, one, info, nodes[:, :1])
-    graph.add_sightings(nodes, v[:, :2], info)
+    graph.add_sightings(*lines['EDGE_SE2_XY'].factors(poses, landmarks))
     one = lines['EDGE_RANGE_SE2_XY']
-    nodes = _nodes(path, one, (poses, landmarks))
-    v = np.array(one.values, dtype=np.float64).reshape(-1, 2)
-    _check(path, one, v[:, 1:, None], nodes[:, :1])
-    if (v[:, 0] < 0.0).any():
-        number = one.numbers[int(np.argmax(v[:, 0] < 0.0))]
-        raise FileFormatError(f'{path}:{number}: the range is negative')
-    graph.add_ranges(nodes, v[:, 0], v[:, 1])
+    nodes, measured, information = one.factors(poses, landmarks)
+    negative = measured[:, 0] < 0.0
+    if negative.any():
+        raise one.error(int(np.argmax(negative)), 'the range is negative')
+    graph.add_ranges(nodes, measured, information)
 
 
 def _add_priors(
-    path: Path, graph: Graph, lines: dict[str, _Lines], poses: dict[int, int],
-    landmarks: dict[int, int],
+    graph: Graph, lines: Mapping[str, _Lines], poses: Mapping[int, int],
+    landmarks: Mapping[int, int],
 ) -> None:  # fmt: skip
-    one = lines['EDGE_PRIOR_SE2']
-    nodes = _nodes(path, one, (poses,))
-    v = np.array(one.values, dtype=np.float64).reshape(-1, 9)
-    info = _symmetric(v[:, 3:], UPPER_3, 3)
-    _check(path, one, info, nodes)
-    for (i,), pose, matrix in zip(nodes, v[:, :3], info, strict=True):
+    for (i,), pose, matrix in zip(*lines['EDGE_PRIOR_SE2'].factors(poses), strict=True):
         B = _axes(pose)
         graph.add_pose_prior(int(i), pose, B @ matrix @ B.T)
-    one = lines['EDGE_PRIOR_XY']
-    nodes = _nodes(path, one, (landmarks,))
-    v = np.array(one.values, dtype=np.float64).reshape(-1, 5)
-    info = _symmetric(v[:, 2:], UPPER_2, 2)
-    _check(path, one, info, nodes)
-    for (k,), point, matrix in zip(nodes, v[:, :2], info, strict=True):
+    for (k,), point, matrix in zip(*lines['EDGE_PRIOR_XY'].factors(landmarks), strict=True):
         graph.add_landmark_prior(int(k), point, matrix)
 
 
@@ -298,59 +273,45 @@ def write_graph(
     pose_ids = np.arange(n) if pose_ids is None else np.asarray(pose_ids)
     if landmark_ids is None:
         landmark_ids = int(np.max(pose_ids, initial=-1)) + 1 + np.arange(len(graph.landmarks))
-    toro = {'.graph', '.toro'} & set(path.suffixes)
-    write = _toro_lines if toro else _g2o_lines
-    text = '\n'.join(write(path, graph, pose_ids, np.asarray(landmark_ids))) + '\n'
+    is_toro = bool({'.graph', '.toro'} & set(path.suffixes))
+    if is_toro and (len(landmark_ids) or len(graph.pose_priors) or len(graph.sightings)):
+        raise FileFormatError(f'{path}: TORO holds poses and edges alone; write g2o')
+    text = '\n'.join(_lines_of(graph, pose_ids, np.asarray(landmark_ids), is_toro)) + '\n'
     data = text.encode('ascii')
     # mtime 0: the same graph gives the same bytes
     path.write_bytes(gzip.compress(data, mtime=0) if path.suffix == '.gz' else data)
 
 
-def _row(tag: str, ids: Sequence[int], *values: Array | np.float64) -> str:
-    numbers = [repr(float(x)) for v in values for x in np.ravel(v)]
-    return ' '.join([tag, *map(str, ids), *numbers])
+def _row(tag: str, ids: Iterable[int], measured: Array, information: Array | None = None) -> str:
+    _, size, entries = TAGS[tag]
+    numbers = measured[:size].tolist()
+    if information is not None:
+        numbers += [float(information[entry]) for entry in entries]
+    return ' '.join([tag, *map(str, ids), *map(repr, numbers)])
 
 
-def _pick(matrix: Array, order: tuple[tuple[int, int], ...]) -> Array:
-    return np.array([matrix[r, c] for r, c in order])
-
-
-def _g2o_lines(
-    path: Path, graph: Graph, pose_ids: NDArray[np.int64], landmark_ids: NDArray[np.int64]
+def _lines_of(
+    graph: Graph, pose_ids: NDArray[np.int64], landmark_ids: NDArray[np.int64], is_toro: bool
 ) -> list[str]:
-    out = [_row('VERTEX_SE2', [i], x) for i, x in zip(pose_ids, graph.poses, strict=True)]
+    vertex, edge = ('VERTEX2', 'EDGE2') if is_toro else ('VERTEX_SE2', 'EDGE_SE2')
+    out = [_row(vertex, [i], x) for i, x in zip(pose_ids, graph.poses, strict=True)]
     out += [_row('VERTEX_XY', [i], m) for i, m in zip(landmark_ids, graph.landmarks, strict=True)]
     e, s, p, q = graph.edges, graph.sightings, graph.pose_priors, graph.landmark_priors
     for k in np.flatnonzero(e.enabled):
-        upper = _pick(e.information[k], UPPER_3)
-        out.append(_row('EDGE_SE2', pose_ids[e.nodes[k]], e.measured[k], upper))
+        out.append(_row(edge, pose_ids[e.nodes[k]], e.measured[k], e.information[k]))
     for k in np.flatnonzero(s.enabled):
+        tag = 'EDGE_RANGE_SE2_XY' if s.kinds[k] == FactorKind.RANGE else 'EDGE_SE2_XY'
         ids = [pose_ids[s.nodes[k, 0]], landmark_ids[s.nodes[k, 1]]]
-        if s.kinds[k] == FactorKind.RANGE:
-            out.append(_row('EDGE_RANGE_SE2_XY', ids, s.measured[k, 0], s.information[k, 0, 0]))
-            continue
-        out.append(_row('EDGE_SE2_XY', ids, s.measured[k], _pick(s.information[k], UPPER_2)))
+        out.append(_row(tag, ids, s.measured[k], s.information[k]))
     for k in np.flatnonzero(p.enabled):
         B = _axes(p.measured[k])
-        upper = _pick(B.T @ p.information[k] @ B, UPPER_3)
-        out.append(_row('EDGE_PRIOR_SE2', pose_ids[p.nodes[k]], p.measured[k], upper))
+        information = B.T @ p.information[k] @ B
+        out.append(_row('EDGE_PRIOR_SE2', pose_ids[p.nodes[k]], p.measured[k], information))
     for k in np.flatnonzero(q.enabled):
-        upper = _pick(q.information[k], UPPER_2)
-        out.append(_row('EDGE_PRIOR_XY', landmark_ids[q.nodes[k]], q.measured[k], upper))
-    # last: readG2o of GTSAM reads no edge behind a line that it does not know
-    out += [f'FIX {i}' for i in pose_ids[graph.fixed_poses]]
-    out += [f'FIX {i}' for i in landmark_ids[graph.fixed_landmarks]]
-    return out
-
-
-def _toro_lines(
-    path: Path, graph: Graph, pose_ids: NDArray[np.int64], landmark_ids: NDArray[np.int64]
-) -> list[str]:
-    if len(landmark_ids) or len(graph.pose_priors) or len(graph.sightings):
-        raise FileFormatError(f'{path}: TORO holds poses and edges alone; write g2o')
-    out = [_row('VERTEX2', [i], x) for i, x in zip(pose_ids, graph.poses, strict=True)]
-    e = graph.edges
-    for k in np.flatnonzero(e.enabled):
-        values = _pick(e.information[k], TORO_3)
-        out.append(_row('EDGE2', pose_ids[e.nodes[k]], e.measured[k], values))
+        ids = landmark_ids[q.nodes[k]]
+        out.append(_row('EDGE_PRIOR_XY', ids, q.measured[k], q.information[k]))
+    if not is_toro:
+        # last: readG2o of GTSAM reads no edge behind a line that it does not know
+        out += [f'FIX {i}' for i in pose_ids[graph.fixed_poses]]
+        out += [f'FIX {i}' for i in landmark_ids[graph.fixed_landmarks]]
     return out
