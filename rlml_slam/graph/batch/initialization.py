@@ -44,11 +44,7 @@ def spanning_tree(graph: Graph, consecutive_first: bool = False) -> None:
     use = np.flatnonzero(e.enabled)
     i, j = e.nodes[use].T
     cost = np.where(np.abs(i - j) == 1, 1.0, 1e6 if consecutive_first else 1.0)
-    n = len(graph.poses)
-    known = np.zeros(n, dtype=np.bool_)
-    roots = _roots(graph)
-    known[roots] = True
-    _compose_tree(graph, use, cost, roots)
+    _compose_tree(graph, use, cost, _roots(graph))
     place_landmarks(graph)
 
 
@@ -58,7 +54,7 @@ def _compose_tree(
     n = len(graph.poses)
     i, j = graph.edges.nodes[use].T
     # the cheapest of parallel edges
-    order = np.lexsort((np.arange(len(use)), cost))[::-1]
+    order = np.argsort(cost, kind='stable')[::-1]
     best = {
         (min(a, b), max(a, b)): int(k) for k, a, b in zip(order, i[order], j[order], strict=True)
     }
