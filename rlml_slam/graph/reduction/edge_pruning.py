@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 from rlml_slam.graph.batch.marginals import Marginals
 from rlml_slam.graph.incremental.online_solver import OnlineSolver
-from rlml_slam.graph.model.factors import chi2, pose_landmark, relative_pose
+from rlml_slam.graph.model.factors import chi2, pose_landmark
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.graph.model.robust_loss import loss
+from rlml_slam.graph.reduction.marginalization import edge_weights, robust_weights
 from rlml_slam.graph.robust.relative_covariance import residual_covs
 from rlml_slam.se2 import Array
 
@@ -80,13 +80,9 @@ def _least(
 
 def leverages(graph: Graph) -> Array:
     """Q W (k, 3, 3) of all enabled edges, in their order; robust weights count."""
-    e = graph.edges
-    use = np.flatnonzero(e.enabled)
-    i, j = e.nodes[use].T
-    information = e.information[use]
-    residual = relative_pose(graph.poses[i], graph.poses[j], e.measured[use])[0]
-    w = _weights(graph, e.kinds[use], chi2(residual, information))
-    out: Array = residual_covs(graph, Marginals(graph)) @ information * w[:, None, None]
+    use = np.flatnonzero(graph.edges.enabled)
+    Q, W = residual_covs(graph, Marginals(graph)), graph.edges.information[use]
+    out: Array = Q @ W * edge_weights(graph, use)[:, None, None]
     return out
 
 
@@ -107,15 +103,6 @@ def sighting_leverages(solver: OnlineSolver, pose: int, sightings: NDArray[np.in
         [np.tile(np.arange(3), (len(at), 1)), 3 + 2 * at[:, None] + np.arange(2)], axis=1
     )
     Q = J @ joint[rows[:, :, None], rows[:, None, :]] @ np.swapaxes(J, 1, 2)
-    w = _weights(graph, s.kinds[sightings], chi2(residual, information))
+    w = robust_weights(graph, s.kinds[sightings], chi2(residual, information))
     out: Array = Q @ information * w[:, None, None]
     return out
-
-
-def _weights(graph: Graph, kinds: NDArray[np.int64], s: Array) -> Array:
-    """Robust weights of factors (k,) with squared norms ``s`` (k,)."""
-    losses = graph.losses.in_order()
-    of = [losses[code] for code in kinds.tolist()]
-    return np.array(
-        [loss(int(one.kind), one.scale, v)[1] for one, v in zip(of, s.tolist(), strict=True)]
-    )

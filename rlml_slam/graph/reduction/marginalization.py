@@ -103,7 +103,8 @@ def _seen_from(
     T = e.measured[edges]
     B = np.zeros((len(edges), 3, 3))
     B[:, :2, :2], B[:, 2, 2] = se2.rotation(T[:, 2]), 1.0  # information: second pose's axes
-    W = e.information[edges] * _weights(graph, edges)[:, None, None]
+    w = np.maximum(edge_weights(graph, edges), MIN_WEIGHT)
+    W = e.information[edges] * w[:, None, None]
     relative = RelativePoses(T, B @ np.linalg.inv(W) @ np.swapaxes(B, 1, 2))
     to = nodes[:, 1] == pose
     back = relative.inverse()
@@ -114,15 +115,21 @@ def _seen_from(
     return there, np.where(to, nodes[:, 0], nodes[:, 1])
 
 
-def _weights(graph: Graph, edges: NDArray[np.int64]) -> Array:
+def edge_weights(graph: Graph, edges: NDArray[np.int64]) -> Array:
+    """Robust weights of ``edges`` (k,) at the current estimate."""
     e = graph.edges
     i, j = e.nodes[edges].T
-    residual, _, _ = relative_pose(graph.poses[i], graph.poses[j], e.measured[edges])
-    s = chi2(residual, e.information[edges])
+    residual = relative_pose(graph.poses[i], graph.poses[j], e.measured[edges])[0]
+    return robust_weights(graph, e.kinds[edges], chi2(residual, e.information[edges]))
+
+
+def robust_weights(graph: Graph, kinds: NDArray[np.int64], s: Array) -> Array:
+    """Robust weights of factors (k,) with squared norms ``s`` (k,)."""
     losses = graph.losses.in_order()
-    of = [losses[code] for code in e.kinds[edges].tolist()]
-    w = [loss(int(one.kind), one.scale, v)[1] for one, v in zip(of, s.tolist(), strict=True)]
-    return np.maximum(w, MIN_WEIGHT)
+    of = [losses[code] for code in kinds.tolist()]
+    return np.array(
+        [loss(int(one.kind), one.scale, v)[1] for one, v in zip(of, s.tolist(), strict=True)]
+    )
 
 
 def _add_star(
