@@ -53,22 +53,11 @@ class Marginals:
 
     def cross(self, pose: int, landmarks: ArrayLike) -> Array:
         """Covariances (k, 3, 2) between one pose and the landmarks (k,)."""
-        p = self._rows([pose], ())
-        q = self._rows((), landmarks)
-        out = np.zeros((3, len(q)))
-        if p[0] >= 0:
-            free = q >= 0
-            out[:, free] = columns(self._system, p)[:, q[free]]
-        return np.swapaxes(out.reshape(3, -1, 2), 0, 1)
+        return self._with_pose(pose, self._rows((), landmarks), 2)
 
     def pose_columns(self, pose: int, others: ArrayLike) -> Array:
         """Covariances (k, 3, 3) between one pose and the poses ``others`` (k,)."""
-        p, q = self._rows([pose], ()), self._rows(others, ())
-        out = np.zeros((3, len(q)))
-        if p[0] >= 0:
-            free = q >= 0
-            out[:, free] = columns(self._system, p)[:, q[free]]
-        return np.swapaxes(out.reshape(3, -1, 3), 0, 1)
+        return self._with_pose(pose, self._rows(others, ()), 3)
 
     def edges(self) -> Array:
         """Covariances (e, 3, 3) between the poses i and j of each enabled edge."""
@@ -81,6 +70,14 @@ class Marginals:
         out = np.zeros((len(at), len(at)))
         out[np.ix_(free, free)] = joint(self._system, at[free])
         return out
+
+    def _with_pose(self, pose: int, rows: NDArray[np.int64], size: int) -> Array:
+        """Covariances (k, 3, size) between one pose and the nodes of ``rows`` (k size,)."""
+        own, free = self._rows([pose], ()), rows >= 0
+        out = np.zeros((3, len(rows)))
+        if own[0] >= 0:
+            out[:, free] = columns(self._system, own)[:, rows[free]]
+        return np.swapaxes(out.reshape(3, -1, size), 0, 1)
 
     def _pick(self, variables: NDArray[np.int64]) -> Array:
         out = np.zeros((len(variables), 3, 3))
