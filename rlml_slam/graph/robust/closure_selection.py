@@ -59,7 +59,6 @@ class Selection:
     accepted: Flags
     evidence: Array
     scale: float
-    solves: int
 
 
 def select_closures(
@@ -112,13 +111,12 @@ class _Selector:
         self._left = np.where(allowed & ~self._bridges, TRIES, 0)
         self._evidence = np.where(self._bridges, np.inf, -np.inf)
         self._forest = spanning_forest
-        self._solves = 0
 
     def run(self) -> Selection:
         """Accept closures, then review all of them."""
         self._grow()
         self._review()
-        return Selection(self._edges, self._accepted, self._evidence, self._scale, self._solves)
+        return Selection(self._edges, self._accepted, self._evidence, self._scale)
 
     def _grow(self) -> None:
         """Accept closures until none of the rest is more likely right than wrong."""
@@ -184,7 +182,6 @@ class _Selector:
     def _solve(self) -> None:
         self._graph.edges.enabled[self._edges] = self._accepted
         optimize(self._graph, self._parameters)
-        self._solves += 1
 
     def _evaluate_by_forest(self) -> None:
         """Evidence by the spanning forest of the trusted edges alone."""
