@@ -58,14 +58,8 @@ def _spikes(observation: Observation, params: EkfParameters) -> Detections | Non
     share = found.beams / beams if sweep_time(scan) != 0.0 else np.zeros(len(found.beams))
     T = se2.compose(se2.exp(share[:, None] * twist), T_base_laser)
     R = se2.rotation(T[:, 2])
-    return Detections(
-        observation.stamp,
-        params.node.base_frame,
-        se2.transform(T, found.points[:, None])[:, 0],
-        R @ found.cov @ R.transpose(0, 2, 1),
-        np.full(len(found.points), ANONYMOUS, dtype=np.int64),
-        np.full(len(found.points), np.nan),
-    )
+    points = se2.transform(T, found.points[:, None])[:, 0]
+    return _anonymous(observation, params, points, R @ found.cov @ R.transpose(0, 2, 1))
 
 
 def _lines(observation: Observation, params: EkfParameters) -> Measured | None:
@@ -73,9 +67,14 @@ def _lines(observation: Observation, params: EkfParameters) -> Measured | None:
         return None
     found = lines.extract(observation.points, observation.origin, params.ransac)
     n = np.stack([np.cos(found.lines[:, 1]), np.sin(found.lines[:, 1])], -1)
-    k = len(n)
-    shown = Detections(
-        observation.stamp, params.node.base_frame, found.lines[:, :1] * n, found.cov,
-        np.full(k, ANONYMOUS, dtype=np.int64), np.full(k, np.nan),
-    )  # fmt: skip
+    shown = _anonymous(observation, params, found.lines[:, :1] * n, found.cov)
     return Measured(found.lines, found.cov, shown)
+
+
+def _anonymous(
+    observation: Observation, params: EkfParameters, points: Array, cov: Array
+) -> Detections:
+    """Detections in the base frame, without ids and diameters."""
+    k = len(points)
+    ids, none = np.full(k, ANONYMOUS, dtype=np.int64), np.full(k, np.nan)
+    return Detections(observation.stamp, params.node.base_frame, points, cov, ids, none)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rlml_slam.params import Spikes
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.polar import polar_covariance
-from rlml_slam.types import ANONYMOUS, Detections, Scan
+from rlml_slam.types import Scan
 
 
 @dataclass(frozen=True)
@@ -29,12 +29,6 @@ class Extracted:
     points: Array
     cov: Array
     beams: Array
-
-    def detections(self, stamp: int, frame_id: str) -> Detections:
-        """The same as anonymous detections."""
-        k = len(self.points)
-        ids = np.full(k, ANONYMOUS, dtype=np.int64)
-        return Detections(stamp, frame_id, self.points, self.cov, ids, np.full(k, np.nan))
 
 
 def extract(scan: Scan, params: Spikes) -> Extracted:
