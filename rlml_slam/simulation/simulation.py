@@ -74,7 +74,6 @@ class Simulation:
         T_base_laser = np.array(p.node.laser_pose)
         self._laser = LaserSensor(p.laser, T_base_laser, p.node.laser_frame, self._generator)
         self._markers = MarkerSensor(p.markers, world.reflectors, self._generator)
-        self._static = world.static.joined(world.reflectors.geometry())
         self._counts = dict.fromkeys((Odometry, Imu, Scan, GroundTruth), 0)
         self._pending: list[tuple[int, int, Message]] = []
         self._pushed = 0
@@ -140,7 +139,6 @@ class Simulation:
         moved = replace(self.world.reflectors, points=points)
         self.world = replace(self.world, reflectors=moved)
         self._markers.reflectors = moved
-        self._static = self.world.static.joined(moved.geometry())
 
     def kidnap(self, distance: float) -> None:
         """Carry the robot ``distance`` [m] along its route at once, unseen by odometry and IMU."""
@@ -228,9 +226,7 @@ class Simulation:
 
     def _scan(self, stamp: int) -> None:
         moment = stamp + self._laser.sweep // 2
-        geometry = self._static
-        for mover in self.world.movers:
-            geometry = geometry.joined(mover.geometry((moment - START) / SECOND))
+        geometry = self.world.geometry((moment - START) / SECOND)
         ready = stamp + self._laser.sweep
         scan = self._laser.measure(self._track, stamp, geometry, moment)
         sent = self._send(scan, ready)
