@@ -24,6 +24,13 @@ VIEW = 0.1  # [rad] by which a reflector is seen from another side
 # round and flat ones, as if seen before: cylinders are more frequent, and a site has one kind
 EXPECTED = 1.0, 0.3
 DECIDED = 3.0  # log of the odds from which on a reflector counts as one of its shape
+SEEN = np.dtype([
+    ('point', np.float64, 2),  # [m] in odom
+    ('odds', np.float64),  # logarithm, without the tilt in this view
+    ('tilts', np.float64, 2),  # sum of TILTED and number of scans of this view
+    ('view', np.float64),  # [rad] from the laser
+    ('stamp', np.int64),  # [ns]
+])  # fmt: skip
 
 
 class ReflectorShapes:
@@ -33,18 +40,14 @@ class ReflectorShapes:
     """
 
     def __init__(self) -> None:
-        self._points = np.zeros((0, 2))
-        self._odds = np.zeros(0)  # without the tilt in this view
-        self._tilts = np.zeros((0, 2))  # sum of TILTED and number of scans of this view
-        self._views = np.zeros(0)
-        self._stamps = np.zeros(0, np.int64)
+        self._seen = np.zeros(0, SEEN)
         self._decided = np.array(EXPECTED)  # round and flat ones so far
 
     @property
     def prior(self) -> float:
         """Log of the odds that a reflector of which nothing is known is flat."""
-        num_round = self._decided[0] + np.sum(self._known < -DECIDED)
-        num_flat = self._decided[1] + np.sum(self._known > DECIDED)
+        num_round = self._decided[0] + np.sum(_odds(self._seen) < -DECIDED)
+        num_flat = self._decided[1] + np.sum(_odds(self._seen) > DECIDED)
         return float(np.log(num_flat / num_round))
 
     def update(self, stamp: int, points: Array, origin: Array, rows: Array) -> Array:
@@ -53,42 +56,35 @@ class ReflectorShapes:
         ``points`` (n, 2) and the laser at ``origin`` (2,) are in odom, ``rows`` (n, COLUMNS) what
         the scan shows. From one view a tilt is the same in all scans: their mean counts, once.
         """
-        self._forget(self._stamps < stamp - MEMORY)
-        n = len(points)
-        before = nearest_once(points, self._points)
-        seen = before >= 0
-        odds, view = rows[:, ODDS].copy(), np.arctan2(*(points - origin).T[::-1])
-        odds[seen] += self._odds[before[seen]]
-        last, tilts = np.full(n, np.inf), np.zeros((n, 2))
-        last[seen], tilts[seen] = self._views[before[seen]], self._tilts[before[seen]]
+        self._forget(self._seen['stamp'] < stamp - MEMORY)
+        before = nearest_once(points, self._seen['point'])
+        now = np.zeros(len(points), SEEN)
+        now['view'] = np.inf
+        now[before >= 0] = self._seen[before[before >= 0]]
+        view = np.arctan2(*(points - origin).T[::-1])
         with np.errstate(invalid='ignore'):
-            is_new = ~(np.abs(se2.wrap(view - last)) < VIEW)
-        odds[is_new] += _mean(tilts[is_new])
-        tilts[is_new] = 0.0
-        tilts += np.stack([rows[:, TILTED], np.ones(n)], -1)
-        odds = np.clip(odds, -SURE, SURE)
-        view[~is_new] = last[~is_new]
-        kept = np.setdiff1d(np.arange(len(self._points)), before)
-        self._points = np.concatenate([self._points[kept], points])
-        self._odds = np.concatenate([self._odds[kept], odds])
-        self._tilts = np.concatenate([self._tilts[kept], tilts])
-        self._views = np.concatenate([self._views[kept], view])
-        self._stamps = np.concatenate([self._stamps[kept], np.full(n, stamp, np.int64)])
-        return np.asarray(np.clip(odds + _mean(tilts), -SURE, SURE) + self.prior)
-
-    @property
-    def _known(self) -> Array:
-        """Log of the odds (n,) of all reflectors seen lately."""
-        return np.asarray(self._odds + _mean(self._tilts))
+            is_new = ~(np.abs(se2.wrap(view - now['view'])) < VIEW)
+        now['odds'] += rows[:, ODDS]
+        now['odds'][is_new] += _mean(now['tilts'][is_new])
+        now['odds'] = np.clip(now['odds'], -SURE, SURE)
+        now['tilts'][is_new] = 0.0
+        now['tilts'] += np.stack([rows[:, TILTED], np.ones(len(points))], -1)
+        now['view'][is_new] = view[is_new]
+        now['point'], now['stamp'] = points, stamp
+        hidden = np.setdiff1d(np.arange(len(self._seen)), before)
+        self._seen = np.concatenate([self._seen[hidden], now])
+        return np.asarray(np.clip(_odds(now), -SURE, SURE) + self.prior)
 
     def _forget(self, old: NDArray[np.bool_]) -> None:
         """Drop reflectors that are out of view; what they were is what others are likely to be."""
-        for is_flat in (0, 1):
-            sign = 2 * is_flat - 1
-            self._decided[is_flat] += np.sum(sign * self._known[old] > DECIDED)
-        self._points, self._odds = self._points[~old], self._odds[~old]
-        self._tilts = self._tilts[~old]
-        self._views, self._stamps = self._views[~old], self._stamps[~old]
+        odds = _odds(self._seen[old])
+        self._decided += np.sum(odds < -DECIDED), np.sum(odds > DECIDED)
+        self._seen = self._seen[~old]
+
+
+def _odds(seen: NDArray[np.void]) -> Array:
+    """Log of the odds (n,) that reflectors are flat, with the tilt in this view."""
+    return np.asarray(seen['odds'] + _mean(seen['tilts']))
 
 
 def _mean(tilts: Array) -> Array:
