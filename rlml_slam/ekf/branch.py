@@ -145,19 +145,17 @@ class Branch:
         if not len(seen.z):
             self._forget_candidates(frame.stamp)
             return [self]
-        matches = self._matcher.match(seen, f, self.tracks, frame.stamp)
-        used = matches.slots >= 0
+        found = self._matcher.match(seen, f, self.tracks, frame.stamp)
+        used = found.match >= 0
         keys = np.full(len(seen.z), -1, dtype=np.int64)
-        keys[used] = self.tracks.keys[f.local[matches.slots[used]]]
-        self.associations = Associations(
-            keys, matches.statuses, float(matches.distance2[used].sum())
-        )
+        keys[used] = self.tracks.keys[f.local[found.match[used]]]
+        self.associations = Associations(keys, found.status, float(found.distance2[used].sum()))
         if self._matcher.defers:
-            self.weight += frame.weight * self._evidence(seen, matches.slots)
+            self.weight += frame.weight * self._evidence(seen, found.match)
             if frame.mapping:
-                self._matcher.learn_spread(seen, matches, f.local, self.tracks)
+                self._matcher.learn_spread(seen, found, f.local, self.tracks)
         for i in np.flatnonzero(used):
-            self._update_landmark(frame, int(i), int(matches.slots[i]))
+            self._update_landmark(frame, int(i), int(found.match[i]))
         if self._matcher.defers and frame.mapping:
             self._merge(keys)
         return self._add_new(frame)

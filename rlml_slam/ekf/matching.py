@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,22 +12,10 @@ from rlml_slam.ekf.association import compatible_ids, mahalanobis2, nearest
 from rlml_slam.ekf.extraction import Measured
 from rlml_slam.ekf.filter import Filter, innovation_covs
 from rlml_slam.estimation.landmark_tracks import LandmarkTracks
-from rlml_slam.matching.reflectors.association import Associator, Believed, gate
+from rlml_slam.matching.reflectors.association import Association, Associator, Believed, gate
 from rlml_slam.params import EkfParameters
 from rlml_slam.se2 import Array
 from rlml_slam.types import ANONYMOUS, Status
-
-
-@dataclass(frozen=True)
-class Matches:
-    """``slots`` (k,) of the filter's local landmarks, -1 for none; ``statuses`` (k,) of Status.
-
-    ``distance2`` (k,) is the squared Mahalanobis distance to the match, NaN without one.
-    """
-
-    slots: NDArray[np.int64]
-    statuses: NDArray[np.int64]
-    distance2: Array
 
 
 class Matcher:
@@ -57,39 +44,38 @@ class Matcher:
 
     def match(
         self, seen: Measured, filter_: Filter, tracks: LandmarkTracks, stamp: int
-    ) -> Matches:
-        """Associate measurements with the landmarks of the filter's region."""
+    ) -> Association:
+        """Associate measurements (k,) with the filter's local landmarks, by their slot."""
         # with ids, joint compatibility adds nothing
         if self._joint is None or (seen.detections.ids != ANONYMOUS).all():
             return self._nearest(seen, filter_, tracks.ids[filter_.local])
         local = filter_.local
         recent = stamp - tracks.last_seen[local] < self._reflector.track_timeout * 1e9
-        found = self._joint.associate(
+        return self._joint.associate(
             seen.detections,
             Believed(
                 filter_.pose, filter_.points, tracks.ids[local], filter_.pose_and_points_cov(),
                 recent if self.defers else None, tracks.spread2[local] if self.defers else None,
             ),
         )  # fmt: skip
-        return Matches(found.match, found.status, found.distance2)
 
     def learn_spread(
-        self, seen: Measured, matches: Matches, local: NDArray[np.int64], tracks: LandmarkTracks
+        self, seen: Measured, found: Association, local: NDArray[np.int64], tracks: LandmarkTracks
     ) -> None:
         """Learn the spread of a landmark that is several close ones, from double detections."""
         assert self._joint is not None
         points = seen.detections.points
-        double = self._joint.doubles(seen.detections, matches.slots)
+        double = self._joint.doubles(seen.detections, found.match)
         for k in np.flatnonzero(double >= 0):
             gap = float(np.linalg.norm(points[k] - points[double[k]]))
-            tracks.see_double(int(local[matches.slots[double[k]]]), gap)
+            tracks.see_double(int(local[found.match[double[k]]]), gap)
 
-    def _nearest(self, seen: Measured, filter_: Filter, ids: NDArray[np.int64]) -> Matches:
+    def _nearest(self, seen: Measured, filter_: Filter, ids: NDArray[np.int64]) -> Association:
         """Nearest neighbour within the gate; a known id uses the wider new-landmark gate."""
         z, detections, k = seen.z, seen.detections, len(seen.z)
         slots, statuses = np.full(k, -1, dtype=np.int64), np.full(k, Status.NEW, dtype=np.int64)
         if not len(ids):
-            return Matches(slots, statuses, np.full(k, np.nan))
+            return Association(slots, statuses, np.full(k, np.nan))
         model = filter_.model
         h, H_r, H_m = model.observe(filter_.x[:3], filter_.points)
         nu = model.innovation(z[:, None], h[None])
@@ -101,7 +87,7 @@ class Matcher:
         statuses[slots >= 0] = Status.USED
         statuses[(slots < 0) & self._is_known(seen, filter_, d2, same_id)] = Status.GATED
         best = np.where(slots >= 0, d2[np.arange(k), np.maximum(slots, 0)], np.nan)
-        return Matches(slots, statuses, best)
+        return Association(slots, statuses, best)
 
     def _is_known(
         self, seen: Measured, filter_: Filter, d2: Array, same_id: NDArray[np.bool_]
