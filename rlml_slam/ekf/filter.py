@@ -159,28 +159,28 @@ class Filter:
         P_NN = J_xr P_rr J_xr^T + J_z R J_z^T, P_Ni = J_xr P_ri for every i.
         """
         m, J_xr, J_z = self.model.place(self.x[:3], z[None])
-        n = len(self.x)
-        self.x = np.concatenate([self.x, m[0]])
-        P = np.empty((n + 2, n + 2))
-        P[:n, :n] = self.P
-        P[n:, :n] = J_xr[0] @ self.P[:3]
-        P[:n, n:] = P[n:, :n].T
-        new = J_xr[0] @ self.P[:3, :3] @ J_xr[0].T + J_z[0] @ R @ J_z[0].T
-        P[n:, n:] = 0.5 * (new + new.T)
-        self.P = P
-        if self._outside is not None:
-            self._outside.append(J_xr[0] @ self._outside.phi[:3])
-        return self._append()
+        cov = J_xr[0] @ self.P[:3, :3] @ J_xr[0].T + J_z[0] @ R @ J_z[0].T
+        return self._append(m[0], 0.5 * (cov + cov.T), J_xr[0])
 
     def fix(self, point: Array, cov: Array) -> int:
         """Add a landmark of a given map, independent of the rest; its number."""
+        return self._append(point, cov)
+
+    def _append(self, point: Array, cov: Array, J_xr: Array | None = None) -> int:
+        """Append a landmark with its Jacobian (2, 3) by the pose, if it depends on it."""
         n = len(self.x)
-        P = np.zeros((n + 2, n + 2))
+        self.x, P = np.concatenate([self.x, point]), np.zeros((n + 2, n + 2))
         P[:n, :n], P[n:, n:] = self.P, cov
-        self.x, self.P = np.concatenate([self.x, point]), P
+        if J_xr is not None:
+            P[n:, :n] = J_xr @ self.P[:3]
+            P[:n, n:] = P[n:, :n].T
+        self.P = P
         if self._outside is not None:
-            self._outside.append(np.zeros((2, self._outside.phi.shape[1])))
-        return self._append()
+            phi = self._outside.phi
+            self._outside.append(np.zeros_like(phi[:2]) if J_xr is None else J_xr @ phi[:3])
+        self.local = np.append(self.local, self.num_landmarks)
+        self.num_landmarks += 1
+        return self.num_landmarks - 1
 
     def join(self, a: int, b: int) -> None:
         """Merge landmarks a and b: the measurement 0 = m_a - m_b, almost without noise.
@@ -195,11 +195,6 @@ class Filter:
         self.x, self.P = self.x[keep], self.P[np.ix_(keep, keep)]
         self.num_landmarks -= 1
         self.local = np.arange(self.num_landmarks)
-
-    def _append(self) -> int:
-        self.local = np.append(self.local, self.num_landmarks)
-        self.num_landmarks += 1
-        return self.num_landmarks - 1
 
     def settle(self) -> None:
         """Apply the updates to the landmarks outside the region; afterwards all are local."""
