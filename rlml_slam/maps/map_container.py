@@ -166,7 +166,7 @@ def read(path: str | Path) -> Content:
     """
     path = Path(path)
     try:
-        return _content(path)
+        return _unpacked(path, _body(path))
     except FileFormatError as e:
         previous = path.with_name(path.name + PREVIOUS)
         if previous.exists() and _is_whole(previous):
@@ -215,10 +215,6 @@ def _checked(path: Path, head: bytes, body: memoryview) -> memoryview:
     if hashlib.sha256(body).digest() != HEAD.unpack(head[: HEAD.size])[3]:
         raise FileFormatError(f'{path}: damaged: the content does not fit its checksum')
     return body
-
-
-def _content(path: Path) -> Content:
-    return _unpacked(path, _body(path))
 
 
 def _unpacked(path: Path, body: memoryview) -> Content:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 
 
@@ -18,14 +18,12 @@ class InputCounts:
     ``contradicts`` odometry.
     """
 
-    counts: dict[str, Counter[str]] = field(default_factory=dict)
+    counts: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     last_error: str = ''
     first_errors: dict[str, str] = field(default_factory=dict)
 
     def count(self, stream: str, what: str, error: str = '') -> None:
         """Count one input of ``stream``; ``error`` is the message for the log."""
-        if stream not in self.counts:
-            self.counts[stream] = Counter()
         self.counts[stream][what] += 1
         if error:
             self.last_error = error

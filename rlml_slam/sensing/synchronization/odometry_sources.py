@@ -176,8 +176,7 @@ class Comparison:
     def update(self, stamp: int) -> None:
         """Compare up to a stamp [ns], or up to where both are known."""
         stamp = min(stamp, *(h.newest or 0 for h in self._of))
-        poses = tuple(h.at(stamp) for h in self._of)
-        a, b = poses
+        a, b = (h.at(stamp) for h in self._of)
         if a is None or b is None or stamp <= self._stamp:
             return
         if self._before is None or stamp - self._stamp > FRESH:

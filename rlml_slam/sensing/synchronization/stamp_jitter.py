@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import defaultdict, deque
 
 from rlml_slam.motion import SECOND
 from rlml_slam.sensing.synchronization.stamp_filter import StampFilter
@@ -18,7 +18,7 @@ class StampJitter:
 
     def __init__(self, enabled: bool) -> None:
         self._enabled = enabled
-        self._filters: dict[tuple[str, str], StampFilter] = {}
+        self._filters: defaultdict[tuple[str, str], StampFilter] = defaultdict(StampFilter)
         # stamps of scans and detections, and their delays
         self._instants: deque[tuple[int, int]] = deque(maxlen=MEMORY)
 
@@ -26,10 +26,7 @@ class StampJitter:
         """The stamp [ns] without jitter, if the sensor has a constant rate."""
         if not self._enabled or stamp <= 0:
             return stamp
-        clock = self._filters.get((stream, source))
-        if clock is None:
-            clock = self._filters[stream, source] = StampFilter()
-        return clock.filtered(stamp)
+        return self._filters[stream, source].filtered(stamp)
 
     def restart(self, clock: tuple[str, str] | None = None) -> None:
         """Begin the filter of a clock (stream, source), or of all, again: stamps were wrong."""

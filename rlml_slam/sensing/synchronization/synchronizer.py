@@ -53,8 +53,7 @@ class Synchronizer:
         self._jitter = StampJitter(self._node.filter_stamps)
         self._queue = WaitingQueue(params, self._stamps, self.inputs)
         self._fastest_turn = params.motion.max_turn_rate
-        n = self._node
-        self.odometry = OdometrySources(n.odom_source, n.tf_buffer_duration)
+        self.odometry = OdometrySources(self._node.odom_source, self._node.tf_buffer_duration)
         self.delay = OdometryDelay()
         self.gyro = GyroCheck()
         # scans would wait for later odometry in vain
