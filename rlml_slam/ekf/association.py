@@ -14,10 +14,9 @@ def mahalanobis2(nu: Array, S: Array) -> Array:
     """nu^T S^-1 nu over leading dimensions, 2 x 2 in closed form."""
     det = S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]
     a, b = nu[..., 0], nu[..., 1]
-    out: Array = (
+    return (
         S[..., 1, 1] * a * a - (S[..., 0, 1] + S[..., 1, 0]) * a * b + S[..., 0, 0] * b * b
     ) / det
-    return out
 
 
 def compatible_ids(a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -90,8 +90,7 @@ class Turn:
 
     def moved(self, coefficients: Array) -> Array:
         """V applied to B times the coefficients."""
-        out: Array = self._along * coefficients + self._across * _swap(coefficients)
-        return out
+        return self._along * coefficients + self._across * _swap(coefficients)
 
 
 def quarter_turn(rows: Array) -> Array:

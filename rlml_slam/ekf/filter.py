@@ -253,8 +253,7 @@ class Filter:
         """Marginal covariances (a, 2, 2) of the local landmarks."""
         m = len(self.local)
         k = np.arange(m)
-        out: Array = self.P[ROBOT:, ROBOT:].reshape(m, 2, m, 2)[k, :, k, :]
-        return out
+        return self.P[ROBOT:, ROBOT:].reshape(m, 2, m, 2)[k, :, k, :]
 
     def landmarks(self) -> Array:
         """All landmarks (m, 2); those outside the region as of when it was chosen."""
@@ -266,8 +265,7 @@ class Filter:
     def difference_cov(self, a: int, b: int) -> Array:
         """Covariance (2, 2) of the difference of two local landmarks."""
         i, j = (slice(ROBOT + 2 * k, ROBOT + 2 * k + 2) for k in (a, b))
-        out: Array = self.P[i, i] + self.P[j, j] - self.P[i, j] - self.P[j, i]
-        return out
+        return self.P[i, i] + self.P[j, j] - self.P[i, j] - self.P[j, i]
 
     def pose_and_points_cov(self) -> Array:
         """Joint covariance (3 + 2a, 3 + 2a) of pose and local landmarks."""
@@ -281,13 +279,12 @@ def innovation_covs(filter_: Filter, H_r: Array, H_m: Array) -> Array:
     m = len(filter_.local)
     P_rm = filter_.P[:3, ROBOT:].reshape(3, m, 2).transpose(1, 0, 2)
     cross = H_r @ P_rm @ H_m.transpose(0, 2, 1)
-    out: Array = (
+    return (
         H_r @ filter_.P[:3, :3] @ H_r.transpose(0, 2, 1)
         + cross
         + cross.transpose(0, 2, 1)
         + H_m @ filter_.point_covs() @ H_m.transpose(0, 2, 1)
     )
-    return out
 
 
 def _columns(landmarks: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -247,5 +247,4 @@ def _array(f: IO[bytes]) -> NDArray[Any]:
         data += piece
     if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(data):
         raise ValueError(f'an array of {shape} {dtype} in {len(data)} bytes')
-    out: NDArray[Any] = np.frombuffer(data, dtype).reshape(shape, order='F' if is_fortran else 'C')
-    return out
+    return np.frombuffer(data, dtype).reshape(shape, order='F' if is_fortran else 'C')

@@ -82,8 +82,7 @@ def leverages(graph: Graph) -> Array:
     """Q W (k, 3, 3) of all enabled edges, in their order; robust weights count."""
     use = np.flatnonzero(graph.edges.enabled)
     Q, W = residual_covs(graph, Marginals(graph)), graph.edges.information[use]
-    out: Array = Q @ W * edge_weights(graph, use)[:, None, None]
-    return out
+    return Q @ W * edge_weights(graph, use)[:, None, None]
 
 
 def sighting_leverages(solver: OnlineSolver, pose: int, sightings: NDArray[np.int64]) -> Array:

@@ -79,5 +79,4 @@ def _jacobians(poses: Array, i: Ints, j: Ints) -> tuple[Array, Array]:
 
 
 def _carried(J: Array, cov: Array) -> Array:
-    out: Array = J @ cov @ np.swapaxes(J, 1, 2)
-    return out
+    return J @ cov @ np.swapaxes(J, 1, 2)

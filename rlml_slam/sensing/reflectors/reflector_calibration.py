@@ -81,8 +81,7 @@ class Calibration:
 def diffuse_at(diffuse: Array, ranges: Array) -> Array:
     """Diffuse intensity (n,) at ranges, interpolated over their logarithm."""
     at = np.log2(np.maximum(ranges, NEAREST) / NEAREST)
-    out: Array = np.interp(at, np.arange(OCTAVES) + 0.5, diffuse)
-    return out
+    return np.interp(at, np.arange(OCTAVES) + 0.5, diffuse)
 
 
 class ReflectorCalibration:
@@ -150,8 +149,7 @@ class ReflectorCalibration:
         brightest = np.maximum.accumulate(np.where(at < FULL, 0.0, level))
         nearer = np.concatenate([[np.inf], brightest[:-1]])
         level = np.where(at > FULL, np.minimum(level, NEARER * nearer), level)
-        out: Array = np.interp(np.arange(OCTAVES), at, level)
-        return out
+        return np.interp(np.arange(OCTAVES), at, level)
 
     def _stands_out(self) -> float:
         """Least ratio of a reflector to what is diffuse: none is noise."""
@@ -231,5 +229,4 @@ def bin_of(bright: Array) -> NDArray[np.int64]:
 
 def intensity_of(bins: NDArray[np.int64]) -> Array:
     """Upper end of a bin of intensity, 0 of darkness."""
-    out: Array = np.where(bins > 0, LOWEST * 2.0 ** (bins / FINE), 0.0)
-    return out
+    return np.where(bins > 0, LOWEST * 2.0 ** (bins / FINE), 0.0)

@@ -120,8 +120,7 @@ def _turned_by_sweep(points: Array, T_base_laser: Array, share: Array) -> Array:
     J = np.zeros((len(points), 2, 3))
     J[:, :, :2] = np.eye(2)
     J[:, 0, 2], J[:, 1, 2] = -p[:, 1], p[:, 0]
-    out: Array = share[:, None, None] * (se2.rotation(T_base_laser[2]).T @ J)
-    return out
+    return share[:, None, None] * (se2.rotation(T_base_laser[2]).T @ J)
 
 
 def detect(scan: Scan, params: Detector, floor: Callable[[Array], Array] | None = None) -> Found:

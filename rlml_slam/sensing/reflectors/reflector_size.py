@@ -102,8 +102,7 @@ class ReflectorSize:
         blurred = spacing + (RATIO - 1.0) * WIDTHS[:, None]
         fits = np.maximum(1.0 - np.abs(width - want) / blurred, 0.0) * (spacing / blurred)
         fits /= np.minimum(want / spacing, 1.0)
-        out: Array = np.log((1.0 - STRAY) * fits + STRAY * np.minimum(spacing / WIDEST, 1.0))
-        return out
+        return np.log((1.0 - STRAY) * fits + STRAY * np.minimum(spacing / WIDEST, 1.0))
 
     def estimate(self) -> tuple[float, float, float]:
         """Size [m], divergence [rad] and the sigma of the size [m].
@@ -128,8 +127,7 @@ class ReflectorSize:
 
 def _odd(view: Array) -> Array:
     """Log of the likelihood (n, 1, divergences) of views whose width is any."""
-    out: Array = np.logaddexp.reduce(view, axis=1, keepdims=True) - math.log(len(WIDTHS))
-    return out
+    return np.logaddexp.reduce(view, axis=1, keepdims=True) - math.log(len(WIDTHS))
 
 
 def _with_view(seen: Array) -> Array:
