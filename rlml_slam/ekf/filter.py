@@ -198,10 +198,9 @@ class Filter:
 
     def settle(self) -> None:
         """Apply the updates to the landmarks outside the region; afterwards all are local."""
-        if not len(self._others):
-            return
         outside = self._outside
-        assert outside is not None
+        if outside is None:
+            return
         a, b = _rows(self.local), _columns(self._others)
         a0 = _rows(self.local[self.local < len(self._x[ROBOT:]) // 2])
         n, before = ROBOT + 2 * self.num_landmarks, len(self._x)
