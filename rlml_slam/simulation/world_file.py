@@ -24,14 +24,14 @@ from rlml_slam.simulation.world import (
     box_corners,
 )
 
+WORLDS = resources.files('rlml_slam.simulation') / 'worlds'
 MATT_REFLECTANCE = 0.6
 WORLD_KEYS = ('description', 'start', 'route', 'walls', 'boxes', 'pillars', 'reflectors', 'movers')
 
 
 def world_names() -> list[str]:
     """Names of the worlds that come with the package."""
-    folder = resources.files('rlml_slam.simulation') / 'worlds'
-    return sorted(p.name[:-5] for p in folder.iterdir() if p.name.endswith('.yaml'))
+    return sorted(p.name[:-5] for p in WORLDS.iterdir() if p.name.endswith('.yaml'))
 
 
 def load_world(name_or_path: str | Path) -> World:
@@ -41,8 +41,7 @@ def load_world(name_or_path: str | Path) -> World:
     """
     text = str(name_or_path)
     if text in world_names():
-        folder = resources.files('rlml_slam.simulation') / 'worlds'
-        return parse_world((folder / f'{text}.yaml').read_text(encoding='utf-8'), text)
+        return parse_world((WORLDS / f'{text}.yaml').read_text(encoding='utf-8'), text)
     path = Path(name_or_path)
     if path.suffix not in ('.yaml', '.yml'):
         known = ', '.join(world_names())
