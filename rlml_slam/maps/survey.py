@@ -65,10 +65,8 @@ def load(path: str | Path) -> Survey:
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise FileFormatError(f'{path}: a survey is one of {", ".join(readers)}')
-    rows = []
     try:
-        for where, row in reader(text):
-            rows.append(_checked(where, row))
+        rows = [_checked(where, row) for where, row in reader(text)]
     except (ValueError, TypeError, KeyError, RecursionError, csv.Error) as e:
         raise FileFormatError(f'{path}: {e}') from e
     if not rows:
