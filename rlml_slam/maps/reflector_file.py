@@ -51,14 +51,14 @@ def load(path: str | Path) -> Reflectors:
         raise FileFormatError(f'{path}: line 1: not the columns of a reflector map')
     try:
         table = enumerate(csv.reader(lines[1:]), 2)
-        rows = [_row(f'{path}: line {k}', row) for k, row in table if row]
+        rows = {k: _row(f'{path}: line {k}', row) for k, row in table if row}
     except csv.Error as e:
         raise FileFormatError(f'{path}: {e}') from e
-    values = np.array(rows).reshape(-1, len(COLUMNS))
+    values = np.array(list(rows.values())).reshape(-1, len(COLUMNS))
     cov = values[:, [4, 5, 5, 6]].reshape(-1, 2, 2)
     if len(cov) and (np.linalg.eigvalsh(cov) < -1e-9).any():
-        bad = int(np.argmax(np.linalg.eigvalsh(cov).min(-1) < -1e-9))
-        raise FileFormatError(f'{path}: line {bad + 2}: covariance has a negative variance')
+        bad = list(rows)[int(np.argmax(np.linalg.eigvalsh(cov).min(-1) < -1e-9))]
+        raise FileFormatError(f'{path}: line {bad}: covariance has a negative variance')
     return Reflectors(
         values[:, 0].astype(np.int64),
         values[:, 2:4].copy(),

@@ -110,7 +110,7 @@ class MotionTerm:
             return
         walk, kept = p.imu_bias_walk**2 * dt, math.exp(-dt / p.scale_error_time)
         before, cov = state.pose, self._sweep_within(motion, dt)
-        if not np.array_equal(self._known, relative(state.x, state.P)[1]):
+        if self.has_lidar and not np.array_equal(self._known, relative(state.x, state.P)[1]):
             self._begin_stretch()  # in another submap, or moved: the pose is known otherwise
         if cov is not None:
             motion = replace(motion, cov=positive(motion.cov - cov))
@@ -185,7 +185,7 @@ class MotionTerm:
         ``now`` is the pose (3,) in the submap, and its covariance (3, 3).
         """
         before, state.x[SCALES], state.P[SCALES, SCALES] = self._held
-        if not motion.known or self.interval > FRESH:
+        if not self._is_odometry(motion) or self.interval > FRESH:
             self._begin_stretch()
             return
         moved = (

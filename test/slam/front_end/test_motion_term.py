@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from made_worlds import SECOND, STEP
@@ -96,12 +98,13 @@ def test_noise_of_the_wheels_is_not_taken_for_a_share():
     assert P[1, 1] == pytest.approx(NOISE.scale_error_sigma[1] ** 2, rel=0.02)
 
 
-def with_lidar(rng, shares, speeds, late=0.0, dt=0.2, sigma=SIGMA, new_submap=0):
+def with_lidar(rng, shares, speeds, late=0.0, dt=0.2, sigma=SIGMA, new_submap=0, bridged=0):
     """Errors (3,) of scale errors and drift and their sigmas, of a robot with a lidar.
 
     ``speeds`` (n, 2) [m/s, rad/s] are those of each second; its odometry is ``late`` [s] and errs
     by ``shares``. ``sigma`` (3,) is that of a pose, in whose direction nothing is seen where it is
-    inf. A submap begins after ``new_submap`` steps each.
+    inf. A submap begins after ``new_submap`` steps each; after ``bridged`` steps each, another
+    source says how the robot moved.
     """
     state = JointState(np.zeros(3), np.zeros((3, 3)), 0.0, wheels=ERRORS)
     term, pose = MotionTerm(Parameters()), np.zeros(3)
@@ -130,6 +133,9 @@ def with_lidar(rng, shares, speeds, late=0.0, dt=0.2, sigma=SIGMA, new_submap=0)
         o = Observation(
             int(k * dt * SECOND), motion, np.eye(2), np.zeros(2), odom_pose=np.zeros(3)
         )
+        o = term.likeliest(o, lambda _: None)
+        if bridged and k % bridged == 0:
+            o = replace(o, motion=replace(o.motion, delta=delta.copy()))
         term.predict(state, o)
         error = pose - state.pose
         error[seen] += sigma[seen] * rng.standard_normal(len(rows))
@@ -173,6 +179,12 @@ def test_a_new_submap_measures_no_scale_error():
     rng, speeds = np.random.default_rng(0), np.tile([0.8, 0.0], (102, 1))
     _, found = with_lidar(rng, (0.04, 0.0, 0.0), speeds, sigma=sigma, new_submap=25)
     assert found[0] > 0.95 * ERRORS[0]
+
+
+def test_a_stall_that_is_bridged_measures_no_scale_error():
+    rng, speeds = np.random.default_rng(0), np.tile([0.8, 0.2], (102, 1))
+    _, found = with_lidar(rng, (0.04, 0.0, 0.0), speeds, bridged=10)
+    np.testing.assert_allclose(found[:2], ERRORS[:2], rtol=1e-9)
 
 
 def test_from_the_first_scan_on_the_wheels_err_less():
