@@ -38,11 +38,15 @@ class Bound(NamedTuple):
     information: Array
 
 
+def detection_cov(offsets: Array, p: Reflector) -> Array:
+    """Covariances (k, 2, 2) of detections of reflectors at ``offsets`` (k, 2) from the robot."""
+    r = np.maximum(np.hypot(offsets[:, 0], offsets[:, 1]), 1e-6)
+    return polar_covariance(offsets / r[:, None], p.sigma_range**2, (r * p.sigma_bearing) ** 2)
+
+
 def reflector_information(offsets: Array, cov: Array, p: Reflector) -> Array:
     """Information (k, 6) of reflectors at ``offsets`` (k, 2) with map covariances (k, 2, 2)."""
-    r = np.maximum(np.hypot(offsets[:, 0], offsets[:, 1]), 1e-6)
-    noise = polar_covariance(offsets / r[:, None], p.sigma_range**2, (r * p.sigma_bearing) ** 2)
-    S = noise + cov
+    S = detection_cov(offsets, p) + cov
     det = S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] ** 2
     a, b, c = S[:, 1, 1] / det, -S[:, 0, 1] / det, S[:, 0, 0] / det
     x, y = offsets.T

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from rlml_slam import se2
 from rlml_slam.matching.reflectors.constellation import locate
 from rlml_slam.params import Parameters
+from rlml_slam.planning.bound import detection_cov
 from rlml_slam.planning.driving import predicted, schur
 from rlml_slam.planning.plan import Goal
-from rlml_slam.planning.samples import FAR, SAME_TURN
+from rlml_slam.planning.samples import is_elsewhere
 from rlml_slam.se2 import Array
-from rlml_slam.sensing.polar import polar_covariance
 from rlml_slam.types import Verdict
 
 OPEN = 1.0  # [m] sigma of what nothing measures
@@ -119,10 +119,11 @@ class Coverage:
         row = self.seen[place] & chosen
         k = int(row.sum())
         z = self.points[row] - self.places[place]
-        found = locate(z, self._noise(z), self.points[chosen], self.cov[chosen], p.relocalization)
+        cov = detection_cov(z, p.reflector)
+        found = locate(z, cov, self.points[chosen], self.cov[chosen], p.relocalization)
         if found.verdict is Verdict.UNIQUE:
             return UNIQUE
-        others = [c for c in found.candidates if _is_elsewhere(c.pose, self.places[place])]
+        others = [c for c in found.candidates if is_elsewhere(c.pose, self.places[place])]
         # matches of the true pose are k
         lacking = [max(c.num_matches - k + LEAD, 1) for c in others]
         if not others:
@@ -132,8 +133,8 @@ class Coverage:
     def decides(self, place: int, mounts: Ints, rivals: Rivals, chosen: Mask) -> Mask:
         """Whether each mount (c,) seen from a place meets nothing chosen at each rival: (k, c)."""
         z = self.points[mounts] - self.places[place]
-        reach = 4.0 * np.sqrt(np.linalg.eigvalsh(self._noise(z))[:, -1]
-                              + self.params.relocalization.sigma_floor**2)  # fmt: skip
+        largest = np.linalg.eigvalsh(detection_cov(z, self.params.reflector))[:, -1]
+        reach = 4.0 * np.sqrt(largest + self.params.relocalization.sigma_floor**2)
         out = np.zeros((len(rivals.poses), len(mounts)), dtype=np.bool_)
         known = self.points[chosen]
         for k, pose in enumerate(rivals.poses):
@@ -145,14 +146,6 @@ class Coverage:
             out[k] = gap > reach
         seen: Mask = self.seen[place, mounts]
         return out & seen
-
-    def _noise(self, z: Array) -> Array:
-        r, d = self.params.reflector, np.maximum(np.hypot(z[:, 0], z[:, 1]), 1e-6)
-        return polar_covariance(z / d[:, None], r.sigma_range**2, (d * r.sigma_bearing) ** 2)
-
-
-def _is_elsewhere(pose: Array, place: Array) -> bool:
-    return bool(np.hypot(*(pose[:2] - place)) > FAR or abs(pose[2]) > SAME_TURN)
 
 
 def step(cost: Array) -> Array:

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from rlml_slam import se2
 from rlml_slam.matching.reflectors.constellation import locate
 from rlml_slam.matching.scans import voxel_filter
-from rlml_slam.params import Laser, Parameters, Reflector
+from rlml_slam.params import Laser, Parameters
+from rlml_slam.planning.bound import detection_cov
 from rlml_slam.planning.site import Site
 from rlml_slam.se2 import Array
-from rlml_slam.sensing.polar import polar_covariance
 from rlml_slam.simulation.ray_cast import cast
 from rlml_slam.slam.front_end.grid_localization import map_information
 from rlml_slam.slam.relocalization.grid_submap import submap_of
@@ -53,15 +53,15 @@ def rival(
 
     The robot is at ``place`` with heading zero; the other place (3,) is NaN if there is none.
     """
-    r: Reflector = p.reflector
-    z = site.reflectors.points[seen] - place
-    d = np.hypot(z[:, 0], z[:, 1])
-    cov = polar_covariance(z / d[:, None], r.sigma_range**2, (d * r.sigma_bearing) ** 2)
-    found = locate(z, cov, site.reflectors.points, site.cov, p.relocalization)
-    for c in found.candidates:
-        if np.hypot(*(c.pose[:2] - place)) > FAR or abs(c.pose[2]) > SAME_TURN:
-            return found.verdict, c.pose
-    return found.verdict, np.full(3, np.nan)
+    z, r = site.reflectors.points[seen] - place, site.reflectors
+    found = locate(z, detection_cov(z, p.reflector), r.points, site.cov, p.relocalization)
+    others = (c.pose for c in found.candidates if is_elsewhere(c.pose, place))
+    return found.verdict, next(others, np.full(3, np.nan))
+
+
+def is_elsewhere(pose: Array, place: Array) -> bool:
+    """Whether a pose (3,) is not that of the robot at ``place`` (2,) with heading zero."""
+    return bool(np.hypot(*(pose[:2] - place)) > FAR or abs(pose[2]) > SAME_TURN)
 
 
 def patterns(places: Array, rivals: Array) -> list[str]:
