@@ -88,8 +88,7 @@ def bound(
     also = np.zeros((n, 6)) if also is None else also
 
     def with_all(rows: NDArray[np.int64] | slice, information: Array) -> Array:
-        more = predicted(information, q) if math.isfinite(q) else 0.0
-        return information + more + also[rows]
+        return information + predicted(information, q) + also[rows]
 
     for first in range(0, n, CHUNK):
         rows, columns = np.nonzero(seen[first : first + CHUNK])

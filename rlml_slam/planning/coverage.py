@@ -71,9 +71,7 @@ class Coverage:
 
     def shortfall(self, information: Array, scan: Array) -> Array:
         """How far (r,) sigmas are from the goal, 0 where reached to 1 where open, by logarithm."""
-        if math.isfinite(self.q):
-            information = information + predicted(information, self.q)
-        a, b, c = schur(information + scan + WEAK)
+        a, b, c = schur(information + predicted(information, self.q) + scan + WEAK)
         mean, half = 0.5 * (a + c), np.hypot(0.5 * (a - c), b)
         least = self.goal.sigma**-2 + WEAK[0]
         short = [np.log(np.maximum(least / np.maximum(v, 1e-30), 1.0))
@@ -90,11 +88,15 @@ class Coverage:
         out = np.zeros(len(place))
         for first in range(0, len(place), CHUNK):
             rows = slice(first, first + CHUNK)
-            i, j = place[rows], members[rows]
-            each = np.where((j >= 0)[..., None], self.information[i[:, None], j], 0.0)
+            each = self.information_of(place[rows], members[rows])
             for hidden in range(self.goal.hidden + 1):
-                out[rows] += self._worst(each, self.scan[i], hidden) / (self.goal.hidden + 1)
+                worst = self._worst(each, self.scan[place[rows]], hidden)
+                out[rows] += worst / (self.goal.hidden + 1)
         return out
+
+    def information_of(self, place: Ints, members: Ints) -> Array:
+        """Information (r, k, 6) of each of the ``members`` (r, k) at ``place`` (r,)."""
+        return np.where((members >= 0)[..., None], self.information[place[:, None], members], 0.0)
 
     def _worst(self, each: Array, scan: Array, hidden: int) -> Array:
         """Shortfall (r,) with that many of the reflectors' information (r, k, 6) hidden."""

@@ -10,6 +10,8 @@ counts once: the error of a grid is the same in successive scans.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from rlml_slam.motion import motion_of
@@ -31,7 +33,12 @@ def schur(information: Array) -> tuple[Array, Array, Array]:
 
 
 def predicted(information: Array, q: float) -> Array:
-    """Information (..., 6) that the prediction brings where scans have (..., 6) of reflectors."""
+    """Information (..., 6) that the prediction brings where scans have (..., 6) of reflectors.
+
+    ``q`` [m^2] is infinite for a single scan, which has no prediction.
+    """
+    if math.isinf(q):
+        return np.zeros_like(information)
     a, b, c = schur(information)
     mean, half = 0.5 * (a + c), np.hypot(0.5 * (a - c), b)
     low, high = (_of_direction(mean + sign * half, q) for sign in (-1.0, 1.0))

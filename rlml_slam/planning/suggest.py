@@ -10,7 +10,7 @@ import numpy as np
 
 from rlml_slam.errors import MapError
 from rlml_slam.params import Parameters, SimulatorParameters
-from rlml_slam.planning.bound import reflector_information, sigmas
+from rlml_slam.planning.bound import position_sigma, reflector_information
 from rlml_slam.planning.coverage import Choice, Coverage, start
 from rlml_slam.planning.driving import predicted
 from rlml_slam.planning.exact_cover import fewest
@@ -264,13 +264,10 @@ def _described(empty: Choice, choice: Choice, at_least: int | None, is_fewest: b
 def _step(choice: Choice, mount: Array) -> Step:
     of = choice.of
     everywhere = np.arange(len(of.places))
-    only = replace(of, goal=replace(of.goal, hidden=0))
     members = of.members(choice.chosen, everywhere)
-    total = np.where((members >= 0)[..., None],
-                     only.information[everywhere[:, None], members], 0.0).sum(axis=1)  # fmt: skip
-    if np.isfinite(of.q):
-        total = total + predicted(total, of.q)
+    total = of.information_of(everywhere, members).sum(axis=1)
+    sigma = position_sigma(total + predicted(total, of.q) + of.scan)
     unique = [not len(r.lacking) for r in choice.rivals]
     reached = of.costs(everywhere, members) == 0.0
-    return Step(mount, float(reached.mean()), float(sigmas(total + of.scan)[0].max()),
+    return Step(mount, float(reached.mean()), float(sigma.max()),
                 float(np.mean(unique)) if unique else None)  # fmt: skip
