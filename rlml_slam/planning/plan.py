@@ -17,7 +17,7 @@ from rlml_slam.params import Parameters, SimulatorParameters
 from rlml_slam.planning.bound import Bound, bound, position_sigma
 from rlml_slam.planning.driving import motion_variance
 from rlml_slam.planning.regular_patterns import rows_of
-from rlml_slam.planning.samples import patterns, rival, scan_information
+from rlml_slam.planning.samples import patterns, rival, scan_information, sees_all
 from rlml_slam.planning.site import Site
 from rlml_slam.planning.visibility import close_pairs, visible
 from rlml_slam.se2 import Array
@@ -92,28 +92,25 @@ def make_plan(
     if not len(places):
         raise MapError('there is no free place in the area; see --clearance and --area')
     seen, points = visible(site, places, p, sensor), site.reflectors.points
-    n, fov = len(places), sensor.laser.field_of_view
-    chosen = spread(n, MAX_SAMPLES)
-    whole = fov > 2.0 * math.pi - 1e-6
+    fov, q = sensor.laser.field_of_view, goal.variance(p, sensor)
+    angles = headings(fov)
     alone: list[Bound] = []
     both: list[Bound] = []
     driving: list[Bound] = []
     scans, counts = [], []
-    for heading in np.arange(1 if whole else HEADINGS) * (2.0 * np.pi / HEADINGS):
-        in_view = seen if whole else seen & within(places, points, heading, fov)
+    for heading in angles:
+        in_view = seen & within(places, points, heading, fov)
         scan = scans_at(site, places, heading, p, sensor)
         alone.append(bound(places, in_view, points, site.cov, p.reflector, hide=False))
         both.append(bound(places, in_view, points, site.cov, p.reflector, scan, hide=False))
-        q = goal.variance(p, sensor)
         driving.append(bound(places, in_view, points, site.cov, p.reflector, scan, q))
         scans.append(scan)
         counts.append(in_view.sum(axis=1))
     worst = np.argmax([b.position for b in both], axis=0)
     fewest = np.argmin(counts, axis=0)
-    answers = []
+    chosen, answers = spread(len(places), MAX_SAMPLES), []
     for k in chosen:
-        heading = fewest[k] * (2.0 * np.pi / HEADINGS)
-        row = seen[k] if whole else seen[k] & within(places[[k]], points, heading, fov)[0]
+        row = seen[k] & within(places[[k]], points, angles[fewest[k]], fov)[0]
         answers.append(rival(site, places[k], row, p))
     rivals = np.array([other for _, other in answers])
     close = [
@@ -127,6 +124,11 @@ def make_plan(
         _worst(driving), chosen, tuple(v for v, _ in answers), rivals,
         tuple(close + rows_of(points) + patterns(places[chosen], rivals)),
     )  # fmt: skip
+
+
+def headings(fov: float) -> Array:
+    """Headings [rad] at which places are evaluated: one is enough where the laser sees all."""
+    return np.arange(1 if sees_all(fov) else HEADINGS, dtype=np.float64) * (2.0 * np.pi / HEADINGS)
 
 
 def spread(n: int, most: int) -> NDArray[np.int64]:
@@ -146,6 +148,8 @@ def scans_at(
 
 def within(places: Array, points: Array, heading: float, fov: float) -> NDArray[np.bool_]:
     """Whether a laser at places (n, 2) with one heading has points (m, 2) in its view."""
+    if sees_all(fov):
+        return np.ones((len(places), len(points)), dtype=np.bool_)
     d = points - places[:, None]
     bearing = se2.wrap(np.arctan2(d[..., 1], d[..., 0]) - heading)
     inside: NDArray[np.bool_] = np.abs(bearing) <= 0.5 * fov + 1e-9

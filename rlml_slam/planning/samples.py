@@ -26,10 +26,14 @@ FREQUENT = 0.02  # share of the places from which a motion is a pattern
 SAME_TURN = math.radians(5.0)
 
 
+def sees_all(fov: float) -> bool:
+    """Whether a field of view [rad] is the whole circle."""
+    return fov > 2.0 * math.pi - 1e-6
+
+
 def scan_information(site: Site, place: Array, heading: float, p: Parameters, n: Laser) -> Array:
     """Information (6,) of a match of a noiseless scan with the grid, as in localization."""
-    whole = n.field_of_view > 2.0 * math.pi - 1e-6
-    step = n.field_of_view / (n.beams if whole else n.beams - 1)
+    step = n.field_of_view / (n.beams if sees_all(n.field_of_view) else n.beams - 1)
     angles = heading - 0.5 * n.field_of_view + np.arange(n.beams, dtype=np.float64) * step
     reach = min(n.range_max, p.submap.max_laser_range)
     origins = np.tile(place, (n.beams, 1))

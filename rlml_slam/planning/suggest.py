@@ -15,7 +15,7 @@ from rlml_slam.planning.coverage import Choice, Coverage, start
 from rlml_slam.planning.driving import predicted
 from rlml_slam.planning.exact_cover import fewest
 from rlml_slam.planning.mounts import thin
-from rlml_slam.planning.plan import HEADINGS, Goal, Plan, make_plan, scans_at, spread, within
+from rlml_slam.planning.plan import Goal, Plan, headings, make_plan, scans_at, spread, within
 from rlml_slam.planning.site import DIAMETER, Site
 from rlml_slam.planning.visibility import in_sight
 from rlml_slam.se2 import Array
@@ -126,8 +126,8 @@ def coverage(
     present = site.reflectors
     m, fov = len(present), sensor.laser.field_of_view
     count = m + len(mounts)
-    headings = 1 if fov > 2.0 * np.pi - 1e-6 else HEADINGS
-    most = max(min(MOST_ROWS, MOST_VALUES // max(count, 1)) // headings, 1)
+    angles = headings(fov)
+    most = max(min(MOST_ROWS, MOST_VALUES // max(count, 1)) // len(angles), 1)
     places = np.concatenate([also, places[spread(len(places), most)]])
     geometry = site.walls.joined(present.geometry())
     hiding = geometry.joined(cylinders(posts).geometry())
@@ -139,11 +139,9 @@ def coverage(
     useful = seen.any(axis=0)
     seen, mounts = np.concatenate([known, seen[:, useful]], axis=1), mounts[useful]
     points = np.concatenate([present.points, mounts])
-    angles = np.arange(headings) * (2.0 * np.pi / HEADINGS)
-    if headings > 1:
-        seen = np.concatenate([seen & within(places, points, a, fov) for a in angles])
+    seen = np.concatenate([seen & within(places, points, a, fov) for a in angles])
     scan = np.concatenate([scans_at(site, places, a, p, sensor) for a in angles])
-    places = np.tile(places, (headings, 1))
+    places = np.tile(places, (len(angles), 1))
     cov = np.concatenate([site.cov, np.zeros((len(mounts), 2, 2))])
     information = np.zeros((*seen.shape, 6))
     rows, columns = np.nonzero(seen)
