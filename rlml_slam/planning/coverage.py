@@ -155,6 +155,11 @@ def step(cost: Array) -> Array:
     return np.where(cost > 0.0, 0.5 + 0.5 * cost, 0.0)
 
 
+def _depth(lacking: Ints) -> Array:
+    """The loss of places that lack so many matches."""
+    return step(np.minimum(lacking / DEEPEST, 1.0))
+
+
 @dataclass(frozen=True)
 class Choice:
     """Chosen reflectors (m,) of a coverage, and what they lack.
@@ -177,7 +182,7 @@ class Choice:
     @property
     def loss(self) -> float:
         """Mean loss of accuracy, if it counts, and of uniqueness."""
-        lost = [_depth(int(r.lacking.max(initial=0))) for r in self.rivals]
+        lost = [_depth(r.lacking.max(initial=0)) for r in self.rivals]
         accuracy = float(step(self.cost).mean()) if self.of.is_accurate else 0.0
         return accuracy + (float(np.mean(lost)) if lost else 0.0)
 
@@ -196,9 +201,7 @@ class Choice:
         for place, r in zip(of.lost, self.rivals, strict=True):
             if len(r.lacking):
                 left = (r.lacking[:, None] - of.decides(place, mounts, r, self.chosen)).max(axis=0)
-                now = _depth(int(r.lacking.max()))
-                out += (now - np.where(left > 0, 0.5 + 0.5 * np.minimum(left / DEEPEST, 1.0), 0.0)
-                        ) / len(of.lost)  # fmt: skip
+                out += (_depth(r.lacking.max()) - _depth(left)) / len(of.lost)
         out[self.chosen[first:]] = 0.0
         return out
 
@@ -234,7 +237,3 @@ def _evaluated(of: Coverage, chosen: Mask, before: Choice, rows: Mask) -> Choice
     rivals = tuple(of.rivals(int(k), chosen) if rows[k] or len(r.lacking) else r
                    for k, r in zip(of.lost, before.rivals, strict=True))  # fmt: skip
     return replace(before, chosen=chosen, cost=cost, after=after, rivals=rivals)
-
-
-def _depth(lacking: int) -> float:
-    return 0.5 + 0.5 * min(lacking / DEEPEST, 1.0) if lacking else 0.0
