@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, milp
 
 from rlml_slam.matching.reflectors.pair_votes import MIN_MATCHES
-from rlml_slam.planning.coverage import Choice, Coverage, Ints, Mask, Rivals
+from rlml_slam.planning.coverage import Choice, Coverage, Ints, Mask
 from rlml_slam.se2 import Array
 
 TIME = 20.0  # [s] of the processor after which the best choice known is the answer
@@ -106,12 +106,10 @@ def _add_cuts(cuts: _Cuts, now: Choice) -> None:
     mounts = np.arange(first, len(of.points))
     extended = 0
     for place, rivals in zip(of.lost.tolist(), now.rivals, strict=True):
-        for k in range(len(rivals.lacking)):
-            one = Rivals(rivals.poses[k : k + 1], rivals.lacking[k : k + 1])
-            decides = of.decides(place, mounts, one, now.chosen)[0] & ~now.chosen[first:]
-            seen = int((of.seen[place] & now.chosen).sum())
-            is_pose = np.isfinite(rivals.poses[k, 0])
-            cuts.add(decides, int(rivals.lacking[k]) if is_pose else max(MIN_MATCHES - seen, 1))
+        decides = of.decides(place, mounts, rivals, now.chosen) & ~now.chosen[first:]
+        seen = int((of.seen[place] & now.chosen).sum())
+        for row, pose, lacking in zip(decides, rivals.poses, rivals.lacking.tolist(), strict=True):
+            cuts.add(row, lacking if np.isfinite(pose[0]) else max(MIN_MATCHES - seen, 1))
         if len(rivals.lacking) and extended < EXTENDED:
             extended += 1
             cuts.add((of.seen[place] & ~_largest_mistaken(of, place, now.chosen))[first:])
