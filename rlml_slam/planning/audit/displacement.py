@@ -59,15 +59,13 @@ def displacement(e: Evidence, tolerance: float) -> Displacement:
         N[np.ix_(rows, XY, rows, XY)] -= np.einsum('aip,ibq->apbq', C, HC)
         N[rows, :, rows, :] += MW @ M
         count[rows] += 1
-        scans.append((k, rows, J, M, W, nu))
+        scans.append((k, rows, M, W, JW, H, nu))
     delta, cov = _snoop(N, b, count, e.site.cov + tolerance**2 * np.eye(2))
     chi2, dof = np.zeros(n), np.zeros(n)
     shift = np.nan_to_num(delta)
-    for k, rows, J, M, W, nu in scans:
+    for k, rows, M, W, JW, H, nu in scans:
         r = nu - np.einsum('kij,kj->ki', M, shift[rows])
-        JW = J.transpose(0, 2, 1) @ W
         g = np.einsum('kij,kj->i', JW, r)
-        H = prior + (JW @ J).sum(axis=0)
         chi2[k] = np.einsum('ki,kij,kj->', r, W, r) - g @ np.linalg.solve(H, g)
         dof[k] = max(2 * len(rows) - 3, 1)
     return Displacement(delta, np.sqrt(np.linalg.eigvalsh(cov)[:, -1]), chi2, dof)
