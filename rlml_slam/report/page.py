@@ -40,12 +40,9 @@ def heading(title: str, sub: str) -> str:
 
 def section(title: str, body: str, kind: str = '', what: str = '') -> str:
     """A box of the page; ``body`` is HTML, ``what`` explains it in plain text."""
-    explained = f'<p class="what">{escape(what)}</p>' if what else ''
-    return (
-        f'<section class="{kind}"><h2>{escape(title)}</h2>{explained}{body}</section>'
-        if title
-        else f'<section class="{kind}">{explained}{body}</section>'
-    )
+    above = f'<h2>{escape(title)}</h2>' if title else ''
+    above += f'<p class="what">{escape(what)}</p>' if what else ''
+    return f'<section class="{kind}">{above}{body}</section>'
 
 
 def table(rows: Sequence[Sequence[str]], head: Sequence[str] = (), kind: str = '') -> str:
@@ -58,13 +55,8 @@ def html_table(rows: Sequence[Sequence[str]], head: Sequence[str] = (), kind: st
     """As ``table``, of cells that are HTML."""
     first = 'td' if head else 'th'
     body = ''.join(
-        '<tr>'
-        + ''.join(
-            f'<{first if k == 0 else "td"}>{c}</{first if k == 0 else "td"}>'
-            for k, c in enumerate(row)
-        )
-        + '</tr>'
-        for row in rows
+        f'<tr><{first}>{name}</{first}>{"".join(f"<td>{c}</td>" for c in others)}</tr>'
+        for name, *others in rows
     )
     top = ''.join(f'<th>{c}</th>' for c in head)
     top = f'<thead><tr>{top}</tr></thead>' if head else ''
