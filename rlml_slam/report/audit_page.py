@@ -16,7 +16,7 @@ from rlml_slam.planning.audit.audit import Audit
 from rlml_slam.planning.audit.findings import Kind
 from rlml_slam.report import pictures as draw
 from rlml_slam.report.outputs import make_folder
-from rlml_slam.report.page import heading, page, picture, section, table
+from rlml_slam.report.page import headed_table, heading, page, picture, section
 from rlml_slam.report.plan_page import cm
 from rlml_slam.types import Level
 
@@ -106,9 +106,7 @@ def _page(name: str, audit: Audit, image: bytes) -> str:
         )
     ]
     if audit.findings:
-        head, *rows = finding_rows(f)
-        parts.append(section('What to do', table(rows, head), 'problem'))
+        parts.append(section('What to do', headed_table(finding_rows(f)), 'problem'))
     parts.append(section(CAPTION, picture(image, CAPTION)))
-    head, *rows = area_rows(f)
-    parts.append(section('Areas', table(rows, head)))
+    parts.append(section('Areas', headed_table(area_rows(f))))
     return page(f'Audit of {name}', parts)

@@ -22,7 +22,7 @@ from rlml_slam.evaluation.run_comparison import (
 )
 from rlml_slam.maps.atomic_file import write_atomically
 from rlml_slam.report.outputs import make_folder
-from rlml_slam.report.page import heading, page, picture, section, table
+from rlml_slam.report.page import headed_table, heading, page, picture, section
 from rlml_slam.se2 import Array, compose
 
 HEADER = ('figure', 'A', 'B', 'change', 'verdict')
@@ -140,10 +140,8 @@ def write_comparison(c: RunComparison, folder: Path) -> None:
         write_atomically(folder / f'{name}.png', png)
         parts.append(section(CAPTIONS[name], picture(png, CAPTIONS[name])))
     if c.parting:
-        head, *rows = parting_table(c)
-        parts.append(section('Where they part', table(rows, head)))
-    head, *rows = table_of(c.rows)
-    parts.append(section('Figures', table(rows, head)))
+        parts.append(section('Where they part', headed_table(parting_table(c))))
+    parts.append(section('Figures', headed_table(table_of(c.rows))))
     write_atomically(folder / 'comparison.html', page(title, parts).encode())
 
 

@@ -51,6 +51,11 @@ def table(rows: Sequence[Sequence[str]], head: Sequence[str] = (), kind: str = '
     return html_table(escaped, [escape(c) for c in head], kind)
 
 
+def headed_table(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of text, of which the first is the head."""
+    return table(rows[1:], rows[0])
+
+
 def html_table(rows: Sequence[Sequence[str]], head: Sequence[str] = (), kind: str = '') -> str:
     """As ``table``, of cells that are HTML."""
     first = 'td' if head else 'th'

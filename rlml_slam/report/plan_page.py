@@ -24,7 +24,7 @@ from rlml_slam.planning import site_file
 from rlml_slam.planning.plan import Plan, figures, scan_sigma
 from rlml_slam.planning.suggest import Suggestion
 from rlml_slam.report.outputs import make_folder
-from rlml_slam.report.page import heading, page, picture, section, table
+from rlml_slam.report.page import headed_table, heading, page, picture, section
 from rlml_slam.report.pictures import LIVE, REFLECTOR, draw_grid, dress, png
 from rlml_slam.se2 import Array
 from rlml_slam.simulation.world import Geometry
@@ -255,15 +255,13 @@ def _page(name: str, found: Mapping[str, Any], pictures: Mapping[str, bytes]) ->
     if found['notes']:
         parts.append(section('Notes', _paragraphs(found['notes']), 'problem'))
     if 'suggested' in found:
-        head, *rows = suggestion_rows(found)
         notes = _paragraphs([*suggestion_notes(found), SUGGESTED])
-        parts.append(section('Suggested reflectors', table(rows, head) + notes))
+        parts.append(section('Suggested reflectors', headed_table(suggestion_rows(found)) + notes))
     for key, image in pictures.items():
         legend = '' if key in LABELS else f'<p class="sub">{LEGEND}</p>'
         parts.append(section(CAPTIONS[key], legend + picture(image, CAPTIONS[key])))
-    size = found['area_size_m']
-    head, *rows = table_rows(found)
-    parts.append(section(f'Areas of {size:g} m, largest sigmas', table(rows, head)))
+    title = f'Areas of {found["area_size_m"]:g} m, largest sigmas'
+    parts.append(section(title, headed_table(table_rows(found))))
     return page(f'Layout of {name}', parts)
 
 
