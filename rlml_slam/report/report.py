@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from html import escape
+from itertools import groupby
 from typing import Any
 
 from rlml_slam.evaluation.metrics import RunErrors
@@ -88,19 +89,12 @@ def _residuals(f: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def bad_spells(run: Run, most: int = 20) -> Iterator[tuple[str, str]]:
     """(when, level and reasons) of the spells that were not OK, one per reason, the first ones."""
-    frames, count = run.frames, 0
-    begun: int | None = None
-    for k in range(len(frames.stamps) + 1):
-        state = (frames.levels[k], frames.reasons[k]) if k < len(frames.stamps) else None
-        if begun is not None and state != (frames.levels[begun], frames.reasons[begun]):
-            level = Level(frames.levels[begun])
-            if level != Level.OK:
-                count += 1
-                if count > most:
-                    yield '…', 'and more'
-                    return
-                a, b = ((frames.stamps[i] - frames.stamps[0]) * 1e-9 for i in (begun, k - 1))
-                yield f'{a:.1f} to {b:.1f} s', f'{level.name}: {"; ".join(frames.reasons[begun])}'
-            begun = None
-        if begun is None and state is not None:
-            begun = k
+    f = run.frames
+    spells = groupby(range(len(f.stamps)), lambda k: (f.levels[k], f.reasons[k]))
+    bad = ((state, list(rows)) for state, rows in spells if state[0] != Level.OK)
+    for count, ((level, reasons), rows) in enumerate(bad):
+        if count == most:
+            yield '…', 'and more'
+            return
+        a, b = ((f.stamps[k] - f.stamps[0]) * 1e-9 for k in (rows[0], rows[-1]))
+        yield f'{a:.1f} to {b:.1f} s', f'{Level(level).name}: {"; ".join(reasons)}'
