@@ -78,10 +78,7 @@ def columns_of(run: Run, errors: RunErrors | None) -> dict[str, Columns]:
         if not truth.is_map and errors is not None:
             T = se2.inverse(errors.optimized.T_truth_map)
         points = se2.transform(T, truth.trajectory.poses[:, :2])
-        out['truth'] = {
-            't': seconds(truth.trajectory.stamps, start),
-            'x': single(points[:, 0]), 'y': single(points[:, 1]),
-        }  # fmt: skip
+        out['truth'] = path(truth.trajectory.stamps, points, start)
         known = se2.transform(T, truth.reflectors)
         names = [str(i) for i in ids.tolist()] or [''] * len(known)
         out['true_reflectors'] = {'x': known[:, 0], 'y': known[:, 1], 'name': names}
@@ -142,7 +139,7 @@ def spells(of: Columns) -> Columns:
 
 
 def path(stamps: NDArray[np.int64], poses: Array, start: int) -> Columns:
-    """A trajectory."""
+    """A trajectory of poses (n, 3) or points (n, 2)."""
     return {
         't': seconds(stamps, start), 'x': single(poses[:, 0]), 'y': single(poses[:, 1]),
     }  # fmt: skip
@@ -187,12 +184,7 @@ def grid(of: OccupancyGrid, is_small: bool = True) -> Columns:
 
 def grid_pictures(cells: NDArray[np.int8], is_small: bool = True) -> list[str]:
     """Data URLs of PNG files with a palette, of at most MAX_SIDE pixels a side."""
-    step = -(-max(cells.shape) // MAX_SIDE) or 1
-    if step > 1:  # the most occupied cell of each block, so that walls stay
-        rows, columns = (-(-n // step) * step for n in cells.shape)
-        padded = np.full((rows, columns), UNKNOWN, dtype=np.int8)
-        padded[: cells.shape[0], : cells.shape[1]] = cells
-        cells = padded.reshape(rows // step, step, columns // step, step).max(axis=(1, 3))
+    cells, _ = coarser(cells, MAX_SIDE)
     # 16 steps: 0 is free, 15 occupied, 16 unknown
     index = np.where(cells < 0, 16, np.round(np.clip(cells, 0, 100) * 0.15)).astype(np.uint8)
     image = Image.fromarray(index[::-1], mode='P')
@@ -206,6 +198,18 @@ def grid_pictures(cells: NDArray[np.int8], is_small: bool = True) -> list[str]:
         image.save(file, 'png', transparency=rgba[:, 3].tobytes(), **level)
         out.append('data:image/png;base64,' + base64.b64encode(file.getvalue()).decode('ascii'))
     return out
+
+
+def coarser(cells: NDArray[np.int8], most: int) -> tuple[NDArray[np.int8], int]:
+    """At most ``most`` cells a side, and how many of those given are a side of one.
+
+    The most occupied cell of each block, so that walls stay.
+    """
+    k = -(-max(cells.shape) // most) or 1
+    rows, columns = (-(-n // k) for n in cells.shape)
+    beyond = [(0, k * m - n) for m, n in zip((rows, columns), cells.shape, strict=True)]
+    padded = np.pad(cells, beyond, constant_values=UNKNOWN)
+    return padded.reshape(rows, k, columns, k).max(axis=(1, 3)), k
 
 
 def scans(log: ScanLog, start: int) -> tuple[Columns, Columns]:
