@@ -18,23 +18,15 @@ def summary_rows(f: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows = [('scans', f'{f["scans"]}{sent} in {f["duration_s"]:.1f} s')]
     if f['real_time_factor']:
         rows.append(('speed', f'{f["real_time_factor"]:.1f} × real time ({f["wall_s"]:.1f} s)'))
-    for name, key in (
-        ('front end per scan', 'front_end_ms'),
-        ('back end per keyframe', 'back_end_ms'),
+    for name, key, decimals in (
+        ('front end per scan', 'front_end_ms', 2),
+        ('back end per keyframe', 'back_end_ms', 2),
+        ('scan to pose', 'latency_ms', 1),
     ):
-        ms = f[key]
+        ms = f.get(key, {'median': None})
         if ms['median'] is not None:
-            rows.append(
-                (name, f'median {ms["median"]:.2f} ms, p99 {ms["p99"]:.1f}, max {ms["max"]:.1f}')
-            )
-    if 'latency_ms' in f:
-        ms = f['latency_ms']
-        rows.append(
-            (
-                'scan to pose',
-                f'median {ms["median"]:.1f} ms, p99 {ms["p99"]:.1f}, max {ms["max"]:.1f}',
-            )
-        )
+            median = f'median {ms["median"]:.{decimals}f} ms'
+            rows.append((name, f'{median}, p99 {ms["p99"]:.1f}, max {ms["max"]:.1f}'))
     c = f['closures']
     rows.append(('keyframes', f'{f["keyframes"]}'))
     rows.append(('loop closures', f'{c["accepted"]} accepted, {c["rejected"]} rejected'))
@@ -63,31 +55,23 @@ def _truth_rows(f: Mapping[str, Any]) -> list[tuple[str, str]]:
     if 'ate_rmse_m' not in f:
         return []
     aligned = '' if f['alignment'] == 'none' else ', aligned'
+    live = f'{f["live_ate_rmse_m"]:.3f} m RMSE, max {f["live_ate_max_m"]:.3f}{aligned}'
     rows = [
-        (
-            'error, live',
-            f'{f["live_ate_rmse_m"]:.3f} m RMSE, max {f["live_ate_max_m"]:.3f}{aligned}',
-        )
+        ('error, live', live),
+        ('error, optimised', f'{f["ate_rmse_m"]:.3f} m RMSE{aligned}'),
     ]
-    rows.append(('error, optimised', f'{f["ate_rmse_m"]:.3f} m RMSE{aligned}'))
     if 'heading_rmse_deg' in f:
-        rows.append(
-            (
-                'heading error',
-                f'{f["live_heading_rmse_deg"]:.3f}° live, {f["heading_rmse_deg"]:.3f}° optimised',
-            )
-        )
+        live = f'{f["live_heading_rmse_deg"]:.3f}° live'
+        rows.append(('heading error', f'{live}, {f["heading_rmse_deg"]:.3f}° optimised'))
     if 'nees_mean' in f:
         rows.append(('NEES', f'{f["nees_mean"]:.2f} (3 is ideal)'))
     if f.get('reflector_rmse_m') is not None:
-        rows.append(
-            (
-                'reflector error',
-                f'{f["reflector_rmse_m"]:.3f} m RMSE; {f["reflectors_found"]} of '
-                f'{f["reflectors_true"]} found, {f["reflectors_twice"]} twice, '
-                f'{f["reflectors_spurious"]} spurious',
-            )
+        error = (
+            f'{f["reflector_rmse_m"]:.3f} m RMSE; {f["reflectors_found"]} of '
+            f'{f["reflectors_true"]} found, {f["reflectors_twice"]} twice, '
+            f'{f["reflectors_spurious"]} spurious'
         )
+        rows.append(('reflector error', error))
     return rows
 
 
