@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from rlml_slam.maps.atomic_file import write_atomically
 from rlml_slam.planning.audit.audit import Audit
 from rlml_slam.planning.audit.findings import Kind
 from rlml_slam.report import pictures as draw
-from rlml_slam.report.outputs import make_folder
+from rlml_slam.report.outputs import make_folder, write_json
 from rlml_slam.report.page import headed_table, heading, page, picture, section
 from rlml_slam.report.plan_page import cm
 from rlml_slam.types import Level
@@ -32,8 +31,7 @@ def write_audit(audit: Audit, name: str, folder: Path) -> None:
     folder = make_folder(folder)
     image = picture_of(audit)
     write_atomically(folder / 'audit.png', image)
-    text = json.dumps(audit.figures, indent=2) + '\n'
-    write_atomically(folder / 'audit.json', text.encode())
+    write_json(folder / 'audit.json', audit.figures)
     write_atomically(folder / 'audit.html', _page(name, audit, image).encode())
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from html import escape
@@ -21,7 +20,7 @@ from rlml_slam.evaluation.run_comparison import (
     live_name,
 )
 from rlml_slam.maps.atomic_file import write_atomically
-from rlml_slam.report.outputs import make_folder
+from rlml_slam.report.outputs import make_folder, write_json
 from rlml_slam.report.page import headed_table, heading, page, picture, section
 from rlml_slam.se2 import Array, compose
 
@@ -128,8 +127,7 @@ def parting_table(c: RunComparison) -> list[tuple[str, ...]]:
 def write_comparison(c: RunComparison, folder: Path) -> None:
     """Write comparison.json, two pictures and comparison.html, each whole or not at all."""
     folder = make_folder(folder)
-    text = json.dumps(figures_of(c), indent=2) + '\n'
-    write_atomically(folder / 'comparison.json', text.encode())
+    write_json(folder / 'comparison.json', figures_of(c))
     beyond = [r.title for r in c.rows if r.is_beyond]
     verdict = f'different: {"; ".join(beyond)}' if beyond else 'no difference beyond the limits'
     title = f'{c.a.name} against {c.b.name}'

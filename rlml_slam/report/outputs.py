@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +64,7 @@ def write_outputs(
         write_atomically(folder / 'reflector_states.csv', table.encode())
     errors = run_errors(run)
     figures = metrics(run, errors)
-    write_atomically(folder / 'metrics.json', (json.dumps(figures, indent=2) + '\n').encode())
+    write_json(folder / 'metrics.json', figures)
     if report:
         write_report(run, errors, figures, folder)
     return figures
@@ -79,6 +80,11 @@ def make_folder(folder: str | Path) -> Path:
     if not os.access(folder, os.W_OK):
         raise MapError(f'{folder}: cannot be written')
     return folder
+
+
+def write_json(path: Path, figures: Mapping[str, Any]) -> None:
+    """Figures as a file that people can read, too."""
+    write_atomically(path, (json.dumps(figures, indent=2) + '\n').encode())
 
 
 def write_report(

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from html import escape
@@ -23,7 +22,7 @@ from rlml_slam.maps.survey import Survey
 from rlml_slam.planning import site_file
 from rlml_slam.planning.plan import Plan, figures, scan_sigma
 from rlml_slam.planning.suggest import Suggestion
-from rlml_slam.report.outputs import make_folder
+from rlml_slam.report.outputs import make_folder, write_json
 from rlml_slam.report.page import headed_table, heading, page, picture, section
 from rlml_slam.report.pictures import LIVE, REFLECTOR, draw_grid, dress, png
 from rlml_slam.report.viewer.columns import coarser
@@ -75,7 +74,7 @@ def write_plan(
     for key, image in pictures.items():
         write_atomically(folder / f'{key}.png', image)
     site_file.save(plan.site, folder)
-    write_atomically(folder / 'plan.json', (json.dumps(found, indent=2) + '\n').encode())
+    write_json(folder / 'plan.json', found)
     write_atomically(folder / 'plan.html', _page(name, found, pictures).encode())
     return found
 
