@@ -54,6 +54,11 @@ class Plot:
     unit: str
     series: tuple[Series, ...]
 
+    @property
+    def main(self) -> Series:
+        """The line that the plot is about: the last one of the frames."""
+        return next(s for s in reversed(self.series) if s.source == 'frames')
+
 
 PLOTS = (
     Plot(
@@ -197,19 +202,16 @@ def plot(of: Plot, by: Mapping[str, ColumnDataSource], x_range: Any) -> Any:
     _dress(f)
     if not len(by['frames'].data['t']):  # a range of nothing is an error in the console
         f.scatter(x=[0.0], y=[0.0], alpha=0.0, name='zero')
-    last = None
+    lines = {}
     for s in of.series:
         draw = f.step if s.is_step else f.line
         more = {'mode': 'center'} if s.is_step else {}
-        last = draw('t', s.column, source=by[s.source], color=s.colour, line_width=1.5,
-                    line_dash=s.dash, name=f'{of.key} {s.name}', **more)  # fmt: skip
-    unit = f' {of.unit}'.rstrip()
-    mine = [s for s in of.series if s.source == 'frames']
-    digits = '{0}' if not of.unit else '{0.000}'
-    tips = [(s.name, f'@{s.column}{digits}{unit}') for s in mine]
-    shown = [r for r in f.renderers if r.name == f'{of.key} {mine[-1].name}'] or [last]
+        lines[s] = draw('t', s.column, source=by[s.source], color=s.colour, line_width=1.5,
+                        line_dash=s.dash, name=f'{of.key} {s.name}', **more)  # fmt: skip
+    value = f'{{0.000}} {of.unit}' if of.unit else '{0}'
+    tips = [(s.name, f'@{s.column}{value}') for s in of.series if s.source == 'frames']
     f.add_tools(
-        HoverTool(renderers=shown, mode='vline', visible=False,
+        HoverTool(renderers=[lines[of.main]], mode='vline', visible=False,
                   tooltips=[('time', '@t{0.00} s'), *tips])
     )  # fmt: skip
     _cursor(f)

@@ -62,16 +62,14 @@ def parts(of: Mapping[str, Columns] | None = None) -> list[str]:
 
 def _has_numbers(columns: Mapping[str, Columns], plot: figures.Plot) -> bool:
     """Whether the plot's own column has any number."""
-    values = np.asarray(columns['frames'][plot.series[-1].column if plot.series[-1].source
-                        == 'frames' else plot.series[1].column], dtype=np.float64)  # fmt: skip
+    values = np.asarray(columns['frames'][plot.main.column], dtype=np.float64)
     return bool(np.isfinite(values).any())
 
 
 def _plot(of: figures.Plot, div: str) -> str:
     legend = ''.join(_key(s.name, s.colour, s.dash != 'solid') for s in of.series)
-    main = next(s for s in reversed(of.series) if s.source == 'frames')
     return (
-        f'<div data-needs="frames.{main.column}"><h2>{escape(of.title)}</h2>'
+        f'<div data-needs="frames.{of.main.column}"><h2>{escape(of.title)}</h2>'
         f'<p class="what">{escape(of.what)}</p><div class="legend">{legend}</div>{div}</div>'
     )
 
@@ -83,7 +81,7 @@ def _key(name: str, colour: str, is_dashed: bool = False) -> str:
 
 def _layers() -> str:
     rows = [
-        f'<label data-needs="{NEEDS.get(name, name)}.{_first(NEEDS.get(name, name))}">'
+        f'<label data-needs="{(source := NEEDS.get(name, name))}.{SOURCES[source][0]}">'
         f'<input type="checkbox" data-layer="{name}"{" checked" if is_shown else ""}>'
         f'<i style="--c:{colour}"></i>{escape(title)}</label>'
         for name, title, colour, is_shown in LAYERS
@@ -93,10 +91,6 @@ def _layers() -> str:
         '<output id="times">1</output>×<input id="size" type="range" min="0" max="5" value="0" '
         'aria-label="how much the ellipses are enlarged"></label>'
     )
-
-
-def _first(source: str) -> str:
-    return SOURCES[source][0]
 
 
 def _time_bar() -> str:
