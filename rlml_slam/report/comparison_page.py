@@ -22,7 +22,7 @@ from rlml_slam.evaluation.run_comparison import (
 from rlml_slam.maps.atomic_file import write_atomically
 from rlml_slam.report.outputs import make_folder, write_json
 from rlml_slam.report.page import headed_table, heading, page, picture, section
-from rlml_slam.se2 import Array, compose
+from rlml_slam.se2 import compose
 
 HEADER = ('figure', 'A', 'B', 'change', 'verdict')
 PARTED = ('apart by', 'first at', 'x, y [m]', 'health of A', 'health of B')
@@ -112,16 +112,12 @@ def _cell(f: Figure, value: float | None, sign: str = '') -> str:
 
 def parting_table(c: RunComparison) -> list[tuple[str, ...]]:
     """Cells of the table of where the paths part, with a header."""
-    return [
-        PARTED,
-        *(
-            (
-                'any digit' if p.distance < 1e-6 else f'{100 * p.distance:g} cm',
-                f'{p.time:.1f} s', f'{p.place[0]:.2f}, {p.place[1]:.2f}', *p.health,
-            )
-            for p in c.parting
-        ),
-    ]  # fmt: skip
+    rows: list[tuple[str, ...]] = [PARTED]
+    for p in c.parting:
+        apart = 'any digit' if p.distance < 1e-6 else f'{100 * p.distance:g} cm'
+        x, y = p.place
+        rows.append((apart, f'{p.time:.1f} s', f'{x:.2f}, {y:.2f}', *p.health))
+    return rows
 
 
 def write_comparison(c: RunComparison, folder: Path) -> None:
@@ -148,10 +144,12 @@ def _paths(c: RunComparison) -> bytes:
 
     from rlml_slam.report import pictures as draw
 
-    errors, (a, b) = c.paths[live_name(c)], _live(c)
+    name = live_name(c)
+    a, b = ((r.paths.get(name) or next(iter(r.paths.values()))).poses for r in (c.a, c.b))
     figure = Figure(figsize=(9.0, 6.5), layout='constrained')
     axes = figure.add_subplot()
     draw.dress(axes, 'x [m]', 'y [m]')
+    errors = c.paths[name]
     moved = compose(errors.T_truth_map, b[errors.indices])
     axes.plot(a[:, 0], a[:, 1], color=draw.TRUTH, linewidth=2.4, alpha=0.4, label='A')
     axes.plot(moved[:, 0], moved[:, 1], color=draw.LIVE, linewidth=1.0, label='B')
@@ -195,11 +193,3 @@ def _distance(c: RunComparison) -> bytes:
     panels[-1].margins(x=0.005)
     figure.align_ylabels()
     return draw.png(figure)
-
-
-def _live(c: RunComparison) -> tuple[Array, Array]:
-    """Poses of the two paths whose parting is given."""
-    name = live_name(c)
-    first = (r.paths.get(name) or next(iter(r.paths.values())) for r in (c.a, c.b))
-    a, b = first
-    return a.poses, b.poses
