@@ -63,8 +63,7 @@ def interpolate(
     It is known between two truth poses at most ``max_gap`` apart and at a truth pose itself.
     """
     t = truth.stamps
-    after = np.clip(np.searchsorted(t, stamps), 1, max(len(t) - 1, 1))
-    after = np.minimum(after, len(t) - 1)
+    after = np.clip(np.searchsorted(t, stamps), min(1, len(t) - 1), len(t) - 1)
     before = np.maximum(after - 1, 0)
     span = np.maximum(t[after] - t[before], 1)
     fraction = (stamps - t[before]) / span

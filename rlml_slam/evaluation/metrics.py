@@ -156,10 +156,8 @@ def distribution(values: Any) -> dict[str, float | None]:
     v = np.asarray(values, dtype=np.float64)
     if not len(v):
         return {'median': None, 'p99': None, 'max': None}
-    figures = (np.median(v), np.percentile(v, 99), v.max())
-    return {
-        name: round(float(f), 3) for name, f in zip(('median', 'p99', 'max'), figures, strict=True)
-    }
+    figures = {'median': np.median(v), 'p99': np.percentile(v, 99), 'max': v.max()}
+    return {name: round(float(f), 3) for name, f in figures.items()}
 
 
 def peak_rss_mb() -> float:

@@ -75,8 +75,8 @@ def read_relations(path: str | Path) -> Relations:
 
 def nearest(stamps: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.int64]:
     """Index of the stamp nearest to each wanted one; ``stamps`` rise and are not empty."""
-    right = np.clip(np.searchsorted(stamps, wanted), 1, len(stamps) - 1) if len(stamps) > 1 else 0
-    left = np.maximum(np.asarray(right) - 1, 0)
+    right = np.minimum(np.searchsorted(stamps, wanted), len(stamps) - 1)
+    left = np.maximum(right - 1, 0)
     is_left = np.abs(wanted - stamps[left]) <= np.abs(stamps[right] - wanted)
     return np.where(is_left, left, right).astype(np.int64)
 
