@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -49,19 +49,25 @@ class Site:
         """The same site with the reflectors of a survey, which is in the frame of the map."""
         n = len(survey.points)
         ids = np.where(survey.ids == ANONYMOUS, np.arange(n), survey.ids)
-        widths = np.where(np.isfinite(survey.diameters), survey.diameters, DIAMETER)
-        found = ReflectorSet(survey.points, widths, np.full(n, np.nan), ids)
+        found = cylinders(survey.points, ids, survey.diameters)
         return replace(self, reflectors=found, cov=np.zeros((n, 2, 2)), oriented=False)
 
     def with_posts(self, points: Array) -> Site:
         """The same site with cylinders (k, 2) added; they do not hide places."""
         r, k = self.reflectors, len(points)
-        first = int(r.ids.max(initial=0)) + 1
-        added = ReflectorSet(
-            np.concatenate([r.points, points]), np.append(r.widths, np.full(k, DIAMETER)),
-            np.append(r.normals, np.full(k, np.nan)), np.append(r.ids, first + np.arange(k)),
-        )  # fmt: skip
-        return replace(self, reflectors=added, cov=np.concatenate([self.cov, np.zeros((k, 2, 2))]))
+        posts = cylinders(points, int(r.ids.max(initial=0)) + 1 + np.arange(k))
+        pairs = zip(vars(r).values(), vars(posts).values(), strict=True)
+        both = ReflectorSet(*(np.concatenate(pair) for pair in pairs))
+        return replace(self, reflectors=both, cov=np.concatenate([self.cov, np.zeros((k, 2, 2))]))
+
+
+def cylinders(
+    points: Array, ids: NDArray[np.int64], diameters: ArrayLike = DIAMETER
+) -> ReflectorSet:
+    """Reflectors at ``points`` (k, 2) that are seen from all sides; NaN: diameter not known."""
+    unknown = np.full(len(points), np.nan)
+    widths = np.where(np.isfinite(diameters), diameters, np.full(len(points), DIAMETER))
+    return ReflectorSet(points, widths, unknown, ids)
 
 
 def of_world(world: World) -> Site:
@@ -91,8 +97,7 @@ def _mark(cells: NDArray[np.bool_], points: Array, low: Array) -> None:
 
 def of_grid(grid: OccupancyGrid, found: Reflectors) -> Site:
     """The site of a saved map; cells near a reflector do not hide it."""
-    widths = np.where(np.isfinite(found.diameters), found.diameters, DIAMETER)
-    reflectors = ReflectorSet(found.points, widths, np.full(len(found), np.nan), found.keys)
+    reflectors = cylinders(found.points, found.keys, found.diameters)
     site = Site(Geometry(np.zeros((0, 6)), np.zeros((0, 5)), np.zeros((0, 4))), reflectors,
                 found.cov, grid, oriented=False)  # fmt: skip
     return with_walls_of_grid(site)

@@ -16,10 +16,9 @@ from rlml_slam.planning.driving import predicted
 from rlml_slam.planning.exact_cover import fewest
 from rlml_slam.planning.mounts import thin
 from rlml_slam.planning.plan import Goal, Plan, headings, make_plan, scans_at, spread, within
-from rlml_slam.planning.site import DIAMETER, Site
+from rlml_slam.planning.site import Site, cylinders
 from rlml_slam.planning.visibility import in_sight
 from rlml_slam.se2 import Array
-from rlml_slam.simulation.world import ReflectorSet
 
 MOST_ROWS = 1500  # places at which mounts are compared
 MOST_VALUES = 1_000_000  # places times reflectors
@@ -109,12 +108,6 @@ def _lacking(plan: Plan, wanted: Wanted) -> Array:
     return np.concatenate([short, plan.places[plan.sampled][~plan.is_unique]])
 
 
-def cylinders(points: Array) -> ReflectorSet:
-    """Reflectors (k, 2) as they are suggested."""
-    k = len(points)
-    return ReflectorSet(points, np.full(k, DIAMETER), np.full(k, np.nan), np.arange(k))
-
-
 def coverage(
     site: Site, mounts: Array, places: Array, p: Parameters, sensor: SimulatorParameters,
     wanted: Wanted, also: Array, posts: Array = NOWHERE,
@@ -130,11 +123,11 @@ def coverage(
     most = max(min(MOST_ROWS, MOST_VALUES // max(count, 1)) // len(angles), 1)
     places = np.concatenate([also, places[spread(len(places), most)]])
     geometry = site.walls.joined(present.geometry())
-    hiding = geometry.joined(cylinders(posts).geometry())
+    hiding = geometry.joined(cylinders(posts, np.arange(len(posts))).geometry())
     known, seen = (
         np.concatenate([in_sight(at, r, around, p, sensor) for at, around in
                         ((places[: len(also)], hiding), (places[len(also) :], geometry))])
-        for r in (present, cylinders(mounts))
+        for r in (present, cylinders(mounts, np.arange(len(mounts))))
     )  # fmt: skip
     useful = seen.any(axis=0)
     seen, mounts = np.concatenate([known, seen[:, useful]], axis=1), mounts[useful]
