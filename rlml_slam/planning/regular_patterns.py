@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -17,17 +19,16 @@ MOST = 3  # rows that are named
 
 def rows_of(points: Array) -> list[str]:
     """The rows, longest first, in words; points (m, 2) that one step moves onto others."""
-    steps, chains = _chains(points)
     lines: list[str] = []
     covered = np.zeros(len(points), dtype=np.bool_)
     named: list[Array] = []
-    for step, chain in sorted(zip(steps, chains, strict=True), key=lambda s: (-len(s[1]), s[0])):
+    for step, chain in sorted(_chains(points), key=lambda c: (-len(c[1]), *c[0])):
         if covered[chain].all() and (len(named) > 1 or (named and _is_multiple(step, named[0]))):
             continue
         if len(lines) == MOST:
             break
         covered[chain] = True
-        named.append(np.array(step))
+        named.append(step)
         is_lattice = len(named) > 1 and abs(_sine(named[0], named[-1])) > 0.5
         kind = 'the lattice also repeats' if is_lattice else 'repeats'
         lines.append(f'{kind} after ({step[0]:.1f}, {step[1]:.1f}) m: '
@@ -35,12 +36,10 @@ def rows_of(points: Array) -> list[str]:
     return lines
 
 
-def _chains(points: Array) -> tuple[list[tuple[float, float]], list[NDArray[np.int64]]]:
-    """Steps that join at least FEWEST reflectors to rows of at least FEWEST, and which."""
-    steps: list[tuple[float, float]] = []
-    chains: list[NDArray[np.int64]] = []
+def _chains(points: Array) -> Iterator[tuple[Array, NDArray[np.int64]]]:
+    """Steps (2,) that join at least FEWEST reflectors to rows of at least FEWEST, and which."""
     if len(points) < FEWEST:
-        return steps, chains
+        return
     tree = cKDTree(points)
     a, b = np.nonzero(np.hypot(*(points[None] - points[:, None]).transpose(2, 0, 1)) <= LONGEST)
     d = points[b] - points[a]
@@ -54,9 +53,7 @@ def _chains(points: Array) -> tuple[list[tuple[float, float]], list[NDArray[np.i
         following = np.where(np.isfinite(gap), following, -1)
         row = _in_rows(following)
         if len(row) >= FEWEST:
-            steps.append((float(step[0]), float(step[1])))
-            chains.append(row)
-    return steps, chains
+            yield step, row
 
 
 def _in_rows(following: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -72,9 +69,9 @@ def _in_rows(following: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.unique(np.array(found, dtype=np.int64))
 
 
-def _is_multiple(step: tuple[float, float], of: Array) -> bool:
+def _is_multiple(step: Array, of: Array) -> bool:
     times = np.hypot(*step) / np.hypot(*of)
-    return abs(_sine(np.array(step), of)) < 0.05 and abs(times - round(times)) < 0.05
+    return abs(_sine(step, of)) < 0.05 and abs(times - round(times)) < 0.05
 
 
 def _sine(a: Array, b: Array) -> float:
