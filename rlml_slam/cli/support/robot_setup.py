@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import difflib
 from collections import Counter, defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -145,28 +146,25 @@ class RobotSetup:
             if is_ != was
         ]
         out += [Finding(f'{s}: {error}') for s, error in inputs.first_errors.items()]
-        out += self._missing() + self._of_frames() + self._of_clocks()
-        out += self._of_transforms() + self._of_odometry(feed) + self._of_mounting(feed)
-        return out
+        return [
+            *out, *self._missing(), *self._of_frames(), *self._of_clocks(),
+            *self._of_transforms(), *self._of_odometry(feed), *self._of_mounting(feed),
+        ]  # fmt: skip
 
-    def _missing(self) -> list[Finding]:
-        out, n = [], self.params.node
+    def _missing(self) -> Iterator[Finding]:
+        n = self.params.node
         if not self.heard['scan'].arrivals:
-            out.append(Finding(f'no scan on {n.scan_topic}', '-p scan_topic:=<topic>'))
+            yield Finding(f'no scan on {n.scan_topic}', '-p scan_topic:=<topic>')
         if not self._parents:
-            out.append(
-                Finding('no transform on /tf or /tf_static: nobody says where the laser sits',
-                        self._static('laser'))
-            )  # fmt: skip
-        if self.topic.newest is None and self.transforms.newest is None:
-            out.append(
-                Finding(
-                    f'no odometry: neither {n.odom_frame} to {n.base_frame} on /tf nor '
-                    f'{n.odom_topic}',
-                    '-p use_odom:=false -p provide_odom_frame:=true, if the robot has none',
-                )
+            yield Finding(
+                'no transform on /tf or /tf_static: nobody says where the laser sits',
+                self._static('laser'),
             )
-        return out
+        if self.topic.newest is None and self.transforms.newest is None:
+            yield Finding(
+                f'no odometry: neither {n.odom_frame} to {n.base_frame} on /tf nor {n.odom_topic}',
+                '-p use_odom:=false -p provide_odom_frame:=true, if the robot has none',
+            )
 
     def _static(self, sensor: str) -> str:
         base = self.params.node.base_frame
@@ -175,8 +173,8 @@ class RobotSetup:
             f'--child-frame-id {sensor}'
         )
 
-    def _of_frames(self) -> list[Finding]:
-        out, base = [], self.params.node.base_frame
+    def _of_frames(self) -> Iterator[Finding]:
+        base = self.params.node.base_frame
         for sensor in self.heard['scan'].frames:
             if not self._parents or sensor == base or self.tree.path(base, sensor) is not None:
                 continue
@@ -184,77 +182,63 @@ class RobotSetup:
             near = difflib.get_close_matches(sensor, known, n=1)
             hint = f'; there is {near[0]}, is that the same?' if near else ''
             text = f'scans are in the frame {sensor!r}, and no transform leads from {base} to it'
-            out.append(Finding(text + hint, self._static(sensor)))
-        return out
+            yield Finding(text + hint, self._static(sensor))
 
-    def _of_clocks(self) -> list[Finding]:
-        out = []
+    def _of_clocks(self) -> Iterator[Finding]:
         for stream, heard in sorted(self.heard.items()):
             if stream == 'tf_static' or not heard.ages or abs(heard.age) <= OFF:
                 continue
             how = 'behind' if heard.age > 0.0 else 'ahead'
-            out.append(
-                Finding(
-                    f'{stream}: stamps are {abs(heard.age):.1f} s {how} the clock of this '
-                    'machine: the clocks differ, or the driver is slow',
-                    'chronyc tracking, on both machines; or -p use_sim_time:=true with a bag',
-                )
+            yield Finding(
+                f'{stream}: stamps are {abs(heard.age):.1f} s {how} the clock of this machine: '
+                'the clocks differ, or the driver is slow',
+                'chronyc tracking, on both machines; or -p use_sim_time:=true with a bag',
             )
-        return out
 
-    def _of_transforms(self) -> list[Finding]:
-        out, n = [], self.params.node
+    def _of_transforms(self) -> Iterator[Finding]:
+        n = self.params.node
         if len(self._poses) > 20:
             poses = np.array(self._poses)
             one, two = (np.mean(np.abs(poses[k:] - poses[:-k]).sum(axis=1)) for k in (1, 2))
             if one > LEAP and two < 0.7 * one:  # of one publisher it is twice as far
-                out.append(
-                    Finding(
-                        f'{n.odom_frame} to {n.base_frame} on /tf jumps to and fro by {one:.2f}: '
-                        'two nodes publish it',
-                        'ros2 topic info /tf --verbose; stop one, such as publish_tf: false of '
-                        'robot_localization or enable_odom_tf: false of the driver',
-                    )
+                yield Finding(
+                    f'{n.odom_frame} to {n.base_frame} on /tf jumps to and fro by {one:.2f}: '
+                    'two nodes publish it',
+                    'ros2 topic info /tf --verbose; stop one, such as publish_tf: false of '
+                    'robot_localization or enable_odom_tf: false of the driver',
                 )
         if n.map_frame in self._parents[n.odom_frame]:
-            out.append(
-                Finding(
-                    f'{n.map_frame} to {n.odom_frame} is on /tf: a localization runs',
-                    'start no other one, or with -p shadow:=true', False,
-                )
+            yield Finding(
+                f'{n.map_frame} to {n.odom_frame} is on /tf: a localization runs',
+                'start no other one, or with -p shadow:=true', False,
             )  # fmt: skip
         for child, several in self._parents.items():
             if len(several) > 1:
-                out.append(Finding(f'{child} has several parents: {", ".join(sorted(several))}'))
-        return out
+                yield Finding(f'{child} has several parents: {", ".join(sorted(several))}')
 
-    def _of_odometry(self, feed: SensorInput[None]) -> list[Finding]:
-        out = [Finding(text) for text in feed.odometry_problems()]
+    def _of_odometry(self, feed: SensorInput[None]) -> Iterator[Finding]:
+        yield from map(Finding, feed.odometry_problems())
         if self.topic.newest is None or self.transforms.newest is None:
-            return out
+            return
         start = max(h.first for h in (self.topic, self.transforms))
         end = min(self.topic.newest, self.transforms.newest)
         ends = [(h.at(start), h.at(end)) for h in (self.topic, self.transforms)]
         steps = [se2.between(a, b) for a, b in ends if a is not None and b is not None]
         if len(steps) < 2:
-            return out
+            return
         way, turn = np.hypot(*(steps[0] - steps[1])[:2]), abs(se2.wrap(steps[0] - steps[1])[2])
         if way > LEAST_WAY + MOST_WAY * np.hypot(
             *steps[1][:2]
         ) or turn > LEAST_TURN + MOST_TURN * abs(steps[1][2]):
-            out.append(
-                Finding(
-                    f'the topic {self.params.node.odom_topic} and /tf differ by {way:.2f} m and '
-                    f'{np.degrees(turn):.1f} degrees in {1e-9 * (end - start):.0f} s; /tf is used',
-                    '-p odom_source:=tf, or topic', False,
-                )
+            yield Finding(
+                f'the topic {self.params.node.odom_topic} and /tf differ by {way:.2f} m and '
+                f'{np.degrees(turn):.1f} degrees in {1e-9 * (end - start):.0f} s; /tf is used',
+                '-p odom_source:=tf, or topic', False,
             )  # fmt: skip
-        return out
 
-    def _of_mounting(self, feed: SensorInput[None]) -> list[Finding]:
+    def _of_mounting(self, feed: SensorInput[None]) -> Iterator[Finding]:
         """Of each laser, whether what it sees stays where it is while the robot turns."""
         history = self.topic if self.transforms.newest is None else self.transforms
-        out = []
         for sensor in sorted({s.frame_id for s in self.scans}):
             place = self.places.get(sensor, np.array(self.params.node.laser_pose))
             mine = [s for s in self.scans if s.frame_id == sensor]
@@ -265,16 +249,15 @@ class RobotSetup:
                     seen.append((replace(scan, time_increment=0.0), pose))
             pairs = pairs_of(seen)
             if not pairs:
-                out.append(
-                    Finding(f'{sensor}: the robot did not turn, so its mounting is not checked',
-                            'turn it by some 90 degrees while this runs', False)
+                yield Finding(
+                    f'{sensor}: the robot did not turn, so its mounting is not checked',
+                    'turn it by some 90 degrees while this runs', False,
                 )  # fmt: skip
                 continue
             wrong = wrong_mounting(distances(pairs, place))
             if wrong:
-                rolled = '--roll 0' if feed.hangs(sensor) else '--roll 3.14159'
                 line = self._static(sensor)
-                mirrored = 'mirrored' in wrong
-                line = line.replace(LASER, f'{LASER} {rolled}') if mirrored else line
-                out.append(Finding(f'{sensor}: the laser {wrong}', line))
-        return out
+                if 'mirrored' in wrong:
+                    rolled = '--roll 0' if feed.hangs(sensor) else '--roll 3.14159'
+                    line = line.replace(LASER, f'{LASER} {rolled}')
+                yield Finding(f'{sensor}: the laser {wrong}', line)
