@@ -17,17 +17,6 @@ import numpy as np
 
 Make: TypeAlias = Callable[..., Any]
 
-_TYPECODE = {
-    'i1': 'b',
-    'u1': 'B',
-    'i2': 'h',
-    'u2': 'H',
-    'i4': 'i',
-    'u4': 'I',
-    'f4': 'f',
-    'f8': 'd',
-}
-
 
 @cache
 def rclpy_class(msgtype: str) -> Any:
@@ -51,9 +40,7 @@ def make_rclpy(msgtype: str, **fields: Any) -> Any:
     for name in _sequences(msgtype) & fields.keys():
         value = fields[name]
         if isinstance(value, np.ndarray):
-            filled = array.array(_TYPECODE[value.dtype.str[1:]])
-            filled.frombytes(value.tobytes())
-            fields[name] = filled
+            fields[name] = array.array(value.dtype.char, value.tobytes())
     return rclpy_class(msgtype)(**fields)
 
 
