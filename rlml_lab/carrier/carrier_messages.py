@@ -15,7 +15,7 @@ from rlml_slam.errors import InputError
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import Make, make_rclpy, rclpy_class
 from rlml_slam.ros.codecs.point_cloud import read_cloud
-from rlml_slam.ros.systems.deformable_messages import FEATURE, build_twist
+from rlml_slam.ros.systems.deformable_messages import FEATURE
 from rlml_slam.se2 import compose
 from rlml_slam.simulation.simulation import START
 from rlml_slam.types import Detections
@@ -94,7 +94,7 @@ def build_velocity(make: Make, time: int, axes: str, velocity: CarrierVelocity) 
     return make(
         'geometry_msgs/msg/TwistStamped',
         header=encode.header(make, time, axes),
-        twist=build_twist(make, np.append(velocity.linear, velocity.angular)),
+        twist=encode.velocity(make, np.append(velocity.linear, velocity.angular)),
     )
 
 

@@ -55,6 +55,15 @@ def pose(make: Make, T: Array) -> Any:
     )
 
 
+def velocity(make: Make, twist: Array) -> Any:
+    """Twist of (vx, vy, yaw rate)."""
+    return make(
+        'geometry_msgs/msg/Twist',
+        linear=vector(make, twist[0], twist[1], 0.0),
+        angular=vector(make, 0.0, 0.0, twist[2]),
+    )
+
+
 def covariance(cov: Array) -> Array:
     """ROS's (36,) of a planar (3, 3)."""
     full = np.zeros((6, 6))
@@ -87,7 +96,6 @@ def odometry(
     twist_cov: Array | None = None,
 ) -> Any:
     """Odometry of frames (parent, child); ``twist`` (3,) = (vx, vy, yaw rate) in the child."""
-    v = np.zeros(3) if twist is None else twist
     return make(
         'nav_msgs/msg/Odometry',
         header=header(make, stamp, frames[0]),
@@ -95,11 +103,7 @@ def odometry(
         pose=_pose_cov(make, T, cov),
         twist=make(
             'geometry_msgs/msg/TwistWithCovariance',
-            twist=make(
-                'geometry_msgs/msg/Twist',
-                linear=vector(make, v[0], v[1], 0.0),
-                angular=vector(make, 0.0, 0.0, v[2]),
-            ),
+            twist=velocity(make, np.zeros(3) if twist is None else twist),
             covariance=covariance(np.zeros((3, 3)) if twist_cov is None else twist_cov),
         ),
     )

@@ -16,7 +16,6 @@ from rlml_slam.ros.codecs.decode import FASTEST, frame, stamp
 from rlml_slam.ros.codecs.markers import reflector_markers
 from rlml_slam.ros.codecs.message_types import Make, make_rclpy, rclpy_class
 from rlml_slam.ros.codecs.point_cloud import bounded, build_cloud
-from rlml_slam.se2 import Array
 from rlml_slam.types import Reflectors
 
 # z = 0 for RViz; key is never reused, id is the feature's own or -1
@@ -51,15 +50,6 @@ def read_velocity(
     angular = float(msg.twist.angular.z)
     bounded([*linear, angular], f'{topic}: twist', FASTEST)
     return stamp(msg, topic), CarrierVelocity(linear, angular), axes == params.base_frame
-
-
-def build_twist(make: Make, twist: Array) -> Any:
-    """Twist of (v_x, v_y, omega)."""
-    return make(
-        'geometry_msgs/msg/Twist',
-        linear=encode.vector(make, twist[0], twist[1], 0.0),
-        angular=encode.vector(make, 0.0, 0.0, twist[2]),
-    )
 
 
 def build_features(make: Make, time: int, map_frame: str, features: Features) -> Any:
@@ -99,7 +89,7 @@ class EstimatePublisher:
         if SUGGESTED in say:
             twist = suggest_twist(estimate, velocity, self._p)
             if twist is not None:
-                say[SUGGESTED].publish(build_twist(make, twist))
+                say[SUGGESTED].publish(encode.velocity(make, twist))
 
 
 def _as_reflectors(features: Features) -> Reflectors:
