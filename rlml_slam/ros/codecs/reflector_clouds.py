@@ -71,8 +71,7 @@ def _placed(
 
 def read_associated(msg: Any, topic: str = 'reflectors/associated') -> Associated:
     """The inverse of build_associated; InputError if it is another kind of cloud."""
-    cloud = _read(msg, ASSOCIATED, topic)
-    points, cov = _places(cloud)
+    cloud, points, cov = _read(msg, ASSOCIATED, topic)
     return Associated(
         Detections(
             stamp(msg, topic),
@@ -89,8 +88,7 @@ def read_associated(msg: Any, topic: str = 'reflectors/associated') -> Associate
 
 def read_reflector_map(msg: Any, topic: str = 'reflector_map_points') -> Reflectors:
     """The inverse of build_reflector_map; InputError if it is another kind of cloud."""
-    cloud = _read(msg, MAPPED, topic)
-    points, cov = _places(cloud)
+    cloud, points, cov = _read(msg, MAPPED, topic)
     return Reflectors(
         cloud['landmark'].astype(np.int64),
         points,
@@ -101,17 +99,12 @@ def read_reflector_map(msg: Any, topic: str = 'reflector_map_points') -> Reflect
     )
 
 
-def _read(msg: Any, dtype: np.dtype[np.void], topic: str) -> NDArray[np.void]:
+def _read(msg: Any, dtype: np.dtype[np.void], topic: str) -> tuple[NDArray[np.void], Array, Array]:
+    """The cloud (n,), its points (n, 2) and their covariances (n, 2, 2), checked."""
     cloud = read_table(msg, dtype, topic)
-    points, cov = _places(cloud)
-    bounded(points, f'{topic}: a position')
-    covariances(cov, f'{topic}: a covariance')
-    return cloud
-
-
-def _places(cloud: NDArray[np.void]) -> tuple[Array, Array]:
-    """Points (n, 2) and covariances (n, 2, 2)."""
-    cov = np.empty((len(cloud), 2, 2))
+    points, cov = cloud['exact'].astype(np.float64), np.empty((len(cloud), 2, 2))
     for name, (i, j) in _COV.items():
         cov[:, i, j] = cloud[name]
-    return cloud['exact'].astype(np.float64), cov
+    bounded(points, f'{topic}: a position')
+    covariances(cov, f'{topic}: a covariance')
+    return cloud, points, cov
