@@ -93,6 +93,16 @@ def listen_to_bytes(
     node.create_subscription(kind, topic, take, qos, raw=True)
 
 
+def waiting(subscription: Any, kind: Any, most: int) -> list[bytes]:
+    """The serialized messages that lie in the queue of a subscription, ``most`` at most."""
+    out: list[bytes] = []
+    handle = subscription.handle
+    with handle:
+        while len(out) < most and (taken := handle.take_message(kind, True)) is not None:
+            out.append(taken[0])
+    return out
+
+
 class Listener:
     """A subscription; ``use`` gets each message of at most ``largest`` bytes that can be read.
 
@@ -127,15 +137,10 @@ class Listener:
     def drained(self) -> list[Any]:
         """All messages that lie in the queue, in order of arrival."""
         out: list[Any] = []
-        handle = self._subscription.handle
-        with handle:
-            for _ in range(self._depth):
-                taken = handle.take_message(self._kind, True)
-                if taken is None:
-                    break
-                msg = self._guard.pass_on(self._topic, partial(self._decoded, taken[0]))
-                if msg is not None:
-                    out.append(msg)
+        for data in waiting(self._subscription, self._kind, self._depth):
+            msg = self._guard.pass_on(self._topic, partial(self._decoded, data))
+            if msg is not None:
+                out.append(msg)
         return out
 
     def _decoded(self, data: bytes) -> Any:

@@ -28,7 +28,7 @@ from rlml_slam.report.viewer.columns import Columns, as_lists
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.codecs.frame_messages import read_points, read_record
 from rlml_slam.ros.codecs.reflector_clouds import read_associated, read_reflector_map
-from rlml_slam.ros.message_guard import LARGE, MessageGuard, guard_of
+from rlml_slam.ros.message_guard import LARGE, MessageGuard, guard_of, waiting
 from rlml_slam.ros.systems.simulator_messages import TRUE_REFLECTORS
 from rlml_slam.se2 import wrap
 from rlml_slam.types import Frame, Health, Level, Status
@@ -141,16 +141,8 @@ class ViewListener:
 
     def _taken(self, topic: str, kind: Any, depth: int) -> list[bytes]:
         """Serialized messages that wait, of a size that can be meant."""
-        out: list[bytes] = []
-        handle = self._subscriptions[topic].handle
-        with handle:
-            for _ in range(depth):
-                taken = handle.take_message(kind, True)
-                if taken is None:
-                    break
-                if len(taken[0]) <= LARGE:
-                    out.append(taken[0])
-        return out
+        messages = waiting(self._subscriptions[topic], kind, depth)
+        return [data for data in messages if len(data) <= LARGE]
 
     def _look_into_next(self, began: float) -> Mapping[str, Columns]:
         """What is new of the slow topic that has waited longest, if it is time for one.
