@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 
 from rlml_slam.deformable.slam import DeformableSlam
 from rlml_slam.params import DeformableParameters, Parameters
@@ -19,9 +19,8 @@ from rlml_slam.ros.managed_node import ManagedNode
 from rlml_slam.ros.message_guard import Listener
 from rlml_slam.ros.run import run
 from rlml_slam.ros.sensor_input import STREAMS
-from rlml_slam.ros.sensors import RELIABLE, Sensors
-from rlml_slam.ros.systems.carrier_velocity import VelocityInput
-from rlml_slam.ros.systems.deformable_messages import EstimatePublisher
+from rlml_slam.ros.sensors import RELIABLE, SENSOR, Sensors
+from rlml_slam.ros.systems.deformable_messages import EstimatePublisher, read_velocity
 from rlml_slam.types import Observation
 
 KEPT = 6000  # updates whose cost the diagnostics report: 10 minutes at 10 Hz
@@ -41,7 +40,7 @@ class DeformableSlamNode(ManagedNode):
         self._cost = np.zeros((KEPT, 2))  # wall and CPU time of an update [s]
         self._updates = 0
         self.answers = EstimatePublisher(self, p)
-        self.velocity = VelocityInput(self, p.node, self.slam.announce)
+        self.velocity = Listener(self, TwistStamped, 'carrier_velocity', self.announce, SENSOR)
         # the few features of a carrier may be all that is ever seen
         node = replace(p.node, trust_ids=True)
         shared = Parameters(node=node, motion=p.motion, reflector=p.reflector)
@@ -53,6 +52,7 @@ class DeformableSlamNode(ManagedNode):
     def process(self, observation: Observation) -> None:
         """One observation: estimate and publish."""
         wall, cpu = time.perf_counter(), time.thread_time()
+        # after a pause, the detections would overtake the velocities in the queue beside theirs
         self.velocity.drain()
         frame = self.slam.process(observation)
         if self.slam.estimate is not None:
@@ -61,6 +61,10 @@ class DeformableSlamNode(ManagedNode):
         spent = time.perf_counter() - wall, time.thread_time() - cpu
         self._cost[self._updates % KEPT] = spent
         self._updates += 1
+
+    def announce(self, msg: TwistStamped) -> None:
+        """The carrier's velocity from the stamp of a message on."""
+        self.slam.announce(*read_velocity(msg, self.params.node))
 
     def start_at(self, msg: PoseWithCovarianceStamped) -> None:
         """Restart at a pose of the map."""

@@ -134,6 +134,11 @@ class Listener:
         """The same for a message."""
         self._guard.pass_on(self._topic, lambda: self._use(msg))
 
+    def drain(self) -> None:
+        """Use all messages that lie in the queue, in order of arrival."""
+        for msg in self.drained():
+            self.accept(msg)
+
     def drained(self) -> list[Any]:
         """All messages that lie in the queue, in order of arrival."""
         out: list[Any] = []

@@ -91,7 +91,7 @@ def feed(node, count=30, skip=(), **settings):
         if topic in skip:
             continue
         if topic == 'carrier_velocity':
-            node.velocity.receive(msg)
+            node.velocity.accept(msg)
         elif topic in ('odom', 'reflectors'):
             node.sensors.add(topic, msg)
 
@@ -182,8 +182,8 @@ def test_velocity_in_the_robots_axes_is_turned_into_the_maps(live):
     start = np.array([0.0, 0.0, math.pi / 2])
     node.start_at(encode.pose_with_covariance(make, SECOND, 'map', start, np.zeros((3, 3))))
     ahead = CarrierVelocity(np.array([1.0, 0.0]), 0.2)
-    node.velocity.receive(build_velocity(make, SECOND, 'base_link', ahead))
-    node.velocity.receive(build_velocity(make, 2 * SECOND, 'map', ahead))
+    node.velocity.accept(build_velocity(make, SECOND, 'base_link', ahead))
+    node.velocity.accept(build_velocity(make, 2 * SECOND, 'map', ahead))
     history = node.slam._velocities
     np.testing.assert_allclose(history.mean(SECOND, 2 * SECOND).linear, [0.0, 1.0], atol=1e-12)
     np.testing.assert_allclose(history.mean(2 * SECOND, 3 * SECOND).linear, [1.0, 0.0])
@@ -195,7 +195,7 @@ def test_velocity_in_the_robots_axes_is_turned_into_the_maps(live):
 def test_velocity_that_cannot_be_believed_changes_nothing(live, axes, linear):
     node = start_node(live)
     velocity = CarrierVelocity(np.array(linear))
-    node.velocity.receive(build_velocity(make, SECOND, axes, velocity))
+    node.velocity.accept(build_velocity(make, SECOND, axes, velocity))
     assert node.slam._velocities.age(2 * SECOND) is None
 
 
@@ -236,7 +236,7 @@ def test_empty_detections_move_the_carrier_on(live):
                 ids=none.astype(np.int64),
             ))  # fmt: skip
         if topic == 'carrier_velocity':
-            node.velocity.receive(msg)
+            node.velocity.accept(msg)
         elif topic in ('odom', 'reflectors'):
             node.sensors.add(topic, msg)
             empty.append(topic)
