@@ -8,9 +8,6 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
-
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
@@ -55,10 +52,8 @@ class HealthPublisher:
         self._heard = time.monotonic()
         self._is_silent = False
         self._found: tuple[str, ...] = ()
-        # steady: with simulated time, silence of /clock must be reported as well
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(PERIOD, self.publish, clock=steady)
-        node.create_timer(WATCH, self.watch, clock=steady)
+        node.every(PERIOD, self.publish)
+        node.every(WATCH, self.watch)
         self._publish_health()
 
     @property

@@ -226,7 +226,7 @@ class ManagedNode(LifecycleNode):
         return sorted(f'{i.node_namespace.rstrip("/")}/{i.node_name}' for i in found)
 
     def every(self, period: float, act: Callable[[], object]) -> Any:
-        """A timer [s] of the wall clock, whatever /clock does."""
+        """A timer [s] of the wall clock, whatever /clock does: its silence has to be noticed."""
         return self.create_timer(period, act, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def create_timer(self, *args: Any, **options: Any) -> Any:

@@ -11,8 +11,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
@@ -109,8 +107,7 @@ class Sensors:
         self._logger.info(f'rlml_slam {__version__}, {params.node.mode}: waits for {inputs}')
         self._came: set[str] = set()
         self._missing = [k for k, (s, _) in enumerate(self._queues) if s in ('scan', 'odom')]
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(0.25 * SILENCE, self.flush_if_silent, clock=steady)
+        node.every(0.25 * SILENCE, self.flush_if_silent)
 
     def _listen(self, node: Any, stream: str, topic: str, kind: str) -> None:
         index = len(self._queues)

@@ -6,9 +6,6 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
-
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
 from rlml_slam.ros.diagnostics import PERIOD
@@ -30,8 +27,7 @@ class DetectorHealth:
         self._publisher = node.create_publisher(
             rclpy_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', 10
         )
-        # steady: with simulated time, silence of /clock must be reported as well
-        node.create_timer(PERIOD, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        node.every(PERIOD, self.publish)
 
     def update(self, scan: Scan, found: Found) -> None:
         """One scan and what it held."""
