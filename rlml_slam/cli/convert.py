@@ -129,17 +129,10 @@ def write_recording(
     """Write a bag in the order of stamps; the number of messages of each topic."""
     counts: dict[str, int] = {}
     with BagWriter(path, storage) as bag:
-        latched = [
-            ('/tf_static', 'tf2_msgs/msg/TFMessage', bool(recording.sensors)),
-            (
-                f'/{TRUE_REFLECTORS}',
-                'sensor_msgs/msg/PointCloud2',
-                recording.true_reflectors is not None,
-            ),
-        ]
-        for topic, msgtype, present in latched:
-            if present:
-                bag.add_topic(topic, msgtype, latched=True)
+        if recording.sensors:
+            bag.add_topic('/tf_static', 'tf2_msgs/msg/TFMessage', latched=True)
+        if recording.true_reflectors is not None:
+            bag.add_topic(f'/{TRUE_REFLECTORS}', 'sensor_msgs/msg/PointCloud2', latched=True)
         for stamp, topic, message in sorted(_messages(recording), key=lambda m: m[0]):
             bag.write(topic, message, stamp)
             counts[topic] = counts.get(topic, 0) + 1
