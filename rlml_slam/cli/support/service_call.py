@@ -19,9 +19,10 @@ def ask(node: str, service: str, argument: str | None = None) -> str:
     from diagnostic_msgs.srv import AddDiagnostics
     from std_srvs.srv import Trigger
 
-    if argument is None:
-        return message_of(call(node, service, Trigger, {}))
-    return message_of(call(node, service, AddDiagnostics, {'load_namespace': argument}))
+    kind = Trigger if argument is None else AddDiagnostics
+    with asking() as asker:
+        fields = {} if argument is None else {'load_namespace': argument}
+        return message_of(answer_of(asker, node, service, kind, fields))
 
 
 def message_of(answer: Any) -> str:
@@ -59,14 +60,8 @@ def asking(namespace: str | None = None) -> Iterator[Any]:
         rclpy.utilities.try_shutdown()
 
 
-def call(node: str, service: str, kind: Any, fields: dict[str, Any]) -> Any:
-    """The response of a service of a running node; InputError where there is none."""
-    with asking() as asker:
-        return answer_of(asker, node, service, kind, fields)
-
-
 def answer_of(asker: Any, node: str, service: str, kind: Any, fields: dict[str, Any]) -> Any:
-    """The same of the node that asks."""
+    """The response of a service of a running node; InputError where there is none."""
     import rclpy
 
     node = '/' + node.strip('/')
