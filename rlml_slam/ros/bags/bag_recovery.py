@@ -93,9 +93,6 @@ class BagRecovery:
                     self._unsorted.add(number)
                 last = time
 
-    def open(self) -> None:
-        """Nothing is left to do."""
-
     def close(self) -> None:
         """Nothing is held open."""
 
