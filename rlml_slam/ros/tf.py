@@ -76,7 +76,12 @@ class Extrinsics:
 
     def between(self, a: str, b: str) -> tuple[Array, Array] | None:
         """R (3, 3) and t (3,) of T_a_b as the transforms are now, None if nothing connects."""
-        return self._find(a, b)
+        up_a, up_b = self._ancestors(a), self._ancestors(b)
+        shared = next((f for f in up_b if f in up_a), None)
+        if shared is None:
+            return None
+        (R_a, t_a), (R_b, t_b) = up_a[shared], up_b[shared]
+        return R_a.T @ R_b, R_a.T @ (t_b - t_a)
 
     def pose(self, base: str, frame: str) -> Array | None:
         """Planar T_base_frame (3,), None if the tree does not connect the two.
@@ -84,7 +89,7 @@ class Extrinsics:
         Of a sensor that hangs upside down, it is that of one which stands there upright, with its
         x axis in the same direction. Raises InputError if the sensor is tilted against the base.
         """
-        found = self._between(base, frame)
+        found = self._known(base, frame)
         if found is None:
             return None
         R, t = found
@@ -109,24 +114,16 @@ class Extrinsics:
 
     def up(self, base: str, frame: str) -> Array | None:
         """The base z axis (3,) in the sensor's frame, None if the tree does not connect them."""
-        found = self._between(base, frame)
+        found = self._known(base, frame)
         return None if found is None else found[0][2]
 
-    def _between(self, base: str, frame: str) -> tuple[Array, Array] | None:
-        """R (3, 3) and t (3,) of T_base_frame."""
+    def _known(self, base: str, frame: str) -> tuple[Array, Array] | None:
+        """R (3, 3) and t (3,) of T_base_frame, kept until the tree changes."""
         if (base, frame) not in self._found:
             if len(self._found) >= MAX_FRAMES:  # names in messages may be anything
                 self._found = {}
-            self._found[base, frame] = self._find(base, frame)
+            self._found[base, frame] = self.between(base, frame)
         return self._found[base, frame]
-
-    def _find(self, base: str, frame: str) -> tuple[Array, Array] | None:
-        to_base, to_frame = self._ancestors(base), self._ancestors(frame)
-        shared = next((f for f in to_frame if f in to_base), None)
-        if shared is None:
-            return None
-        (R_b, t_b), (R_f, t_f) = to_base[shared], to_frame[shared]
-        return R_b.T @ R_f, R_b.T @ (t_f - t_b)
 
     def _ancestors(self, frame: str) -> dict[str, tuple[Array, Array]]:
         """T_ancestor_frame as (R, t) by ancestor, nearest first, the frame itself included."""
@@ -177,7 +174,6 @@ def subscribe_static(node: Any, extrinsics: Extrinsics) -> bool:
         )
         return False
     latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
     guard = guard_of(node)
 
     def take_one(transform: Any) -> None:
