@@ -11,7 +11,6 @@ from typing import Any
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import PointCloud2
 
-from rlml_slam.ros.back_end.back_end_figures import figures
 from rlml_slam.ros.back_end.map_services import MapServices
 from rlml_slam.ros.back_end.mapper import Mapper
 from rlml_slam.ros.back_end.user_requests import UserRequests
@@ -80,7 +79,7 @@ class BackEndNode(ManagedNode):
     def figures(self) -> dict[str, object]:
         """Figures for /diagnostics."""
         own = {'frames without their points or detections': self.join.incomplete}
-        return {**figures(self.mapper), **self.map_services.figures(), **own}
+        return {**self.mapper.figures(), **self.map_services.figures(), **own}
 
     def begin(self) -> None:
         """Announce the mode and the map; later, draw what came in before the pause."""

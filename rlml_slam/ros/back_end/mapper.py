@@ -22,10 +22,12 @@ from rlml_slam.ros.back_end.map_topics import MapTopics
 from rlml_slam.ros.back_end.map_transform import MapTransform
 from rlml_slam.ros.back_end.searcher import Searcher
 from rlml_slam.ros.back_end.worker import Worker
+from rlml_slam.ros.diagnostics import map_id
 from rlml_slam.ros.map_publisher import MapPublisher
 from rlml_slam.ros.message_guard import guard_of
 from rlml_slam.slam import conversation as say
 from rlml_slam.slam.back_end.back_end import BackEnd
+from rlml_slam.slam.closures.closure_table import state_counts
 from rlml_slam.slam.system import System
 from rlml_slam.types import Frame
 
@@ -239,6 +241,23 @@ class Mapper:
             saved = self.archive.autosave(self.back_end, self.products.grid(self.back_end))
             self.journal.close(keep=not saved)
         self.searcher.close()
+
+    def figures(self) -> dict[str, object]:
+        """Figures for /diagnostics."""
+        back_end, entry = self.back_end, self.system.entry
+        survey_frame = back_end.survey_frame
+        return {
+            'keyframes': len(back_end.graph.poses),
+            'edges': len(back_end.graph.edges),
+            'closures accepted': back_end.loop_closer.tried[True],
+            'closures rejected': back_end.loop_closer.tried[False],
+            **state_counts(back_end.loop_closer.records),
+            'map id': map_id(self.system.map if entry is None else entry.saved),
+            **({} if entry is None else {'saved map not entered': entry.why}),
+            **({} if survey_frame is None else {'survey': survey_frame.why}),
+            'constellations not searched': back_end.constellation_search.not_searched,
+            'frames waiting for the worker': self.worker.backlog,
+        }
 
     def problems(self) -> tuple[str, ...]:
         """What /diagnostics have to say of the files."""
