@@ -47,9 +47,7 @@ def recorded_parameters(path: Path) -> Parameters | None:
     known = {d.name for d in declarations(Parameters)} - set(OWN)
     given = found.get('parameters')
     given = given if isinstance(given, dict) else {}
-    params: Parameters = from_mapping(
-        {k: _as_tuple(v) for k, v in given.items() if k in known}, Parameters
-    )
+    params: Parameters = from_mapping({k: v for k, v in given.items() if k in known})
     with BagReader(path) as bag:
         first = next((m for _, _, m in bag.messages([POSE])), None)
     if first is None:
@@ -61,7 +59,3 @@ def recorded_parameters(path: Path) -> Parameters | None:
         map_start_sigma=tuple(sigma.tolist()),
     )  # fmt: skip
     return replace(params, node=node)
-
-
-def _as_tuple(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
