@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import concurrent.futures
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from diagnostic_msgs.srv import AddDiagnostics
@@ -41,20 +42,25 @@ class MapServices:
         # in the node's group, every subscription would wait for the answer, and every service in
         # one that is exclusive
         own = ReentrantCallbackGroup()
-        for kind, name, answer in (
-            (Trigger, '~/save_map', self.save_map),
-            (LoadMap, '~/load_map', self.load_map),
-            (Trigger, '~/reset', self.reset),
-            (Trigger, '~/closures', self.closures),
-            (Trigger, '~/reflectors', self.reflectors),
-            (AddDiagnostics, '~/revoke_closure', self.revoke_closure),
-            (GetMap, '~/dynamic_map', self.dynamic_map),
-            (SetBool, '~/pause_new_measurements', self.pause),
-            (Trigger, '~/relocalize', self.relocalize),
-            (SetBool, '~/set_localization_mode', self.set_localization_mode),
-            (Empty, 'reinitialize_global_localization', self.reinitialize),
-        ):
+
+        def serve(kind: Any, name: str, answer: Callable[[Any, Any], Any]) -> None:
             node.create_service(kind, name, self._in_worker(answer), callback_group=own)
+
+        in_words: tuple[tuple[Any, str, Callable[[Any], str]], ...] = (
+            (Trigger, 'save_map', lambda _: requests.save(params.node.map_file_name)),
+            (Trigger, 'reset', lambda _: requests.reset()),
+            (Trigger, 'closures', lambda _: closure_table(mapper.back_end.loop_closer.records)),
+            (Trigger, 'reflectors', lambda _: state_table(mapper.back_end.reflector_states())),
+            (AddDiagnostics, 'revoke_closure', lambda r: requests.revoke(r.load_namespace)),
+            (SetBool, 'pause_new_measurements', lambda r: self._pause(r.data)),
+            (SetBool, 'set_localization_mode', lambda r: requests.localize(r.data)),
+        )
+        for kind, name, act in in_words:
+            serve(kind, f'~/{name}', partial(self._say, name, act))
+        serve(LoadMap, '~/load_map', self.load_map)
+        serve(GetMap, '~/dynamic_map', self.dynamic_map)
+        serve(Trigger, '~/relocalize', self.relocalize)
+        serve(Empty, 'reinitialize_global_localization', self.reinitialize)
 
     def _in_worker(self, answer: Callable[[Any, Any], Any]) -> Any:
         async def call(request: Any, response: Any) -> Any:
@@ -86,35 +92,18 @@ class MapServices:
         """Figures for /diagnostics."""
         return {'last refused request': self.refused} if self.refused else {}
 
-    def save_map(self, _request: Any, response: Any) -> None:
-        """Write the map under map_file_name."""
-        save = self._requests.save
-        self._try('save_map', response, lambda: save(self._p.node.map_file_name))
+    def _say(self, service: str, act: Callable[[Any], str], request: Any, response: Any) -> None:
+        """Answer with what was done, or with why it was refused."""
+        try:
+            response.message = act(request)
+            response.success = True
+        except RlmlError as e:
+            refuse(response, str(e))
+            self.refused = f'{service}: {e}'
 
-    def reset(self, _request: Any, response: Any) -> None:
-        """Forget the map and begin at map_start_pose; the front end does as well."""
-        self._try('reset', response, self._requests.reset)
-
-    def closures(self, _request: Any, response: Any) -> None:
-        """All loop closures with their records, as a table of comma-separated values."""
-        response.success = True
-        response.message = closure_table(self._mapper.back_end.loop_closer.records)
-
-    def reflectors(self, _request: Any, response: Any) -> None:
-        """What has become of each reflector, as a table of comma-separated values."""
-        response.success = True
-        response.message = state_table(self._mapper.back_end.reflector_states())
-
-    def revoke_closure(self, request: Any, response: Any) -> None:
-        """Take a loop closure out of the map; load_namespace is its number."""
-        revoke = self._requests.revoke
-        self._try('revoke_closure', response, lambda: revoke(request.load_namespace))
-
-    def pause(self, request: Any, response: Any) -> None:
-        """Leave new measurements out of the map, or take them in again."""
-        self._mapper.system.pause(bool(request.data))
-        response.success = True
-        response.message = 'paused' if request.data else 'measurements are used again'
+    def _pause(self, on: bool) -> str:
+        self._mapper.system.pause(on)
+        return 'paused' if on else 'measurements are used again'
 
     def relocalize(self, _request: Any, response: Any) -> Any:
         """Find the newest scan anywhere in the map; while localizing, go on from there."""
@@ -143,11 +132,6 @@ class MapServices:
         answer.add_done_callback(take)
         return answer
 
-    def set_localization_mode(self, request: Any, response: Any) -> None:
-        """Localise in the map as it is now, or begin a new one."""
-        localize = self._requests.localize
-        self._try('set_localization_mode', response, lambda: localize(bool(request.data)))
-
     def dynamic_map(self, _request: Any, response: Any) -> None:
         """The grid as it is now."""
         grid = self._mapper.current().grid
@@ -170,14 +154,6 @@ class MapServices:
 
     def _message(self, grid: OccupancyGrid) -> Any:
         return encode.occupancy_grid(make_rclpy, self._mapper.stamp, self._p.node.map_frame, grid)
-
-    def _try(self, service: str, response: Any, act: Callable[[], str]) -> None:
-        try:
-            response.message = act()
-            response.success = True
-        except RlmlError as e:
-            refuse(response, str(e))
-            self.refused = f'{service}: {e}'
 
 
 def refuse(response: Any, why: str) -> None:
