@@ -288,9 +288,7 @@ class Sensors:
 
     def _use(self, stream: str, msg: Any) -> None:
         # whatever a message does to the code costs that message alone
-        use = self._guard.pass_on(
-            stream, lambda: self._observe(lambda: self._feed.add(stream, msg)), REFUSED
-        )
+        use = self._guard.pass_on(stream, partial(self._observe, stream, msg), REFUSED)
         if use is REFUSED:
             self._count_invalid(stream, self._guard.last)
 
@@ -299,9 +297,9 @@ class Sensors:
         self._begin(self.extrinsics)
         self._restart()
 
-    def _observe(self, add: Callable[[], list[Observation]]) -> None:
+    def _observe(self, stream: str, msg: Any) -> None:
         try:
-            observations = add()
+            observations = self._feed.add(stream, msg)
         except InputError as e:
             self._start_again(str(e))
             return
