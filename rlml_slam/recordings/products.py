@@ -47,8 +47,7 @@ def survey_figures(back_end: BackEnd) -> dict[str, Any]:
 def collect(slam: Slam | EkfSlam, log: FrameLog, name: str, truth: Truth | None) -> Run:
     """The products of a finished system; a grid too large to be drawn is ``Run.problem``."""
     truth = truth and truth.in_map_of(log)
-    stamps, optimized = slam.trajectory()
-    path = Trajectory(stamps, optimized)
+    path = Trajectory(*slam.trajectory())
     grid, problem = None, ''
     try:
         grid = slam.occupancy_grid()
