@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from rlml_slam import se2
-from rlml_slam.ros.odom_frame import OdomFrame
+from rlml_slam.ros.back_end.map_transform import OdomFrame
 from rlml_slam.types import Frame, Motion, Observation
 
 HERE, WHEELS = np.array([50.0, 20.0, 1.0]), np.array([3.0, 1.0, 0.2])
