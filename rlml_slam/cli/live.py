@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from rlml_slam.cli.support.live_session import LISTENERS, Source, drive
-from rlml_slam.cli.support.recorder import Recorder
 from rlml_slam.evaluation.run_record import Origin
 from rlml_slam.params import Parameters, Player, changed, from_mapping, read_yaml
 from rlml_slam.recordings.bag_inputs import BagInputs
@@ -58,11 +57,6 @@ def source(
 ) -> Source:
     """The bag in the place of a robot."""
     duration = max(1e-9 * (bag.end - bag.start), 1e-3)
-
-    def progress(recorder: Recorder) -> float:
-        stamps = recorder.frames.stamps
-        return 1e-9 * (stamps[-1] - stamps[0]) / duration if stamps else 0.0
-
     # nodes listen to the topics that replay takes, and to its frames
     system: dict[str, Any] = {STREAMS[s][0]: topic for s, topic in inputs.topics.items()}
     system |= {f: getattr(inputs.params.node, f) for f in ('odom_frame', 'base_frame')}
@@ -75,7 +69,7 @@ def source(
             'bag': Path(args.bag).resolve(), 'rate': float(args.rate),
             'wait_for_subscribers': LISTENERS, 'wait_for_topic': inputs.topics[sensor],
         },
-        progress,
+        lambda recorder: recorder.elapsed() / duration,
         system,
         args.config,
         (inputs.topics[sensor], STREAMS[sensor][1]),
