@@ -72,11 +72,6 @@ class Processes:
         text = self._log(name).read_text(encoding='utf-8', errors='replace')
         return '\n'.join(f'  {line}' for line in text.splitlines()[-LAST_LINES:])
 
-    def kill(self, name: str) -> None:
-        """End a child at once, by SIGKILL."""
-        self._children[name].kill()
-        self._children[name].wait()
-
     def usage(self, name: str) -> Usage | None:
         """CPU time and memory of a running child; None where the system does not say."""
         return usage(self._children[name].pid, time.monotonic())
