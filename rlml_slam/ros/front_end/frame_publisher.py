@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from rlml_slam.ros.codecs.reflector_clouds import build_associated
 from rlml_slam.ros.front_end.provided_odometry import ProvidedOdometry
 from rlml_slam.se2 import Array
 from rlml_slam.slam.conversation import SessionFrame
-from rlml_slam.types import Detections, Frame
+from rlml_slam.types import Frame
 
 CLOUD = 'sensor_msgs/msg/PointCloud2'
 TOPICS = {
@@ -83,29 +84,20 @@ class FramePublisher:
                 make, frame.stamp, frames, frame.T_local_base, frame.cov_local, twist, twist_cov
             )
         )
-        if observation.points is not None and self._is_heard('deskewed_points'):
-            points = build_points(make, frame.stamp, p.base_frame, observation.points)
-            self._publishers['deskewed_points'].publish(points)
+        if observation.points is not None:
+            points = frame.stamp, p.base_frame, observation.points
+            self._send_if_heard('deskewed_points', build_points, *points)
         if observation.detections is not None:
-            if self._is_heard('reflectors/associated'):
-                associated = build_associated(make, frame, p.base_frame)
-                self._publishers['reflectors/associated'].publish(associated)
-            self._show_statuses(frame, observation.detections)
-        if self._is_heard('rlml/frames'):
-            self._publishers['rlml/frames'].publish(build_record(make, record, p.local_frame))
+            self._send_if_heard('reflectors/associated', build_associated, frame, p.base_frame)
+            seen = frame.stamp, p.base_frame, observation.detections.points, frame.statuses
+            self._send_if_heard('reflectors/statuses', detection_markers, *seen)
+        self._send_if_heard('rlml/frames', build_record, record, p.local_frame)
         self._last = frame
 
-    def _is_heard(self, topic: str) -> bool:
-        return bool(self._publishers[topic].get_subscription_count() > 0)
-
-    def _show_statuses(self, frame: Frame, detections: Detections) -> None:
-        """The detections in colour, where somebody looks at them."""
-        if self._is_heard('reflectors/statuses'):
-            self._publishers['reflectors/statuses'].publish(
-                detection_markers(
-                    make_rclpy, frame.stamp, self._p.base_frame, detections.points, frame.statuses
-                )
-            )
+    def _send_if_heard(self, topic: str, build: Callable[..., Any], *of: Any) -> None:
+        """Build and send a message, where somebody subscribes."""
+        if self._publishers[topic].get_subscription_count() > 0:
+            self._publishers[topic].publish(build(make_rclpy, *of))
 
     def _twist(self, frame: Frame) -> tuple[Array, Array]:
         """Body twist since the last frame, with the covariance of the motion model.
