@@ -40,16 +40,14 @@ class BagInputs:
         self._bag = bag
         self.tf = self._transforms('tf')
         self.extrinsics = Extrinsics()
-        self._read_tf(_TF_SAMPLE)
-        self.params = with_frames_of(self.extrinsics, params)
-        n = self.params.node
-        self.has_odometry_on_tf = bool(self._odometry().path)
-        if self.tf and not self.has_odometry_on_tf:  # it may begin late
-            self._read_tf(None)
+        for most in (_TF_SAMPLE, None):  # odometry on /tf may begin late
+            self._read_tf(most)
             self.params = with_frames_of(self.extrinsics, params)
-            n, self.has_odometry_on_tf = self.params.node, bool(self._odometry().path)
-        is_on_tf = self.has_odometry_on_tf
-        self.has_odometry_on_tf &= n.use_odom and n.odom_source != 'topic'
+            is_on_tf = bool(self._odometry().path)
+            if is_on_tf or not self.tf:
+                break
+        n = self.params.node
+        self.has_odometry_on_tf = is_on_tf and n.use_odom and n.odom_source != 'topic'
         without = ('imu', 'odom') if self.has_odometry_on_tf else ('imu',)
         self.topics = choose_topics(bag.topics, n, without)
         self.more_scans = [self._scans(t) for t in topics_of(n, 'scan')[1:]]
