@@ -179,18 +179,15 @@ class Sensors:
 
     def _tell_of_missing(self) -> None:
         """Say once which scans and odometry have never come, PATIENCE after it became active."""
-        if self._missing and time.monotonic() - self._began > PATIENCE:
-            missing = [
-                f'{self._queues[k][0]} on {self._queues[k][1].topic_name}'
-                for k in self._missing
-                if self._queues[k][0] != 'odom' or not self._feed.tf.path
-            ]
-            if missing:
-                kinds = {STREAMS[self._queues[k][0]][1]: self._queues[k][0] for k in self._missing}
-                known = {listener.topic_name for _, listener in self._queues}
-                others = _others(self._node, kinds, known)
-                self._logger.warning(f'waiting for {", ".join(missing)}{others}')
-            self._missing = []
+        if time.monotonic() - self._began <= PATIENCE:
+            return
+        missing, self._missing = [self._queues[k] for k in self._missing], []
+        is_on_tf = bool(self._feed.tf.path)
+        named = [f'{s} on {q.topic_name}' for s, q in missing if s != 'odom' or not is_on_tf]
+        if named:
+            kinds = {STREAMS[stream][1]: stream for stream, _ in missing}
+            others = _others(self._node, kinds, {q.topic_name for _, q in self._queues})
+            self._logger.warning(f'waiting for {", ".join(named)}{others}')
 
     def _tell_of_refused(self) -> None:
         """Say of each stream once why an input was not used; /diagnostics count all of them."""
