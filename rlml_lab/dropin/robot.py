@@ -20,7 +20,6 @@ from sensor_msgs.msg import LaserScan
 
 from rlml_lab.dropin.tf_messages import tf_message
 from rlml_slam.params import Simulator, SimulatorParameters
-from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_rclpy as make
 from rlml_slam.ros.run import run
 from rlml_slam.ros.systems.simulator_messages import SimulatedMessages
@@ -46,7 +45,7 @@ class Robot(Node):
         self._tf = self.create_publisher(kind, '/tf', 100)
         self._scan = self.create_publisher(LaserScan, 'scan', qos_profile_sensor_data)
         self._truth = self.create_publisher(Odometry, TRUTH, 100)
-        static = encode.tf_message(make, [self._convert.laser_transform()])
+        static = self._convert.laser_transform()
         self._static = self.create_publisher(kind, '/tf_static', LATCHED)
         self._static.publish(static)
         self._later = time.time_ns() - START  # system's time less the simulation's

@@ -18,7 +18,6 @@ from rlml_slam.errors import FileFormatError, ParameterError
 from rlml_slam.params import SimulatorParameters, from_mapping, read_yaml
 from rlml_slam.plain_yaml import parse_yaml
 from rlml_slam.ros.bags.bag import BagWriter
-from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_bag
 from rlml_slam.ros.systems.simulator_messages import TOPICS, TRUE_REFLECTORS, SimulatedMessages
 from rlml_slam.ros.tf import TF_MESSAGE
@@ -126,8 +125,7 @@ def write_bag(
         bag.add_topic(f'/{TRUE_REFLECTORS}', 'sensor_msgs/msg/PointCloud2', latched=True)
         for topic, kind in topics.items():
             bag.add_topic(f'/{topic}', kind)
-        static = encode.tf_message(make_bag, [convert.laser_transform()])
-        bag.write('/tf_static', static, START)
+        bag.write('/tf_static', convert.laser_transform(), START)
         bag.write(f'/{TRUE_REFLECTORS}', convert.true_reflectors(simulation), START)
         for event in with_progress(simulation):
             if tf_only and isinstance(event.message, Odometry):

@@ -65,10 +65,15 @@ class SimulatedMessages:
     def odom_transform(self, sample: Odometry) -> Any:
         """TFMessage of odom to base."""
         n = self._p.node
-        frames = (n.odom_frame, n.base_frame)
-        return encode.tf_message(
-            self._make, [encode.transform(self._make, sample.stamp, frames, sample.pose)]
-        )
+        return self._transform(sample.stamp, (n.odom_frame, n.base_frame), sample.pose)
+
+    def laser_transform(self) -> Any:
+        """TFMessage of base to laser."""
+        n = self._p.node
+        return self._transform(START, (n.base_frame, n.laser_frame), np.array(n.laser_pose))
+
+    def _transform(self, stamp: int, frames: tuple[str, str], T: Array) -> Any:
+        return encode.tf_message(self._make, [encode.transform(self._make, stamp, frames, T)])
 
     def _truth(self, truth: GroundTruth) -> Any:
         n = self._p.node
@@ -122,12 +127,6 @@ class SimulatedMessages:
         )
         return encode.detections(self._make, known)
 
-    def laser_transform(self) -> Any:
-        """TransformStamped from base to laser."""
-        n = self._p.node
-        T_base_laser = np.array(n.laser_pose)
-        return encode.transform(self._make, START, (n.base_frame, n.laser_frame), T_base_laser)
-
 
 class SimulatedTopics:
     """The publishers of the simulator node; what never changes is published at once, latched."""
@@ -159,8 +158,8 @@ class SimulatedTopics:
                 f'tf2_msgs is not installed: give the other nodes laser_pose:={pose}'
             )
         else:
-            static = encode.tf_message(make_rclpy, [self._messages.laser_transform()])
-            node.create_publisher(kind, '/tf_static', latched).publish(static)
+            static = node.create_publisher(kind, '/tf_static', latched)
+            static.publish(self._messages.laser_transform())
 
     def is_heard(self, topic: str, by: int, now: float) -> bool:
         """Whether a topic has had ``by`` subscriptions for SETTLE, at the wall's time [s].
