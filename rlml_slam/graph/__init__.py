@@ -25,13 +25,13 @@ from rlml_slam.graph.reduction.marginalization import (
     floored_covariance,
     marginalize_pose,
 )
-from rlml_slam.graph.robust.closure_selection import select_closures
+from rlml_slam.graph.robust.closure_selection import Selection, select_closures
 from rlml_slam.graph.robust.inlier_evidence import evidence, uniform
 from rlml_slam.graph.robust.path_bound import path_bound
 
 __all__ = [
     'Column', 'FactorKind', 'FactorTable', 'Graph', 'Loss', 'LossKind', 'Losses', 'Marginals',
-    'OnlineSolver', 'RelativePoses', 'Renumbering', 'Solution', 'chi2', 'evidence',
+    'OnlineSolver', 'RelativePoses', 'Renumbering', 'Selection', 'Solution', 'chi2', 'evidence',
     'floored_covariance', 'loss_weights', 'marginalize_pose', 'optimize', 'path_bound',
     'prune_edges', 'prune_sightings', 'read_graph', 'relative_information', 'relative_pose',
     'select_closures', 'uniform', 'write_graph',

@@ -124,7 +124,7 @@ def test_scans_outside_the_last_trajectory_have_their_live_poses(recorder):
 
 def test_products_of_the_back_end_are_kept(recorder):
     cells = np.array([[-1, 0, 100], [0, 0, 0]], dtype=np.int8)
-    grid = OccupancyGrid(0.05, (-1.0, 2.0), cells)
+    grid = OccupancyGrid(0.0333333, (-1.0, 2.0), cells)
     recorder.map.use_grid(encode.occupancy_grid(make, 1, 'map', grid))
     known = reflectors([[1.0, 2.0], [3.0, 4.0]])
     recorder.on_reflectors(build_reflector_map(make, 1, 'map', known))
@@ -136,7 +136,7 @@ def test_products_of_the_back_end_are_kept(recorder):
     recorder.on_truth(truth(1, 0.0))
     run = recorder.run('drive')
     assert_array_equal(run.grid.cells, cells)
-    assert (run.grid.resolution, run.grid.origin) == (0.05, (-1.0, 2.0))
+    assert (run.grid.resolution, run.grid.origin) == (0.0333333, (-1.0, 2.0))
     assert_allclose(run.reflectors.points, known.points)
     assert_array_equal(run.truth.reflector_ids, [7])
 

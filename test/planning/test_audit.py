@@ -236,6 +236,21 @@ def test_noise_above_the_plan_is_a_finding():
     assert {f.kind for f in found} == {Kind.RESIDUALS}
 
 
+def test_place_of_large_residuals_does_not_depend_on_health():
+    s = sightings(9, pose_error=0.0)
+    s = replace(s, cov=s.cov / 4.0)
+    bad = (s.poses[:, 0] < -5.0) & (s.poses[:, 1] < -2.5)
+    ill = replace(s, levels=bad.astype(int), reasons=bad.astype(int),
+                  texts=np.array(['', 'wheels slip', record.OTHER]))  # fmt: skip
+    places = [
+        {(f.what, f.x, f.y) for f in audit(one).findings if f.kind is Kind.RESIDUALS}
+        for one in (s, ill)
+    ]
+    assert Kind.DEGRADED in {f.kind for f in audit(ill).findings}
+    assert places[0]
+    assert places[0] == places[1]
+
+
 def test_displacement_has_its_covariance():
     """Squared error over variance of a displaced reflector: 2 in the mean (chi2, 30 drives)."""
     total = []

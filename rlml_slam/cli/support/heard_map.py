@@ -48,10 +48,7 @@ class HeardMap:
 
     def use_grid(self, msg: Any) -> None:
         """The map."""
-        info = msg.info
-        cells = np.frombuffer(msg.data, dtype=np.int8).reshape(info.height, info.width)
-        x, y, yaw = decode.planar_pose(info.origin, 'map').tolist()
-        self.grid = OccupancyGrid(round(info.resolution, 6), (x, y), cells, yaw)
+        self.grid = decode.occupancy_grid(msg, 'map')
 
     def use_path(self, msg: Any) -> None:
         """The optimised trajectory."""

@@ -78,10 +78,10 @@ def of_areas(
         if bad.sum() >= FEW and row['ok_share'] <= 1.0 - BAD_SHARE:
             reason = e.sightings.texts[np.bincount(e.sightings.reasons[bad]).argmax()]
             in_view = np.median(e.planned[bad].sum(axis=1))
-            x, y = np.median(e.sightings.poses[bad, :2], axis=0).tolist()
+            u, v = np.median(e.sightings.poses[bad, :2], axis=0).tolist()
             what = (
                 f'{name}: DEGRADED in {1.0 - row["ok_share"]:.0%} of {row["scans"]} scans, mostly '
-                f'near ({x:.1f}, {y:.1f}): {reason}'
+                f'near ({u:.1f}, {v:.1f}): {reason}'
             )
             advice = f'{in_view:.0f} reflectors are planned in view there'
             advice += (
@@ -89,7 +89,7 @@ def of_areas(
                 if in_view >= ENOUGH
                 else '; see rlml plan --suggest'
             )
-            found.append(Finding(Kind.DEGRADED, -1, x, y, what, advice, share))
+            found.append(Finding(Kind.DEGRADED, -1, u, v, what, advice, share))
         ratio = row['residual_ratio']
         if ratio is not None and row['scans'] >= FEW and ratio > BAD_RATIO:
             what = f'{name}: residuals are {ratio:.1f} times their sigma'

@@ -28,6 +28,7 @@ REPEATED_WRONG = 0.1
 # share of the log odds of a weak match that its support for others lacks: where a place need not
 # fit well, a wrong one fits again more often
 REPEATED_WEAK = 0.75
+ROUNDING = 1e-9  # of log odds that are to be 0
 FALSE_AGREEMENT = 0.1  # expected number of accidental agreements among the pending closures
 
 
@@ -53,14 +54,15 @@ def is_consistent(
     i, j = nodes.T
     e = relative_pose(graph.poses[i], graph.poses[j], deltas)[0]
     alone = evidence(e, between.covs(i, j) + covs, 1.0, wrong)
-    # a weak or wide match may not enter alone, wherever the graph expects it
-    alone = np.where(weak, np.minimum(alone, 0.0), alone)
+    # a weak or wide match may not enter alone, wherever the graph expects it, nor with a second
+    # one from nearly the same viewpoint: its prior odds ask for one whole viewpoint more
+    alone = np.where(weak, np.minimum(alone, 0.0) + math.log(REPEATED_WRONG), alone)
     agree = _agreement(graph, between, nodes, deltas, covs, wrong)
     odds = np.broadcast_to(log_odds, len(nodes))
     ranges, positions = np.broadcast_to(view_range, len(nodes)), graph.poses[:, :2]
     together = _together(positions, j, ranges, np.minimum(odds, 0.0), agree)
-    # prior odds 1 : 1; of verified matches about 1 % are wrong
-    return np.asarray(np.maximum(odds, 0.0) + alone + together > 0.0)
+    # prior odds 1 : 1 of all others; of verified matches about 1 % are wrong
+    return np.asarray(np.maximum(odds, 0.0) + alone + together > -ROUNDING)
 
 
 class _RelativeCovariance:

@@ -169,8 +169,8 @@ class ClosureMatcher:
     ) -> WideResult:
         """Best pose in the search window."""
         p = self._p.loop_closure
-        half_width = candidate.window, candidate.window
-        window = Window(candidate.guess, half_width, candidate.angle)
+        half_width, is_wide = (candidate.window,) * 2, candidate.window > p.search_window
+        window = Window(candidate.guess, half_width, candidate.angle, mapped=is_wide)
         usual = Criteria(p.min_score, second_share=p.ambiguity_ratio)
         if not weak_too:
             return wide(pyramid, points, window, usual)

@@ -16,8 +16,9 @@ from copy import deepcopy
 
 import numpy as np
 
-from rlml_slam.graph import Graph, select_closures
+from rlml_slam.graph import Graph, Selection, select_closures
 from rlml_slam.params import Parameters
+from rlml_slam.slam.closures.closure_consistency import Ints
 from rlml_slam.slam.closures.closure_matching import Match
 from rlml_slam.slam.closures.closure_monitor import MAJORITY
 from rlml_slam.slam.closures.closure_records import ClosureRecords
@@ -33,15 +34,21 @@ def confirmed(
     """Of each pending match, whether it is right; none if they are of one keyframe."""
     if len({c.key.index for c in pending}) < MIN_VIEWS:
         return [False] * len(pending)
+    revoked = [c.edge for c in records.accepted() if c.status.state is State.REVOKED]
+    active = np.flatnonzero(graph.edges.enabled)
+
+    def select(trial: Graph) -> tuple[Selection, Ints]:
+        # covariances of this graph are right for what is short: errors of a long way are not less
+        found = select_closures(trial, p.solver, np.array(revoked, np.int64), least_scale=1.0)
+        return found, np.intersect1d(found.edges[~found.accepted], active)
+
     trial = deepcopy(graph)
     edges = [trial.add_edge(EdgeKind.CLOSURE, *c.edge(p.loop_closure)) for c in pending]
-    revoked = [c.edge for c in records.accepted() if c.status.state is State.REVOKED]
-    revoked_edges = np.array(revoked, np.int64)
-    # covariances of this graph are right for what is short: errors of a long way are not smaller
-    chosen = select_closures(trial, p.solver, revoked_edges, least_scale=1.0)
-    active = np.isin(chosen.edges, np.flatnonzero(graph.edges.enabled))
-    if chosen.accepted[active].sum() < MAJORITY * active.sum():
-        return [False] * len(pending)  # it takes them instead of those that are accepted
+    chosen, refuted = select(trial)
+    if len(refuted) > (1.0 - MAJORITY) * np.isin(chosen.edges, active).sum():
+        return [False] * len(pending)
+    if len(refuted) and not np.isin(refuted, select(deepcopy(graph))[1]).all():
+        return [False] * len(pending)  # it takes them instead of one that is accepted
     # what alone connects two parts was not tested
     right = np.isin(edges, chosen.edges[chosen.accepted & np.isfinite(chosen.evidence)])
     views = {c.key.index for c, is_right in zip(pending, right, strict=True) if is_right}

@@ -119,11 +119,12 @@ def test_weak_matches_support_others_less(graph):
 
 
 def test_of_one_viewpoint_the_best_match_counts(graph):
-    ends = [(5, 5 + LAP), (25, 25 + LAP), (26, 25 + LAP)]
+    ends = [(5, 5 + LAP), (25, 25 + LAP), (26, 25 + LAP), (45, 45 + LAP)]
     weakest = math.log(REPEATED_WRONG)
-    assert tried(graph, ends, log_odds=[0.5 * weakest, weakest, 0.6 * weakest]).all()
-    assert tried(graph, ends, log_odds=[0.5 * weakest, 0.6 * weakest, weakest]).any()
-    assert not tried(graph, ends, log_odds=[0.5 * weakest, weakest, weakest]).any()
+    least = 0.001 * weakest
+    assert tried(graph, ends, log_odds=[0.5 * weakest, weakest, 0.6 * weakest, least]).all()
+    assert tried(graph, ends, log_odds=[0.5 * weakest, 0.6 * weakest, weakest, least]).any()
+    assert not tried(graph, ends, log_odds=[0.5 * weakest, weakest, weakest, least]).any()
 
 
 def test_matches_that_are_weaker_never_harm(graph):
@@ -144,6 +145,14 @@ def test_odds_of_what_proposed_a_match_are_its_own(graph):
     assert tried(sharp, ends, far, log_odds=[100.0, 0.0]).tolist() == [True, False]
 
 
+def test_two_matches_of_a_wide_search_from_nearly_one_viewpoint_are_not_enough(graph):
+    """Where rooms repeat, the next scan, half a median range on, fits in the same wrong room."""
+    wide, ends = -1e-12, [(5, 5 + LAP), (15, 15 + LAP)]
+    travel = math.dist(true(15)[:2], true(5)[:2])
+    assert not tried(graph, ends, view_range=2.0 * travel, log_odds=wide).any()
+    assert tried(graph, ends, view_range=0.9 * travel, log_odds=wide).all()
+
+
 def test_weaker_matches_need_more_viewpoints(graph):
     ends = [(k, k + LAP) for k in range(5, 70, 5)]
 
@@ -153,7 +162,7 @@ def test_weaker_matches_need_more_viewpoints(graph):
         )
 
     asked_of = [asked(share * math.log(REPEATED_WRONG)) for share in (0.1, 0.6, 1.0)]
-    assert asked_of == [2, 3, 6]
+    assert asked_of == [3, 4, 9]
 
 
 def test_wrong_ones_that_disagree_help_no_one(graph):

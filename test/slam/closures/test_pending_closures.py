@@ -130,3 +130,16 @@ def test_group_that_contradicts_accepted_closures_stays_out(is_cut, seed):
     optimize(graph)
     wrong = [matched(graph, k, k + LAP, rng, (3.0, 0.0, 0.0)) for k in range(40, 48)]
     assert not any(confirmed(graph, ClosureRecords(), wrong, P))
+
+
+@pytest.mark.parametrize('seed', [0, 2])
+def test_group_that_contradicts_one_of_many_accepted_closures_stays_out(seed):
+    """A group in rooms that look alike, where only one closure before says otherwise."""
+    rng = np.random.default_rng(seed)
+    graph = bent(rng)
+    for k in [*range(20), 75]:
+        edge = matched(graph, k, k + LAP, rng).edge(P.loop_closure)
+        graph.add_edge(EdgeKind.CLOSURE, *edge)
+    optimize(graph)
+    wrong = [matched(graph, k, k + LAP, rng, (1.0, 0.0, 0.0)) for k in range(60, 66)]
+    assert not any(confirmed(graph, ClosureRecords(), wrong, P))
