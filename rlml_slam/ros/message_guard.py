@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import traceback
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -93,14 +93,16 @@ def listen_to_bytes(
     node.create_subscription(kind, topic, take, qos, raw=True)
 
 
-def waiting(subscription: Any, kind: Any, most: int) -> list[bytes]:
-    """The serialized messages that lie in the queue of a subscription, ``most`` at most."""
-    out: list[bytes] = []
+def waiting(subscription: Any, kind: Any, most: int) -> Iterator[bytes]:
+    """The serialized messages in the queue of a subscription, ``most`` at most, one at a time."""
     handle = subscription.handle
     with handle:
-        while len(out) < most and (taken := handle.take_message(kind, True)) is not None:
-            out.append(taken[0])
-    return out
+        for _ in range(most):
+            taken = handle.take_message(kind, True)
+            if taken is None:
+                return
+            yield taken[0]
+            del taken  # else two are in memory
 
 
 class Listener:

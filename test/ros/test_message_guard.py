@@ -15,7 +15,14 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import LaserScan
 
 from rlml_slam.errors import InputError
-from rlml_slam.ros.message_guard import MAX_LOGGED, SMALL, Listener, MessageGuard, guard_of
+from rlml_slam.ros.message_guard import (
+    MAX_LOGGED,
+    SMALL,
+    Listener,
+    MessageGuard,
+    guard_of,
+    waiting,
+)
 
 
 class Said:
@@ -142,3 +149,22 @@ def test_refused_message_is_counted(node):
     listener(node, refuse).accept(LaserScan())
     assert guard_of(node).refused == {'scan': 1}
     assert node.get_logger().errors == []
+
+
+def test_messages_that_wait_are_taken_one_at_a_time():
+    """Each is refused or used before the next one is in memory."""
+    waits = [b'1', b'2', b'3']
+
+    class Handle:
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def take_message(self, _kind, _raw):
+            return (waits.pop(0), None) if waits else None
+
+    for data in waiting(SimpleNamespace(handle=Handle()), LaserScan, 2):
+        assert len(waits) == 3 - int(data)
+    assert waits == [b'3']

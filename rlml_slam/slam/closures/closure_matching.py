@@ -167,7 +167,7 @@ class ClosureMatcher:
     def _search(
         self, pyramid: Pyramid, candidate: Candidate, points: Array, weak_too: bool
     ) -> WideResult:
-        """Best pose in the search window."""
+        """Best pose in the search window; of a wide one, where the submap knows something."""
         p = self._p.loop_closure
         half_width, is_wide = (candidate.window,) * 2, candidate.window > p.search_window
         window = Window(candidate.guess, half_width, candidate.angle, mapped=is_wide)

@@ -45,7 +45,8 @@ def confirmed(
     trial = deepcopy(graph)
     edges = [trial.add_edge(EdgeKind.CLOSURE, *c.edge(p.loop_closure)) for c in pending]
     chosen, refuted = select(trial)
-    if len(refuted) > (1.0 - MAJORITY) * np.isin(chosen.edges, active).sum():
+    num_active = np.isin(chosen.edges, active).sum()
+    if num_active - len(refuted) < MAJORITY * num_active:
         return [False] * len(pending)
     if len(refuted) and not np.isin(refuted, select(deepcopy(graph))[1]).all():
         return [False] * len(pending)  # it takes them instead of one that is accepted

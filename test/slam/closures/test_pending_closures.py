@@ -10,9 +10,12 @@ from made_laps import LAP, SIGMA, true, two_laps
 from rlml_slam import se2
 from rlml_slam.graph.batch.solver import optimize
 from rlml_slam.graph.incremental.online_solver import OnlineSolver
+from rlml_slam.graph.model.factors import FactorKind
 from rlml_slam.graph.model.graph import Graph
+from rlml_slam.graph.robust.closure_selection import Selection
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import Parameters
+from rlml_slam.slam.closures import pending_closures
 from rlml_slam.slam.closures.closure_matching import Match
 from rlml_slam.slam.closures.closure_records import ClosureRecords
 from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap
@@ -143,3 +146,21 @@ def test_group_that_contradicts_one_of_many_accepted_closures_stays_out(seed):
     optimize(graph)
     wrong = [matched(graph, k, k + LAP, rng, (1.0, 0.0, 0.0)) for k in range(60, 66)]
     assert not any(confirmed(graph, ClosureRecords(), wrong, P))
+
+
+@pytest.mark.parametrize(('accepted', 'right'), [(9, False), (10, True)])
+def test_a_tenth_of_the_accepted_closures_may_be_refuted_in_any_case(monkeypatch, accepted, right):
+    """One of them is, with the pending ones and without."""
+    rng = np.random.default_rng(0)
+    graph = bent(rng)
+    for k in range(accepted):
+        edge = matched(graph, k, k + LAP, rng).edge(P.loop_closure)
+        graph.add_edge(EdgeKind.CLOSURE, *edge)
+
+    def select(trial, *_, **__):
+        edges = np.flatnonzero(trial.edges.kinds == FactorKind.CLOSURE)
+        return Selection(edges, edges != edges[0], np.ones(len(edges)), 1.0)
+
+    monkeypatch.setattr(pending_closures, 'select_closures', select)
+    pending = [matched(graph, k, k + LAP, rng) for k in (60, 65)]
+    assert confirmed(graph, ClosureRecords(), pending, P) == [right] * 2
