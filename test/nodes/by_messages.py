@@ -174,8 +174,7 @@ class ByMessages(Driver):
         self.front.sensors.add(stream, message)
 
     def _call(self, service, kind, **fields):
-        services, response = self.back.map_services, kind.Response()
-        act = getattr(services, service)
+        act, response = self.back.map_services.answers[f'~/{service}'], kind.Response()
         self.back.mapper.worker.submit(lambda: act(kind.Request(**fields), response)).result()
         self.settle()
         return response
@@ -188,7 +187,7 @@ class ByMessages(Driver):
         assert self._call('set_localization_mode', SetBool, data=on).success
 
     def pause(self, on):
-        assert self._call('pause', SetBool, data=on).success
+        assert self._call('pause_new_measurements', SetBool, data=on).success
 
     def reset(self):
         assert self._call('reset', Trigger).success

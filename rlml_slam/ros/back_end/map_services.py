@@ -28,7 +28,8 @@ from rlml_slam.slam.landmarks.reflector_states import state_table
 class MapServices:
     """Answers in the mapper's thread, between two frames, so that no subscription waits.
 
-    ``refused`` is the newest request that was refused, and why.
+    ``answers`` takes a request and its response to each service, by its name; ``refused`` is the
+    newest request that was refused, and why.
     """
 
     def __init__(
@@ -38,12 +39,14 @@ class MapServices:
         self._p = params
         self._mapper = mapper
         self._requests = requests
+        self.answers: dict[str, Callable[[Any, Any], Any]] = {}
         self.refused = ''
         # in the node's group, every subscription would wait for the answer, and every service in
         # one that is exclusive
         own = ReentrantCallbackGroup()
 
         def serve(kind: Any, name: str, answer: Callable[[Any, Any], Any]) -> None:
+            self.answers[name] = answer
             node.create_service(kind, name, self._in_worker(answer), callback_group=own)
 
         in_words: tuple[tuple[Any, str, Callable[[Any], str]], ...] = (
