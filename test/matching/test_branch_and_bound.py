@@ -194,7 +194,8 @@ def test_point_that_is_in_no_grid_meets_no_cell(pyramid, points, far):
     for of in (mixed, away):
         lattice = branch_and_bound.lattice_of(pyramid, of, window, thetas)
         found = np.full((2, 4), -1, dtype=np.int64)
-        goal = Goal(-1, 0.0, 0.7, 10.0, 10.0, False, branch_and_bound.ENDLESS)
+        endless = branch_and_bound.ENDLESS
+        goal = Goal(-1, 0.0, 0.7, 10.0, 10.0, False, endless, -1, endless)
         search(pyramid.levels, lattice, goal, found)
         sums.append(found[0])
     np.testing.assert_array_equal(*sums)
@@ -241,6 +242,39 @@ def test_search_ends_when_its_budget_does(pyramid, points):
         assert not cut.complete
         # a block at most beyond it
         assert cut.lookups < budget + 200 * len(points)
+
+
+def test_weak_ones_are_found_in_the_same_search_and_only_within_their_budget(pyramid, points):
+    def of(**criteria):
+        return searched(pyramid, points, np.zeros(3), 3.0, np.pi, **criteria)
+
+    best = of(min_score=0.1).best
+    usual = of(min_score=best.score + 0.05)
+    assert usual.best is None  # so it is a weak one
+    weak = of(min_score=best.score + 0.05, weak_score=best.score - 0.05)
+    np.testing.assert_array_equal(weak.best.pose, best.pose)
+    assert weak.second is None
+    # no more look-ups than without weak ones, as soon as the budget is used up
+    cut = of(min_score=best.score + 0.05, weak_score=best.score - 0.05, weak_budget=0)
+    assert cut.best is None
+    assert cut.complete
+    assert cut.lookups == pytest.approx(usual.lookups, rel=0.05)
+
+
+@pytest.mark.parametrize('weak_budget', [0, 100_000, branch_and_bound.ENDLESS])
+def test_usual_pose_and_second_one_are_the_same_where_weak_ones_are_looked_for(
+    pyramid, points, weak_budget
+):
+    start, span = np.zeros(3), (3.0, np.pi)
+    usual = searched(pyramid, points, start, *span, min_score=0.4, second_share=0.5)
+    also = searched(
+        pyramid, points, start, *span, min_score=0.4, second_share=0.5, weak_score=0.2,
+        weak_budget=weak_budget,
+    )  # fmt: skip
+    assert usual.second is not None
+    for one, other in ((usual.best, also.best), (usual.second, also.second)):
+        assert one.score == other.score
+        np.testing.assert_array_equal(one.pose, other.pose)
 
 
 def test_search_is_the_same_to_the_last_bit(room, points):

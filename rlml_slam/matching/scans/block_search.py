@@ -35,7 +35,10 @@ class Lattice(NamedTuple):
 
 
 class Goal(NamedTuple):
-    """Criteria in sums of cells; the second needs more than ``offset`` + ``share`` * the best."""
+    """Criteria in sums of cells; the second needs more than ``offset`` + ``share`` * the best.
+
+    Poses from ``weak`` to ``threshold`` are looked for within ``weak_budget``, without a second.
+    """
 
     threshold: int
     offset: float
@@ -44,6 +47,8 @@ class Goal(NamedTuple):
     turns: float
     circular: bool
     budget: int
+    weak: int
+    weak_budget: int
 
 
 class Table(NamedTuple):
@@ -136,7 +141,7 @@ def bounds(
 
 @part
 def sweep(levels: Levels, lattice: Lattice, table: Table, goal: Goal) -> tuple[Integers, int]:
-    """Largest blocks that may hold a pose above the threshold, best first; the look-ups made.
+    """Largest blocks that may hold a pose, a weak one too, best first; the look-ups made.
 
     A block is (bound, group of angles, row, column) as one number, see packed().
     """
@@ -149,7 +154,7 @@ def sweep(levels: Levels, lattice: Lattice, table: Table, goal: Goal) -> tuple[I
     hits, met = np.zeros((2, parts), np.uint64), np.zeros((2, parts), np.int64)
     for g in range(len(first)):
         sure = FULL * (n - int(first[g, n + 2, 0]))
-        least = max(goal.threshold // UNIT + 1 - sure, 0)
+        least = max(goal.weak // UNIT + 1 - sure, 0)
         for i in range(0, rows, 2):
             if lookups > goal.budget:
                 break
@@ -216,20 +221,22 @@ def search(levels: Levels, lattice: Lattice, goal: Goal, found: Integers) -> int
     blocks, lookups = sweep(levels, lattice, tabulate(levels.eight, lattice.cells, 4), goal)
     tables = tabulate(levels.four, lattice.cells, 2), tabulate(levels.two, lattice.cells, 1)
     for rank in range(2):
-        best = goal.threshold
+        best = goal.weak
         if rank == 1:
-            best = max(best, int(np.floor(goal.offset + goal.share * found[0, 0])))
+            best = max(goal.threshold, int(np.floor(goal.offset + goal.share * found[0, 0])))
         for block in blocks:
             rest, j = divmod(block, SHIFTS)
             rest, i = divmod(rest, SHIFTS)
             bound, g = divmod(rest, ANGLES)
+            if lookups > goal.weak_budget:
+                best = max(best, goal.threshold)
             if UNIT * bound <= best or lookups > goal.budget:
                 break
             at = (SIDE * j, SIDE * i)
             if rank == 0 or not is_excluded(goal, len(lattice.cells), found, (4 * g, 4), at, 7):
                 lookups += divide(levels, lattice, goal, tables, (g, *at), rank, best, found)
                 best = max(best, found[rank, 0])
-        if found[0, 0] < 0:
+        if found[0, 0] <= goal.threshold:
             break
     return lookups
 

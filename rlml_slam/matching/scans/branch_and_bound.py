@@ -55,7 +55,9 @@ class Criteria:
     Candidates below ``min_score`` are not looked for. The second candidate differs from the best
     by more than ``separation`` [m] in x or y or by more than ``separation_angle`` [rad], and is
     looked for down to ``second_share`` of the best score. ``budget`` are look-ups of end points in
-    the grid, of which a processor does about a thousand million in a second.
+    the grid, of which a processor does about a thousand million in a second. Candidates from
+    ``weak_score`` on (None: ``min_score``) are looked for too, while less than ``weak_budget``
+    look-ups were made, but no second one.
     """
 
     min_score: float = 0.0
@@ -63,6 +65,8 @@ class Criteria:
     separation_angle: float = 0.3
     second_share: float = 0.7
     budget: int = ENDLESS
+    weak_score: float | None = None
+    weak_budget: int = ENDLESS
 
 
 @dataclass(frozen=True)
@@ -94,14 +98,21 @@ def wide(
     lattice = lattice_of(pyramid, points, window, thetas)
     unit = 255.0 * len(points) / (P_MAX - P_MIN)  # sum of cells per score
     turn = thetas[1] - thetas[0] if len(thetas) > 1 else math.inf
+    weak_score = criteria.min_score if criteria.weak_score is None else criteria.weak_score
+    threshold, weak = (
+        max(math.ceil((score - P_MIN) * unit) - 1, -1)
+        for score in (criteria.min_score, weak_score)
+    )
     goal = Goal(
-        max(math.ceil((criteria.min_score - P_MIN) * unit) - 1, -1),
+        threshold,
         (criteria.second_share - 1.0) * P_MIN * unit,
         criteria.second_share,
         criteria.separation / pyramid.resolution,
         criteria.separation_angle / turn,
         window.half_angle >= math.pi,
         criteria.budget,
+        weak,
+        criteria.weak_budget,
     )
     found = np.full((2, 4), -1, dtype=np.int64)
     lookups = search(pyramid.levels, lattice, goal, found)

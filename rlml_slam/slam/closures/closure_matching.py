@@ -39,7 +39,7 @@ PYRAMIDS = (
     6  # search pyramids kept, more than are searched at a time: each is three times its submap
 )
 WEAK_SHARE = 0.85  # of the smallest score: below, wrong places of a local map score as well
-MAX_LOOKUPS = 5_000_000  # of a search for weak matches, which prunes less
+MAX_LOOKUPS = 5_000_000  # of a search, after which weak matches are not looked for any more
 SEARCH_SIGMA = np.array([0.5, 0.5, 0.2])  # [m, m, rad] prior of the refinement at the best cell
 
 AMBIGUOUS, DEGENERATE = 'a second pose fits as well', 'the scan does not constrain one direction'
@@ -171,16 +171,12 @@ class ClosureMatcher:
         p = self._p.loop_closure
         half_width, is_wide = (candidate.window,) * 2, candidate.window > p.search_window
         window = Window(candidate.guess, half_width, candidate.angle, mapped=is_wide)
-        usual = Criteria(p.min_score, second_share=p.ambiguity_ratio)
-        if not weak_too:
-            return wide(pyramid, points, window, usual)
-        # weak ones are not searched for a second pose: they need other viewpoints anyway
-        weak = Criteria(WEAK_SHARE * p.min_score, second_share=1.0, budget=MAX_LOOKUPS)
-        found = wide(pyramid, points, window, weak)
-        if found.complete and (found.best is None or found.best.score < p.min_score):
-            return found
-        strong = wide(pyramid, points, window, usual)
-        return found if strong.best is None else strong
+        # weak ones need other viewpoints anyway, so no second pose of theirs is looked for
+        criteria = Criteria(
+            p.min_score, second_share=p.ambiguity_ratio,
+            weak_score=WEAK_SHARE * p.min_score if weak_too else None, weak_budget=MAX_LOOKUPS,
+        )  # fmt: skip
+        return wide(pyramid, points, window, criteria)
 
     def _log_odds(self, score: float) -> float:
         """Prior log odds of a match by its score, eq. 58: 0, or negative for a weak one."""
