@@ -53,5 +53,7 @@ def parse_yaml(text: str, source: str) -> Any:
         return yaml.load(text, _Loader)
     # some values (the 99th of a month) are errors of Python's own
     except (yaml.YAMLError, ValueError, TypeError, OverflowError, RecursionError) as e:
-        reason = str(e).splitlines() or [type(e).__name__]
-        raise FileFormatError(f'{source}: not YAML: {reason[0]}') from e
+        reason = (str(e).splitlines() or [type(e).__name__])[0]
+        if isinstance(e, yaml.MarkedYAMLError) and e.problem_mark is not None:
+            reason = f'line {e.problem_mark.line + 1}: {e.problem}'
+        raise FileFormatError(f'{source}: not YAML: {reason}') from e

@@ -39,6 +39,7 @@ def test_long_texts_of_digits_are_no_numbers():
         ('[' * 2000, 'not YAML'),
         ('a: ' + '9' * 5000, 'not YAML'),
         ('a: [', 'not YAML'),
+        ('a: 1\nb:\n\tc: 2', 'line 3: found character'),
         ('!!python/object:os.system x', 'not YAML'),
         ('x' * (MAX_CHARACTERS + 1), 'more than'),
         ('- 1\n' * 250_000, 'more than 50 levels or 50000 events'),

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import re
 import time
 from typing import Any
 
@@ -36,11 +37,14 @@ def add_parser(subparsers: Any) -> None:
         description='Calls a service of a running node and prints its answer.',
     )
     names = [*SERVICES, POSE]
+    # -1,2,90 is no option: Python 3.14 reads it so
+    parser._negative_number_matcher = re.compile(r'-\.?\d')
     parser.add_argument('service', metavar='SERVICE', choices=names, help=', '.join(names))
     parser.add_argument(
         'argument', metavar='ARGUMENT', nargs='?',
         help='of load_map the name of a map, which save_map takes as well, to save under another '
-        'one; of the two that switch something on or off; of initialpose x,y,angle [m, degrees]',
+        'one from then on; of the two that switch something on or off; of initialpose x,y,angle '
+        '[m, degrees]',
     )  # fmt: skip
     parser.add_argument(
         '--node', metavar='NAME',
@@ -61,9 +65,11 @@ def run(args: argparse.Namespace) -> int:
     node = args.node or ('/front_end' if args.service == 'save_incident' else '/back_end')
     kind = getattr(importlib.import_module(f'{package}.srv'), name)
     with asking() as asker:
-        if args.service == 'save_map' and args.argument is not None:
-            rename(asker, node, args.argument)
+        renames = args.service == 'save_map' and args.argument is not None
+        before = rename(asker, node, args.argument) if renames else ''
         answer = answer_of(asker, node, args.service, kind, fields)
+        if renames and not answer.success:
+            rename(asker, node, before)
         if name != 'LoadMap':
             print(message_of(answer))
         elif answer.result != kind.Response.RESULT_SUCCESS:
@@ -102,15 +108,18 @@ def give_pose(node: str, argument: str) -> str:
     return f'{topic}: x = {x:g} m, y = {y:g} m, {degrees:g} degrees: sent'
 
 
-def rename(asker: Any, node: str, name: str) -> None:
-    """Save under another name from now on; InputError where the node refuses it."""
-    from rcl_interfaces.srv import SetParameters
+def rename(asker: Any, node: str, name: str) -> str:
+    """Save under another name from now on; the one before. InputError where it is refused."""
+    from rcl_interfaces.srv import GetParameters, SetParameters
     from rclpy.parameter import Parameter
 
+    asked = {'names': ['map_file_name']}
+    before = answer_of(asker, node, 'get_parameters', GetParameters, asked).values[0]
     given = [Parameter('map_file_name', value=name).to_parameter_msg()]
     answer = answer_of(asker, node, 'set_parameters', SetParameters, {'parameters': given})
     if not answer.results[0].successful:
         raise InputError(answer.results[0].reason)
+    return str(before.string_value)
 
 
 def value_of(service: str, field: str, argument: str | None) -> str | bool:

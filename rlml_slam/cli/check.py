@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from rlml_slam.ros.sensor_input import STREAMS
 from rlml_slam.ros.tf import TF_MESSAGE
 
 STATIC = 'tf_static'
+CLOCK = 'rosgraph_msgs/msg/Clock'
 
 
 def add_parser(subparsers: Any) -> None:
@@ -86,6 +87,9 @@ def listen(
     from rlml_slam.ros.message_guard import LARGE, Listener
     from rlml_slam.ros.sensors import MOTION, SENSOR
 
+    own = deque[int](
+        maxlen=1
+    )  # the time of a simulator in the namespace, whose /clock is remapped
     keep, latched = [], QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     for stream, (topic, kind) in topics.items():
         found = rclpy_class(kind)
@@ -94,9 +98,18 @@ def listen(
         qos = latched if stream == STATIC else SENSOR if stream == 'scan' else MOTION
 
         def take(msg: Any, stream: str = stream) -> None:
-            setup.hear(stream, msg, time.monotonic(), node.get_clock().now().nanoseconds)
+            simulated = own[-1] if own else node.get_clock().now().nanoseconds
+            setup.hear(stream, msg, time.monotonic(), simulated)
 
         keep.append(Listener(node, found, topic, take, qos, LARGE))
+        if stream in ('tf', STATIC) and node.get_namespace() != '/':  # where it is remapped
+            keep.append(Listener(node, found, stream, take, qos, LARGE))
+
+    def keep_time(msg: Any) -> None:
+        own.append(msg.clock.sec * 10**9 + msg.clock.nanosec)
+
+    if node.get_namespace() != '/':
+        keep.append(Listener(node, rclpy_class(CLOCK), 'clock', keep_time, SENSOR, LARGE))
     end = time.monotonic() + seconds
     is_simulated = False
     while time.monotonic() < end:

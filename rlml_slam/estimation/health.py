@@ -45,6 +45,7 @@ class HealthInputs:
     why the saved map does not confirm the pose, empty if it does; ``is_lost``: for too long.
     ``contradicted``: scan or reflectors have contradicted the map for too long. ``seen`` of the
     ``expected`` reflectors in view were detected. ``maps``: the map is in the making.
+    ``mounting``: what is wrong with the laser's place on the robot, empty if nothing is.
     """
 
     scan: ScanEvidence
@@ -59,6 +60,7 @@ class HealthInputs:
     seen: int = 0
     maps: bool = False
     position: Array = field(default_factory=lambda: np.zeros(2))
+    mounting: str = ''
 
 
 class HealthMonitor:
@@ -83,7 +85,7 @@ class HealthMonitor:
 
     def evaluate(self, stamp: int, step: HealthInputs) -> Health:
         """Health at ``stamp`` [ns], after the first step."""
-        reasons = [step.unconfirmed] if step.unconfirmed else []
+        reasons = [reason for reason in (step.unconfirmed, step.mounting) if reason]
         if self._first is None:
             self._first = stamp
             return Health(Level.DEGRADED if reasons else Level.OK, tuple(reasons))
@@ -176,7 +178,9 @@ class HealthMonitor:
             reasons.append(f'none of {self._num_detections} detected reflectors matches the map')
         if self._fails(self._reflectors_seen, stamp):
             reasons.append(f'only {step.seen} of {step.expected} expected reflectors detected')
-        if misfit:
+        if misfit and math.isnan(self._score):
+            reasons.append('too few beams of the scan are in range')
+        elif misfit:
             reasons.append(f'scan does not match the submap: score {self._score:.2f}')
         open_direction = step.scan.open_direction
         if self._fails(max(self._held_by_scan, self._held_by_reflectors), stamp):

@@ -27,7 +27,7 @@ class FrontEndNode(ManagedNode):
     def __init__(self, has_back_end: bool = False, **options: Any) -> None:
         self.take: Callable[[SessionFrame], None] | None = None  # a back end in the same process
         self._has_back_end = has_back_end
-        self.back_end_is_active: Callable[[], bool] = lambda: True
+        self.back_end_problems: Callable[[], tuple[str, ...]] = tuple
         self._map: LocalizeIn | None = None
         self._obey: Callable[[FrontEndCommand], None] = lambda _: None  # while there is a control
         super().__init__('front_end', **options)
@@ -59,9 +59,8 @@ class FrontEndNode(ManagedNode):
 
     def problems(self) -> tuple[str, ...]:
         """What is wrong around the estimate."""
-        alone = () if self.back_end_is_active() else ('back_end is not active',)
         around = self.answers, self.control, self.sensors, self.black_box
-        return sum((part.problems() for part in around), alone)
+        return sum((part.problems() for part in around), self.back_end_problems())
 
     @property
     def front_end(self) -> FrontEnd:

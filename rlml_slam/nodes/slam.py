@@ -18,7 +18,12 @@ def connected(front_end: FrontEndNode, **options: Any) -> BackEndNode:
     """A back end for a front end that was made with ``has_back_end``."""
     back_end = BackEndNode(front_end.command, **options)
     front_end.take = back_end.take
-    front_end.back_end_is_active = lambda: back_end.is_active
+
+    def problems() -> tuple[str, ...]:
+        active = back_end.is_active
+        return back_end.mapper.entry_problems() if active else ('back_end is not active',)
+
+    front_end.back_end_problems = problems
     return back_end
 
 

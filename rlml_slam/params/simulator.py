@@ -21,7 +21,9 @@ class Simulator(Group, prefix=''):
         'follow the route of the world, or the cmd_vel topic',
         choices=('route', 'cmd_vel'),
     )
-    repeat: bool = param(False, 'repeat the route without end')
+    repeat: bool = param(
+        False, 'repeat the route without end; one that is not closed is driven back each time'
+    )
     duration: float = param(0.0, 'duration of the run; 0: until the route is done', 's', 0, 1e6)
     exit_at_end: bool = param(True, 'the node exits with code 0 when the run is done')
     wait_for_subscribers: int = param(

@@ -71,12 +71,14 @@ def write_outputs(
 
 
 def make_folder(folder: str | Path) -> Path:
-    """The folder, made if need be; MapError if nothing can be written there."""
+    """The folder, made if need be; MapError if it is a bag, or nothing can be written there."""
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise MapError(f'{folder}: cannot be made: {e.strerror}') from e
+    if (folder / 'metadata.yaml').exists():
+        raise MapError(f'{folder} is a bag: name another folder for what is written')
     if not os.access(folder, os.W_OK):
         raise MapError(f'{folder}: cannot be written')
     return folder

@@ -78,7 +78,9 @@ class HealthPublisher:
     def health(self) -> Health:
         """The health as it is now."""
         if self._frame is None:
-            return with_problems(Health(Level.DEGRADED, ('no input yet',)), self._found)
+            last = '' if self._sensors is None else self._sensors.synchronizer.inputs.last_error
+            reasons = ('no input yet', f'not used: {last}') if last else ('no input yet',)
+            return with_problems(Health(Level.DEGRADED, reasons), self._found)
         # who is lost stays lost in silence
         silence = ('no new scan or reflectors',) if self._is_silent else ()
         return with_problems(with_problems(self._frame.health, silence), self._found)

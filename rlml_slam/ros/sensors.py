@@ -67,8 +67,7 @@ class Sensors:
     one of their sensors is, but no longer than TF_PATIENCE: then a sensor without a transform is
     taken to sit at ``laser_pose``, one for each topic; where its transform comes after all, a map
     begins again. Later, a message in another frame without transform is refused, and holds up
-    nothing. Where all inputs fall silent, what still waits for
-    odometry is used as it is.
+    nothing. Where all inputs fall silent, what still waits for odometry is used as it is.
     """
 
     def __init__(
@@ -91,6 +90,7 @@ class Sensors:
         self._since: dict[str, int] = {}  # stamp at which a sensor without a transform appeared
         self._held: list[tuple[str, Any]] = []
         self._frames: defaultdict[str, set[str]] = defaultdict(set)  # of sensors, by stream
+        self._frame_of: dict[str, str] = {}  # of scans, by topic
         self._topics: Counter[str] = Counter()  # by stream
         self._queues: list[tuple[str, Listener]] = []
         self.arrange: Callable[[list[str]], None] = lambda topics: None  # of what was taken
@@ -110,8 +110,7 @@ class Sensors:
         node.every(0.25 * SILENCE, self.flush_if_silent)
 
     def _listen(self, node: Any, stream: str, topic: str, kind: str) -> None:
-        index = len(self._queues)
-        found, use = rclpy_class(kind), partial(self.receive, index)
+        found, use = rclpy_class(kind), partial(self.receive, len(self._queues))
         if found is None:
             return  # of a package that is not installed
         self._topics[stream] += 1
@@ -140,7 +139,7 @@ class Sensors:
         that is more frequent and lies in the queue beside theirs.
         """
         if self._node.is_active:
-            self._take({index: self._plain(self._queues[index][0], msg)})
+            self._take({index: self._plain(*self._queues[index], msg)})
 
     def _take(self, first: dict[int, list[tuple[str, Any]]]) -> int:
         """Use all that has arrived, ``first`` of each queue before the rest; how many.
@@ -168,8 +167,10 @@ class Sensors:
             self._handle(observation)
 
     def problems(self) -> tuple[str, ...]:
-        """Sensors of which there is one, and that several nodes publish."""
-        out = []
+        """Sensors in an assumed place, and those that several nodes publish where one is meant."""
+        guessed = () if any(self._p.node.laser_pose) else sorted(self._assumed)
+        out = [f'no transform to {name!r}: it is taken to sit at base_frame' for name in guessed]
+        out += _in_one_frame(self._frame_of)
         for stream, listener in self._queues:
             if stream not in (*PLACED, TF):
                 found = self._node.publishers_of(listener.topic_name)
@@ -203,10 +204,12 @@ class Sensors:
     def _taken(self, index: int) -> list[tuple[str, Any]]:
         """Everything in a queue, in order of arrival."""
         stream, listener = self._queues[index]
-        return [item for msg in listener.drained() for item in self._plain(stream, msg)]
+        return [item for msg in listener.drained() for item in self._plain(stream, listener, msg)]
 
-    def _plain(self, stream: str, msg: Any) -> list[tuple[str, Any]]:
+    def _plain(self, stream: str, listener: Listener, msg: Any) -> list[tuple[str, Any]]:
         """The message, of a device as a PoseArray; nothing where it cannot be used."""
+        if stream == 'scan':
+            self._frame_of[listener.topic_name] = frame(msg.header.frame_id)[:100]
         if not is_device(msg):
             return [(stream, msg)]
         most = self._p.node.max_beams
@@ -303,6 +306,18 @@ class Sensors:
         self._tell_of_refused()
         for observation in observations:
             self._handle(observation)
+
+
+def _in_one_frame(frame_of: dict[str, str]) -> list[str]:
+    """Problems of several lasers, by topic, that say they are in one place."""
+    by_frame = defaultdict[str, list[str]](list)
+    for topic, name in sorted(frame_of.items()):
+        by_frame[name].append(topic)
+    return [
+        f'scans of {" and ".join(topics)} are all in the frame {name!r}: each laser needs its own'
+        for name, topics in by_frame.items()
+        if len(topics) > 1
+    ]
 
 
 def _others(node: Any, kinds: dict[str, str], known: set[str]) -> str:

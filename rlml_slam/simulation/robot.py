@@ -19,6 +19,11 @@ SECOND = 1_000_000_000
 Command = tuple[float, float]
 
 
+def there_and_back(route: Array) -> Array:
+    """A route (n, 2) that ends where it begins: one that does not is driven back as well."""
+    return route if np.allclose(route[0], route[-1]) else np.vstack([route, route[-2::-1]])
+
+
 class RouteFollower:
     """Pure pursuit of a polyline: an arc through the point ``lookahead`` ahead on the route."""
 

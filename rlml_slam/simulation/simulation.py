@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rlml_slam import se2
 from rlml_slam.params import SimulatorParameters
 from rlml_slam.se2 import Array
-from rlml_slam.simulation.robot import SECOND, RouteFollower, Track, approach
+from rlml_slam.simulation.robot import SECOND, RouteFollower, Track, approach, there_and_back
 from rlml_slam.simulation.sensors import GyroSensor, LaserSensor, MarkerSensor, WheelSensor
 from rlml_slam.simulation.world import World
 from rlml_slam.types import Detections, Imu, Odometry, Scan
@@ -63,7 +63,8 @@ class Simulation:
         self.parameters = p
         self._seed = p.node.seed if seed is None else seed
         self._track = Track(START, world.start, STEP)
-        self._route = RouteFollower(world.route, p.node)
+        route = there_and_back(world.route) if p.node.repeat else world.route
+        self._route = RouteFollower(route, p.node)
         self._slide = self._generator('lateral')
         self._faults = {
             kind: self._generator(f'transport/{kind.__name__}')

@@ -121,6 +121,12 @@ def test_folder_that_cannot_be_written_is_named(tmp_path):
         make_folder(tmp_path / 'file')
 
 
+def test_results_do_not_go_into_a_bag(tmp_path):
+    (tmp_path / 'metadata.yaml').write_text('')
+    with pytest.raises(MapError, match='is a bag: name another folder'):
+        make_folder(tmp_path)
+
+
 def test_spells_are_the_ones_that_were_not_ok():
     run = made_run()
     assert list(bad_spells(run)) == [('20.0 to 29.0 s', 'DEGRADED: saw 0 of 4')]

@@ -75,6 +75,8 @@ def test_services_answer_in_words_and_refuse_in_words(live, command, tmp_path):
         (['reset', 'hall'], 'reset takes no argument'),
         (['set_localization_mode', 'yes'], "'yes' is neither on nor off"),
         (['initialpose', '1,2'], "'1,2' is no x,y,angle [m, degrees]"),
+        (['initialpose', '-1,2'], "'-1,2' is no x,y,angle [m, degrees]"),
+        (['initialpose', '-.5,nan,3'], "'-.5,nan,3' is no x,y,angle [m, degrees]"),
         (['initialpose', '1,nan,3'], "'1,nan,3' is no x,y,angle [m, degrees]"),
     ],
 )
@@ -170,4 +172,4 @@ def test_map_is_saved_under_another_name(live, command, tmp_path):
     assert 'is not inside of map_directory' in err
     code, out, err = command('save_map', 'second')
     assert 'there is no map yet' in err
-    assert node.params.node.map_file_name == 'second'
+    assert node.params.node.map_file_name == 'map'  # a refused service changes nothing

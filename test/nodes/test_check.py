@@ -28,10 +28,15 @@ PLACE = np.array([0.2, 0.0, 0.0])
 class Robot:
     """Publishes a part of the sample drive as it was recorded; ``edit`` may change messages."""
 
-    def __init__(self, live, edit=lambda topic, msg: [msg], place=PLACE, odom_qos=10):
+    def __init__(
+        self, live, edit=lambda topic, msg: [msg], place=PLACE, odom_qos=10, namespace=None
+    ):
         from rclpy.node import Node
 
-        self.node = live.add(Node('robot', context=live.context))
+        words = ['--ros-args', '-r', '/tf:=tf', '-r', '/tf_static:=tf_static']
+        self.node = live.add(
+            Node('robot', context=live.context, namespace=namespace, cli_args=namespace and words)
+        )
         self.edit, self.place = edit, place
         self.publishers = {
             '/scan': self.node.create_publisher(
@@ -94,7 +99,8 @@ def checked(live, monkeypatch, capsys):
         robots.append(Robot(live, **robot))
         for add in more:
             add(robots[-1].node)
-        code = main(['check', '--seconds', str(SECONDS), '--json'])
+        words = ['--namespace', robot['namespace']] if 'namespace' in robot else []
+        code = main(['check', '--seconds', str(SECONDS), '--json', *words])
         found = json.loads(capsys.readouterr().out)
         wrong = [f for f in found['findings'] if f['is_wrong']]
         assert code == (1 if wrong else 0)
@@ -118,6 +124,28 @@ def test_nothing_is_wrong_with_a_sound_robot(checked):
     assert topics['/scan']['frames'] == ['laser']
     assert topics['/tf']['publishers'] == ['/robot']
     assert -50 < topics['/odom']['age_ms'] < 200
+
+
+def test_nothing_is_wrong_with_a_robot_in_a_namespace_with_a_clock_of_its_own(checked):
+    """As simulators publish them where several robots run: /tf and /clock remapped into it."""
+    clock = []
+
+    def late(topic, msg):
+        if topic != '/tf_static':
+            header = msg.transforms[0].header if topic == '/tf' else msg.header
+            header.stamp.sec -= 1_000_000_000
+            time_msg = rclpy_class('rosgraph_msgs/msg/Clock')()
+            time_msg.clock.sec, time_msg.clock.nanosec = header.stamp.sec, header.stamp.nanosec
+            clock[0].publish(time_msg)
+        return [msg]
+
+    def add(node):
+        clock.append(node.create_publisher(rclpy_class('rosgraph_msgs/msg/Clock'), 'clock', 10))
+
+    found, wrong = checked(add, edit=late, namespace='r1')
+    assert wrong == []
+    topics = {t['topic']: t for t in found['topics']}
+    assert abs(topics['/r1/odom']['age_ms']) < 1000
 
 
 def test_no_transform_at_all(checked):

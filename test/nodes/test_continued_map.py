@@ -107,8 +107,10 @@ def drive_on(mapper, ear):
 def test_mapping_goes_on_where_the_robot_is_found(mapped, make):
     mapper, ear = make(continue_map=True)
     assert entering(mapper)
+    assert 'not yet in the saved map' in mapper.problems()[0]
     before = len(mapper.back_end.keyframes)
     front = drive_on(mapper, ear)
+    assert mapper.problems() == ()
     assert front.begun == 2
     assert not entering(mapper)
     assert len(mapper.back_end.keyframes) > before + 5

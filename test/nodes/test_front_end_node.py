@@ -446,6 +446,24 @@ def test_tf_static_tells_the_place_of_the_laser(live):
     np.testing.assert_allclose(node.sensors.extrinsics.pose('base_link', 'laser'), [0.3, 0.1, 0.0])
 
 
+@pytest.mark.parametrize(('given', 'expected'), [([0.0, 0.0, 0.0], 1), ([0.2, 0.0, 0.0], 0)])
+def test_place_of_the_laser_that_nobody_gave_makes_health_degraded(live, given, expected):
+    node = live.start(FrontEndNode, laser_pose=given)
+    node.sensors._has_tf = node.sensors._waits = True
+    feed(node, 4.0)
+    assert used(node, 'scan') > 10
+    node.health.publish()
+    found = [p for p in node.problems() if "no transform to 'laser'" in p]
+    assert len(found) == expected
+    assert (node.health.health().level is Level.DEGRADED) == bool(expected)
+    place = encode.transform(make, SECOND, ('base_link', 'laser'), np.array(given))
+    node.sensors.extrinsics.add(decode.transforms(place))  # where it was taken to be
+    for stream, msg in room(['/scan', '/odom'], seconds=4.5):
+        if decode.stamp(msg, stream) > node.last.stamp:
+            node.sensors.add(stream, msg)
+    assert not any('no transform' in p for p in node.problems())
+
+
 def test_scan_in_an_unknown_frame_holds_up_nothing_and_never_gets_laser_pose(live):
     """Neither as the first message of all, nor later."""
     node = live.start(FrontEndNode, laser_pose=[5.0, 5.0, 0.0])
@@ -550,6 +568,21 @@ def test_scans_do_not_overtake_odometry_after_a_pause(live, node):
     live.spin_until(lambda: used(node, 'scan') >= sent - 1)
     assert used(node, 'scan', 'waited_out') == used(node, 'scan', 'late') == 0
     assert node.last.observation.motion.known
+
+
+@pytest.mark.parametrize(('second', 'expected'), [('laser', 1), ('rear', 0)])
+def test_two_lidars_in_one_frame_are_a_problem(live, second, expected):
+    node = live.start(FrontEndNode, scan_topics=['front', 'rear/scan'])
+    node.sensors.stop_waiting()
+    for stream, msg in room(['/scan'], seconds=1.0):
+        assert stream == 'scan'
+        node.sensors.receive(0, msg)
+        other = copy.deepcopy(msg)
+        other.header.frame_id = second
+        node.sensors.receive(1, other)
+    found = [p for p in node.problems() if "all in the frame 'laser'" in p]
+    assert len(found) == expected
+    assert not found or '/front and /rear/scan' in found[0]
 
 
 def test_several_lidars_answer_each_on_their_own(live):

@@ -48,6 +48,17 @@ def test_health_is_there_before_the_first_scan(live, node):
     assert live.heard[HEALTH][0].message == 'no input yet'
 
 
+def test_input_that_is_refused_is_named_where_there_is_no_other(live, node):
+    for _, msg in room(['/scan'], seconds=1.0):
+        msg.angle_increment = 0.0
+        node.sensors.add('scan', msg)
+    assert node.last is None
+    first, why = node.health.health().reasons
+    assert first == 'no input yet'
+    assert why.startswith('not used: ')
+    assert 'scan' in why
+
+
 def test_each_scan_has_its_health_at_once(live, node):
     poses = 0
     for stream, msg in room(('/scan', '/odom'), seconds=3.0):

@@ -136,6 +136,23 @@ def test_a_route_of_one_point_is_a_robot_that_stands():
     np.testing.assert_allclose(last.T_map_base, 0.0, atol=1e-12)
 
 
+def test_a_repeated_route_that_is_not_closed_is_driven_back():
+    """Not straight to its beginning, where something may stand in between."""
+    world = parse_world('start: [0, 0, 0]\nroute: [[0, 0], [3, 0], [3, 2]]', 'w')
+    simulation = Simulation(world, SimulatorParameters(node=Simulator(repeat=True)))
+    path = []
+    for _ in range(6000):
+        simulation._track.advance()
+        simulation._steer()
+        path.append(simulation._track.pose[:2])
+    path = np.array(path)
+    off = np.minimum(np.abs(path[:, 1]), np.abs(path[:, 0] - 3.0))
+    assert off.max() < 0.4  # it cuts the corner
+    ends = np.hypot(*(path - [3.0, 2.0]).T) < 0.6, np.hypot(*path.T) < 0.6
+    arrivals = [int((np.diff(end.astype(int)) == 1).sum()) for end in ends]
+    assert min(arrivals) >= 2
+
+
 def test_a_repeated_route_has_no_end():
     world = parse_world('start: [0, 0, 0]\nroute: [[0, 0], [1, 0], [1, 1], [0, 0]]', 'w')
     node = Simulator(repeat=True, still_time=0.0)

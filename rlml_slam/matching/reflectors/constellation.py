@@ -246,7 +246,10 @@ class _Search:
             if strange:
                 why = f'no pose explains the detections: only {seen}'
                 return Constellation(Verdict.IMPOSSIBLE, why, chance=chance)
-            why = f'{seen}, as many as chance gives ({chance:.2g} poses expected)'
+            why = (
+                f'{seen}, as many as chance gives: {chance:.2g} wrong poses are expected, more '
+                f'than {p.false_positive_probability:.2g}'
+            )
             return Constellation(Verdict.AMBIGUOUS, why, tuple(found), chance)
         odds = np.exp([c.score - best.score for c in found])  # against the best one
         close = [c.support >= best.support - 1 for c in found]

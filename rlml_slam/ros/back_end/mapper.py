@@ -260,5 +260,11 @@ class Mapper:
         }
 
     def problems(self) -> tuple[str, ...]:
-        """What /diagnostics have to say of the files."""
-        return (self.journal.problem,) if self.journal.problem else ()
+        """What /diagnostics have to say of the files, and of the robot's place in them."""
+        unwritten = (self.journal.problem,) if self.journal.problem else ()
+        return (*unwritten, *self.entry_problems())
+
+    def entry_problems(self) -> tuple[str, ...]:
+        """Why poses are not in the saved map that is to be continued."""
+        entry = self.system.entry
+        return () if entry is None else (f'not yet in the saved map: {entry.why}',)

@@ -19,6 +19,7 @@ from rlml_slam.estimation.correction import Correction, ReferencePose
 from rlml_slam.estimation.health import HealthInputs, HealthMonitor, ScanEvidence
 from rlml_slam.estimation.kidnapping_detection import KidnappingDetection
 from rlml_slam.estimation.landmark_tracks import LandmarkTracks
+from rlml_slam.estimation.laser_check import LaserCheck
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
@@ -53,7 +54,7 @@ class FrontEnd:
         self._scans = ScanTerm(self._p, self.state, self._motion)
         self._map = MapLocalization(self._p)
         self._correction = Correction(np.zeros(3))
-        self.health = HealthMonitor(self._p.health)
+        self.health, self._laser = HealthMonitor(self._p.health), LaserCheck()
         self._jumped, self._is_settled = False, True
         self._carried = CarriedRobot()
         self._settling = 0.0  # [s] spent in settle() since the last frame
@@ -66,6 +67,7 @@ class FrontEnd:
         were ambiguous or outside their gates with the prior; each detection is used once.
         """
         began = self._finish_last_step()
+        self._laser.add_motion(observation.motion)
         observation = self._motion.likeliest(observation, self._scans.fit)
         self._motion.predict(self.state, observation)
         observation, sweep = self._scans.deskew(observation)
@@ -169,6 +171,7 @@ class FrontEnd:
                 seen=seen,
                 maps=self._map.saved is None,
                 position=pose[:2],
+                mounting=self._laser.fault(self.state.pose),
             ),
         )
 
@@ -183,10 +186,8 @@ class FrontEnd:
         return Frame(
             observation.stamp, observation, pose, cov, T_map_base, cov_map,
             matches.keys, matches.status, health,
-            scan_score=scan.score,
-            scan_used=scan.used,
+            scan_score=scan.score, scan_used=scan.used, iterations=scan.iterations,
             chi2=float(matches.distance2[matches.status == USED].sum()),
-            iterations=scan.iterations,
             wall_ms=(time.perf_counter() - began) * 1e3,
             unconfirmed=contradicted or self._map.confirmation.is_pending,
             jumped=jumped,

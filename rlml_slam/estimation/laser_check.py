@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the pose moves as odometry does: a laser whose mounting is not the one that it is given.
+
+Scans that are moved by a wrong transform still fit each other, so that their map and the pose in
+it look right: behind a laser that faces backwards, the robot drives backwards; below one that is
+upside down, it turns the other way.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable
+
+import numpy as np
+
+from rlml_slam import se2
+from rlml_slam.se2 import Array
+from rlml_slam.types import Motion
+
+TRAVEL, TURN = 1.0, 0.5  # [m], [rad] of odometry, at which a window ends
+MIN_TRAVEL, MIN_TURN = 0.5, 0.25  # [m], [rad] that are compared
+STANDS = 0.3  # share of the travel below which wheels may have slipped, which is no such fault
+AWAY = math.radians(60.0)  # between the travel of the pose and of odometry
+AGAINST = -0.5  # turn of the pose, as a share of that of odometry
+MEMORY, ENOUGH, MOST = 5, 3, 0.8  # windows: remembered, needed, and the share that shows a fault
+
+
+class LaserCheck:
+    """Compares the pose with odometry, window by window."""
+
+    def __init__(self) -> None:
+        self._way = np.zeros(3)  # of odometry since the beginning of the window
+        self._begin: Array | None = None  # pose (3,) there
+        # by window: angle [rad] between the travels; turn of the pose as a share of odometry's
+        self._angles: deque[float] = deque(maxlen=MEMORY)
+        self._shares: deque[float] = deque(maxlen=MEMORY)
+
+    def add_motion(self, motion: Motion) -> None:
+        """What odometry measured since the last pose."""
+        if motion.known:
+            self._way = se2.compose(self._way, motion.delta)
+        else:
+            self._begin = None
+
+    def fault(self, pose: Array) -> str:
+        """What is wrong by all windows until now; the pose (3,) is that of the same moment."""
+        if (
+            self._begin is None
+            or math.hypot(*self._way[:2]) >= TRAVEL
+            or abs(self._way[2]) >= TURN
+        ):
+            if self._begin is not None:
+                self._compare(se2.between(self._begin, pose))
+            self._begin, self._way = pose.copy(), np.zeros(3)
+        if _most(abs(angle) > AWAY for angle in self._angles):
+            angle = math.degrees(float(np.median(np.abs(self._angles))))
+            return (
+                f'the scans move {angle:.0f} deg away from where odometry goes: '
+                'does the laser look where its transform says?'
+            )
+        if _most(share < AGAINST for share in self._shares):
+            return (
+                'the scans turn against odometry: is the laser upside down, or odometry mirrored?'
+            )
+        return ''
+
+    def _compare(self, moved: Array) -> None:
+        (x, y, turn), way = moved.tolist(), math.hypot(*self._way[:2])
+        if way >= MIN_TRAVEL and math.hypot(x, y) >= STANDS * way:
+            self._angles.append(
+                float(se2.wrap(math.atan2(y, x) - math.atan2(self._way[1], self._way[0])))
+            )
+        if abs(self._way[2]) >= MIN_TURN:
+            self._shares.append(turn / float(self._way[2]))
+
+
+def _most(shown: Iterable[bool]) -> bool:
+    """Whether enough windows show a fault."""
+    found = list(shown)
+    return len(found) >= ENOUGH and sum(found) >= MOST * len(found)
