@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import re
 import time
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rlml_slam.cli.support.service_call import PATIENCE, answer_of, asking, message_of
+from rlml_slam.cli.support.service_call import PATIENCE, answer_of, asking, client_of, message_of
 from rlml_slam.errors import InputError
 
 POSE = 'initialpose'
@@ -66,10 +67,13 @@ def run(args: argparse.Namespace) -> int:
     kind = getattr(importlib.import_module(f'{package}.srv'), name)
     with asking() as asker:
         renames = args.service == 'save_map' and args.argument is not None
+        if renames:
+            client_of(asker, node, args.service, kind)  # no other name where nothing is saved
         before = rename(asker, node, args.argument) if renames else ''
         answer = answer_of(asker, node, args.service, kind, fields)
         if renames and not answer.success:
-            rename(asker, node, before)
+            with contextlib.suppress(InputError):  # what it was refused for is said below
+                rename(asker, node, before)
         if name != 'LoadMap':
             print(message_of(answer))
         elif answer.result != kind.Response.RESULT_SUCCESS:
@@ -114,12 +118,12 @@ def rename(asker: Any, node: str, name: str) -> str:
     from rclpy.parameter import Parameter
 
     asked = {'names': ['map_file_name']}
-    before = answer_of(asker, node, 'get_parameters', GetParameters, asked).values[0]
+    before = answer_of(asker, node, 'get_parameters', GetParameters, asked).values
     given = [Parameter('map_file_name', value=name).to_parameter_msg()]
     answer = answer_of(asker, node, 'set_parameters', SetParameters, {'parameters': given})
     if not answer.results[0].successful:
         raise InputError(answer.results[0].reason)
-    return str(before.string_value)
+    return str(before[0].string_value)
 
 
 def value_of(service: str, field: str, argument: str | None) -> str | bool:

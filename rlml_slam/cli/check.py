@@ -6,8 +6,9 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -87,9 +88,8 @@ def listen(
     from rlml_slam.ros.message_guard import LARGE, Listener
     from rlml_slam.ros.sensors import MOTION, SENSOR
 
-    own = deque[int](
-        maxlen=1
-    )  # the time of a simulator in the namespace, whose /clock is remapped
+    own = [0]  # [ns] time of a simulator in the namespace, whose /clock is remapped
+    remapped = set[str]()  # streams of the namespace, which /tf of other robots are not
     keep, latched = [], QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     for stream, (topic, kind) in topics.items():
         found = rclpy_class(kind)
@@ -97,16 +97,20 @@ def listen(
             continue
         qos = latched if stream == STATIC else SENSOR if stream == 'scan' else MOTION
 
-        def take(msg: Any, stream: str = stream) -> None:
-            simulated = own[-1] if own else node.get_clock().now().nanoseconds
+        def take(msg: Any, stream: str = stream, is_own: bool = False) -> None:
+            if is_own:
+                remapped.add(stream)
+            elif stream in remapped:
+                return
+            simulated = own[0] or node.get_clock().now().nanoseconds
             setup.hear(stream, msg, time.monotonic(), simulated)
 
         keep.append(Listener(node, found, topic, take, qos, LARGE))
         if stream in ('tf', STATIC) and node.get_namespace() != '/':  # where it is remapped
-            keep.append(Listener(node, found, stream, take, qos, LARGE))
+            keep.append(Listener(node, found, stream, partial(take, is_own=True), qos, LARGE))
 
     def keep_time(msg: Any) -> None:
-        own.append(msg.clock.sec * 10**9 + msg.clock.nanosec)
+        own[0] = msg.clock.sec * 10**9 + msg.clock.nanosec
 
     if node.get_namespace() != '/':
         keep.append(Listener(node, rclpy_class(CLOCK), 'clock', keep_time, SENSOR, LARGE))

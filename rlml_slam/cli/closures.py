@@ -80,7 +80,7 @@ def read(folder: Path) -> list[dict[str, str]]:
     try:
         return parse(path.read_text(encoding='utf-8'), str(path))
     except (OSError, UnicodeDecodeError) as e:
-        raise MapError(f'{path}: cannot be read: {e}') from e
+        raise MapError(f'{path}: cannot be read: {getattr(e, "strerror", None) or e}') from e
 
 
 def parse(table: str, name: str) -> list[dict[str, str]]:

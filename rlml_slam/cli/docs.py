@@ -52,7 +52,9 @@ def _read(path: Path) -> str:
     try:
         return path.read_text(encoding='utf-8')
     except (OSError, UnicodeDecodeError) as e:
-        raise FileFormatError(f'{path}: cannot be read: {e}') from e
+        raise FileFormatError(
+            f'{path}: cannot be read: {getattr(e, "strerror", None) or e}'
+        ) from e
 
 
 def filled(texts: Mapping[Path, str]) -> dict[Path, str]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the pose moves as odometry does: a laser whose mounting is not the one that it is given.
+"""Whether the pose moves as odometry does: a misplaced laser, odometry that stands still.
 
 Scans that are moved by a wrong transform still fit each other, so that their map and the pose in
 it look right: behind a laser that faces backwards, the robot drives backwards; below one that is
@@ -15,14 +15,18 @@ from collections.abc import Iterable
 import numpy as np
 
 from rlml_slam import se2
+from rlml_slam.motion import SECOND
 from rlml_slam.se2 import Array
 from rlml_slam.types import Motion
 
-TRAVEL, TURN = 1.0, 0.5  # [m], [rad] of odometry, at which a window ends
+TRAVEL, TURN = 1.0, 0.5  # [m] of odometry or the pose, [rad] of odometry: there a window ends
 MIN_TRAVEL, MIN_TURN = 0.5, 0.25  # [m], [rad] that are compared
 STANDS = 0.3  # share of the travel below which wheels may have slipped, which is no such fault
+FROZEN = 0.1  # travel of odometry, as a share of that of the pose, below which it stands still
 AWAY = math.radians(60.0)  # between the travel of the pose and of odometry
 AGAINST = -0.5  # turn of the pose, as a share of that of odometry
+HALF_TURN = 2.5  # [rad] of odometry in a window, beyond which turns cannot be compared
+LONGEST = 20 * SECOND  # [ns] of a window: in a longer one the bias of a gyro counts
 MEMORY, ENOUGH, MOST = 5, 3, 0.8  # windows: remembered, needed, and the share that shows a fault
 
 
@@ -32,37 +36,40 @@ class LaserCheck:
     def __init__(self) -> None:
         self._way = np.zeros(3)  # of odometry since the beginning of the window
         self._begin: Array | None = None  # pose (3,) there
+        self._since = self._stamp = 0  # [ns] of that pose and of the newest motion
         # by window: angle [rad] between the travels; turn of the pose as a share of odometry's
         self._angles: deque[float] = deque(maxlen=MEMORY)
         self._shares: deque[float] = deque(maxlen=MEMORY)
+        self._travels: deque[float] = deque(maxlen=MEMORY)  # of odometry, as a share of the pose's
 
-    def add_motion(self, motion: Motion) -> None:
-        """What odometry measured since the last pose."""
-        if motion.known:
+    def add_motion(self, stamp: int, motion: Motion) -> None:
+        """What odometry measured since the last pose, until a stamp [ns]."""
+        self._stamp = stamp
+        if motion.known and stamp - self._since <= LONGEST:
             self._way = se2.compose(self._way, motion.delta)
         else:
             self._begin = None
 
     def fault(self, pose: Array) -> str:
         """What is wrong by all windows until now; the pose (3,) is that of the same moment."""
-        if (
-            self._begin is None
-            or math.hypot(*self._way[:2]) >= TRAVEL
-            or abs(self._way[2]) >= TURN
-        ):
+        moved = np.zeros(3) if self._begin is None else se2.between(self._begin, pose)
+        travel = max(math.hypot(*self._way[:2]), math.hypot(*moved[:2]))
+        if self._begin is None or travel >= TRAVEL or abs(self._way[2]) >= TURN:
             if self._begin is not None:
-                self._compare(se2.between(self._begin, pose))
-            self._begin, self._way = pose.copy(), np.zeros(3)
+                self._compare(moved)
+            self._begin, self._way, self._since = pose.copy(), np.zeros(3), self._stamp
         if _most(abs(angle) > AWAY for angle in self._angles):
             angle = math.degrees(float(np.median(np.abs(self._angles))))
             return (
-                f'the scans move {angle:.0f} deg away from where odometry goes: '
+                f'the pose moves {angle:.0f} deg away from where odometry goes: '
                 'does the laser look where its transform says?'
             )
         if _most(share < AGAINST for share in self._shares):
             return (
-                'the scans turn against odometry: is the laser upside down, or odometry mirrored?'
+                'the pose turns against odometry: is the laser upside down, or odometry mirrored?'
             )
+        if _most(share < FROZEN for share in self._travels):
+            return 'the pose moves while odometry stands still'
         return ''
 
     def _compare(self, moved: Array) -> None:
@@ -71,7 +78,9 @@ class LaserCheck:
             self._angles.append(
                 float(se2.wrap(math.atan2(y, x) - math.atan2(self._way[1], self._way[0])))
             )
-        if abs(self._way[2]) >= MIN_TURN:
+        if math.hypot(x, y) >= MIN_TRAVEL:
+            self._travels.append(way / math.hypot(x, y))
+        if MIN_TURN <= abs(self._way[2]) <= HALF_TURN:
             self._shares.append(turn / float(self._way[2]))
 
 

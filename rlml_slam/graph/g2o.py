@@ -147,7 +147,9 @@ def _text(path: Path) -> str:
         message = f'{path}: no g2o or TORO file, which is ASCII: byte {error.start} is not'
         raise FileFormatError(message) from None
     except (ValueError, OSError, EOFError, zlib.error) as error:
-        raise FileFormatError(f'{path}: cannot be read: {error}') from None
+        raise FileFormatError(
+            f'{path}: cannot be read: {getattr(error, "strerror", None) or error}'
+        ) from None
 
 
 def _parse(path: Path) -> tuple[dict[str, _Lines], list[tuple[int, int]], Counter[str]]:

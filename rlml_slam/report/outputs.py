@@ -35,7 +35,7 @@ def write_outputs(
     reflector_states.csv, sightings.rlml and closures.csv depend on the data alone: two replays
     give the same bytes. Without ``report`` there is no report.html. What this run does not write
     is of an earlier one, and set aside as ``.previous``, but for ``known``, the map that the run
-    localized in. Raises MapError if the folder cannot be written.
+    localized in, whose files stay as they are. Raises MapError if the folder cannot be written.
     """
     folder = make_folder(folder)
     is_written = {
@@ -49,8 +49,9 @@ def write_outputs(
     write_tum(folder / 'trajectory.tum', run.trajectory)
     write_tum(folder / 'front_end.tum', run.frames.trajectory())
     write_atomically(folder / HEALTH, health_table(run.frames).encode())
-    save(run.grid if run.grid is not None else unknown_grid(run.trajectory), folder / 'map')
-    reflector_file.save(run.reflectors, folder / 'reflectors.csv')
+    if not is_used:  # else these are of the map that the run localized in
+        save(run.grid if run.grid is not None else unknown_grid(run.trajectory), folder / 'map')
+        reflector_file.save(run.reflectors, folder / 'reflectors.csv')
     if run.stored is not None:
         map_container.write(folder / 'map.rlml', run.stored)
     if len(run.frames.sightings):
@@ -77,7 +78,7 @@ def make_folder(folder: str | Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise MapError(f'{folder}: cannot be made: {e.strerror}') from e
-    if (folder / 'metadata.yaml').exists():
+    if (folder / 'metadata.yaml').exists() or any(folder.glob('*.db3')):
         raise MapError(f'{folder} is a bag: name another folder for what is written')
     if not os.access(folder, os.W_OK):
         raise MapError(f'{folder}: cannot be written')

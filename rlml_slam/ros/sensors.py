@@ -168,7 +168,8 @@ class Sensors:
 
     def problems(self) -> tuple[str, ...]:
         """Sensors in an assumed place, and those that several nodes publish where one is meant."""
-        guessed = () if any(self._p.node.laser_pose) else sorted(self._assumed)
+        is_given = any(self._p.node.laser_pose) or self._p.node.laser_upside_down
+        guessed = () if is_given else sorted(self._assumed.intersection(self._frame_of.values()))
         out = [f'no transform to {name!r}: it is taken to sit at base_frame' for name in guessed]
         out += _in_one_frame(self._frame_of)
         for stream, listener in self._queues:

@@ -21,7 +21,8 @@ Command = tuple[float, float]
 
 def there_and_back(route: Array) -> Array:
     """A route (n, 2) that ends where it begins: one that does not is driven back as well."""
-    return route if np.allclose(route[0], route[-1]) else np.vstack([route, route[-2::-1]])
+    is_closed = math.dist(route[0], route[-1]) < 0.1
+    return route if is_closed else np.vstack([route, route[-2::-1]])
 
 
 class RouteFollower:

@@ -97,6 +97,12 @@ def test_mapping_goes_on_with_it(folder, tmp_path, capsys, alone):
     assert errors(slam.trajectory()[1], AGAIN)[0].max() < 0.06
 
 
+def test_name_of_a_whole_map_has_its_ending(folder, tmp_path, capsys):
+    assert main(['map', 'import', str(folder), str(tmp_path / 'hall')]) == 1
+    assert 'the name of a whole map ends with .rlml' in capsys.readouterr().err
+    assert not (tmp_path / 'hall').exists()
+
+
 def test_keyframes_of_another_graph_are_refused(folder):
     (folder / 'keyframes.tum').write_text('1.0 0 0 0 0 0 0 1\n')
     with pytest.raises(FileFormatError, match=r'keyframes.tum has 1 poses, graph.g2o \d+'):

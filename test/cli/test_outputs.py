@@ -109,6 +109,8 @@ def test_files_of_an_earlier_run_are_set_aside(tmp_path):
     for known in (tmp_path / 'map.rlml', tmp_path, tmp_path / 'map.yaml'):
         write_outputs(run, tmp_path, report=False, known=known)
         assert (tmp_path / 'map.rlml').exists()  # the run localized in it
+        assert not (tmp_path / 'map.pgm').exists()  # nor is its image or its table another one
+        assert not (tmp_path / 'reflectors.csv').exists()
     write_outputs(run, tmp_path, report=False)
     for name in others:
         assert not (tmp_path / name).exists()

@@ -8,6 +8,7 @@ from rlml_slam import se2
 from rlml_slam.estimation.laser_check import LaserCheck
 from rlml_slam.types import Motion
 
+FRAME = 100_000_000  # [ns]
 STEP = np.array([0.1, 0.0, 0.0])
 MIRROR = np.array([1.0, -1.0, -1.0])
 
@@ -16,8 +17,8 @@ def fault_of(steps, seen, known=True):
     """The fault after poses that move by ``seen(step)`` where odometry measures ``step``."""
     check, pose = LaserCheck(), np.zeros(3)
     check.fault(pose)
-    for step in steps:
-        check.add_motion(Motion(np.array(step), 1e-4 * np.eye(3), known))
+    for k, step in enumerate(steps):
+        check.add_motion((k + 1) * FRAME, Motion(np.array(step), 1e-4 * np.eye(3), known))
         pose = se2.compose(pose, seen(np.array(step)))
         found = check.fault(pose)
     return found
@@ -38,7 +39,7 @@ def test_pose_that_moves_elsewhere_than_odometry_is_a_fault_after_three_metres(a
 
 
 def test_pose_that_turns_against_odometry_is_a_fault():
-    assert 'turn against odometry' in fault_of(curve(200), lambda step: step * MIRROR)
+    assert 'turns against odometry' in fault_of(curve(200), lambda step: step * MIRROR)
 
 
 @pytest.mark.parametrize(
@@ -47,11 +48,60 @@ def test_pose_that_turns_against_odometry_is_a_fault():
         lambda step: step,
         lambda step: step * [1.3, 1.0, 0.6],  # wheels of another size
         lambda step: step * [0.1, 1.0, 0.0],  # wheels that slip
+        lambda step: np.array([0.0, 0.2 * step[0], 0.0]),  # and the floor tilts
+        lambda step: step * [1.0, 1.0, -0.4],  # turns on ice
         lambda step: step + np.array([0.0, 0.04, 0.01]),  # sideways
     ],
 )
 def test_poor_odometry_is_no_such_fault(seen):
     assert fault_of(curve(300), seen) == ''
+
+
+def test_odometry_that_stands_still_is_a_fault():
+    moves = fault_of([np.zeros(3)] * 25, lambda step: STEP)
+    assert moves == ''
+    assert 'stands still' in fault_of([np.zeros(3)] * 45, lambda step: STEP)
+
+
+def drive(check, pose, steps):
+    """Poses that move by the second of each pair, where odometry measures the first; the fault."""
+    for step, moved, known in steps:
+        drive.stamp += FRAME
+        check.add_motion(drive.stamp, Motion(np.array(step), 1e-4 * np.eye(3), known))
+        pose = se2.compose(pose, np.array(moved))
+        found = check.fault(pose)
+    return pose, found
+
+
+drive.stamp = 0
+
+
+def test_window_ends_where_odometry_has_a_gap():
+    """Which the robot was carried through, backwards."""
+    steps = [(STEP, STEP, True)] * 6 + [(STEP, -20.0 * STEP, False)] + [(STEP, STEP, True)] * 2
+    assert drive(LaserCheck(), np.zeros(3), steps * 8)[1] == ''
+
+
+def test_two_bad_windows_of_five_are_no_fault():
+    good, bad = [(STEP, STEP, True)] * 10, [(STEP, -STEP, True)] * 10
+    assert drive(LaserCheck(), np.zeros(3), (good + bad + good + bad + good) * 3)[1] == ''
+
+
+def test_robot_that_only_turns_is_compared():
+    step = np.array([0.0, 0.0, 0.1])
+    assert 'turns against' in drive(LaserCheck(), np.zeros(3), [(step, -step, True)] * 25)[1]
+    assert drive(LaserCheck(), np.zeros(3), [(step, step, True)] * 60)[1] == ''
+
+
+def test_half_a_turn_in_one_step_is_not_compared():
+    steps = [((0.0, 0.0, 3.1), (0.0, 0.0, 3.2), True)] * 12
+    assert drive(LaserCheck(), np.zeros(3), steps)[1] == ''
+
+
+def test_bias_of_a_gyro_while_the_robot_stands_is_no_turn():
+    stands, turns = ((0.0, 0.0, -0.002), (0.0, 0.0, 0.0)), ((0.0, 0.0, 0.04), (0.0, 0.0, 0.042))
+    steps = ([(*stands, True)] * 400 + [(*turns, True)] * 10) * 6  # 40 s, and 0.4 rad
+    assert drive(LaserCheck(), np.zeros(3), steps)[1] == ''
 
 
 def test_what_odometry_did_not_measure_is_not_compared():
@@ -61,7 +111,7 @@ def test_what_odometry_did_not_measure_is_not_compared():
 def test_fault_is_forgotten_when_it_is_over():
     check, pose = LaserCheck(), np.zeros(3)
     for k in range(200):
-        check.add_motion(Motion(STEP, 1e-4 * np.eye(3)))
+        check.add_motion((k + 1) * FRAME, Motion(STEP, 1e-4 * np.eye(3)))
         pose = se2.compose(pose, -STEP if k < 60 else STEP)
         found = check.fault(pose)
         if k == 59:

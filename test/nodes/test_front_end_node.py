@@ -450,7 +450,9 @@ def test_tf_static_tells_the_place_of_the_laser(live):
 def test_place_of_the_laser_that_nobody_gave_makes_health_degraded(live, given, expected):
     node = live.start(FrontEndNode, laser_pose=given)
     node.sensors._has_tf = node.sensors._waits = True
-    feed(node, 4.0)
+    queues = {stream: k for k, (stream, _) in enumerate(node.sensors._queues)}
+    for stream, msg in room(['/scan', '/odom'], seconds=4.0):
+        node.sensors.receive(queues[stream], msg)
     assert used(node, 'scan') > 10
     node.health.publish()
     found = [p for p in node.problems() if "no transform to 'laser'" in p]
@@ -460,7 +462,22 @@ def test_place_of_the_laser_that_nobody_gave_makes_health_degraded(live, given, 
     node.sensors.extrinsics.add(decode.transforms(place))  # where it was taken to be
     for stream, msg in room(['/scan', '/odom'], seconds=4.5):
         if decode.stamp(msg, stream) > node.last.stamp:
-            node.sensors.add(stream, msg)
+            node.sensors.receive(queues[stream], msg)
+    assert not any('no transform' in p for p in node.problems())
+
+
+def test_place_that_was_assumed_is_no_problem_of_a_driver_that_names_another_frame(live):
+    node = live.start(FrontEndNode)
+    node.sensors._has_tf = node.sensors._waits = True
+    queues = {stream: k for k, (stream, _) in enumerate(node.sensors._queues)}
+    place = encode.transform(make, SECOND, ('base_link', 'mounted'), np.zeros(3))
+    for n, (stream, msg) in enumerate(room(['/scan', '/odom'], seconds=6.0)):
+        if n == 100:
+            assert any('no transform' in p for p in node.problems())
+            node.sensors.extrinsics.add(decode.transforms(place))
+        if n >= 100 and stream == 'scan':
+            msg.header.frame_id = 'mounted'
+        node.sensors.receive(queues[stream], msg)
     assert not any('no transform' in p for p in node.problems())
 
 

@@ -304,6 +304,7 @@ def test_sqlite_with_broken_definitions_of_messages_is_read(tmp_path):
 def test_folder_without_files_of_a_bag_is_named(tmp_path, metadata):
     if metadata is not None:
         (tmp_path / 'metadata.yaml').write_text(metadata)
+    (tmp_path / 'bag').mkdir()  # one is named, not the folder of all
     with pytest.raises(BagError, match='no bag: there is no recording in this folder'):
         BagReader(tmp_path)
 

@@ -151,7 +151,7 @@ def _is_world(name: str) -> bool:
     try:
         tree = parse_yaml(path.read_text(encoding='utf-8'), name)
     except (OSError, UnicodeDecodeError) as e:
-        raise MapError(f'{name}: cannot be read: {e}') from e
+        raise MapError(f'{name}: cannot be read: {getattr(e, "strerror", None) or e}') from e
     return isinstance(tree, dict) and 'image' not in tree
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rlml_slam import warm_up
 from rlml_slam.cli.map.map_info import contents
 from rlml_slam.datasets.tum import read_tum
-from rlml_slam.errors import FileFormatError, MapError
+from rlml_slam.errors import FileFormatError, InputError, MapError
 from rlml_slam.graph import Graph, read_graph
 from rlml_slam.maps import map_container, nav2_map, reflector_file
 from rlml_slam.maps.map_container import Content
@@ -47,6 +47,8 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read, save, and say what is in it."""
     warm_up.compile_loaded()
+    if args.file.suffix != '.rlml':
+        raise InputError(f'{args.file}: the name of a whole map ends with .rlml')
     content = import_map(args.folder)
     map_container.write(args.file, content)
     figures = contents(content)

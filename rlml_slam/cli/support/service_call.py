@@ -64,15 +64,21 @@ def answer_of(asker: Any, node: str, service: str, kind: Any, fields: dict[str, 
     """The response of a service of a running node; InputError where there is none."""
     import rclpy
 
-    node = '/' + node.strip('/')
-    client = asker.create_client(kind, f'{node}/{service}')
-    if not client.wait_for_service(PATIENCE):
-        raise InputError(_absent(asker, node, service))
+    client = client_of(asker, node, service, kind)
     future = client.call_async(kind.Request(**fields))
     rclpy.spin_until_future_complete(asker, future, timeout_sec=WORK)
     if not future.done() or future.result() is None:
         raise InputError(f'{node}: no answer within {WORK:.0f} s')
     return future.result()
+
+
+def client_of(asker: Any, node: str, service: str, kind: Any) -> Any:
+    """A client of a service of a running node; InputError where there is none."""
+    node = '/' + node.strip('/')
+    client = asker.create_client(kind, f'{node}/{service}')
+    if not client.wait_for_service(PATIENCE):
+        raise InputError(_absent(asker, node, service))
+    return client
 
 
 def _absent(asker: Any, node: str, service: str) -> str:

@@ -62,7 +62,8 @@ class BagReader:
         self._todays: dict[str, bool] = {}
         if not self.path.exists():
             raise BagError(f'{path}: no such bag')
-        if self.path.is_dir() and all(f.name == 'metadata.yaml' for f in self.path.iterdir()):
+        entries = self.path.iterdir() if self.path.is_dir() else [self.path]
+        if all(f.name == 'metadata.yaml' or f.is_dir() for f in entries):
             raise BagError(f'{path}: no bag: there is no recording in this folder')
         self.is_ros1 = _is_ros1(self.path)
         self._reader = self._open()

@@ -125,7 +125,9 @@ class StampCheck:
         """Accept a stamp if it is after ``limit`` [ns]; else count it as late."""
         newest = self._newest_of.get(stream)
         if limit is not None and stamp <= limit:
-            late = f'{stream} at {stamp} ns is late by {(limit - stamp) / SECOND:.3g} s'
+            by = (limit - stamp) / SECOND
+            digits = '.3g' if by < 1.0 else '.1f'
+            late = f'{stream} at {stamp} ns is late by {by:{digits}} s'
             self._inputs.count(stream, 'late', late)
             return False
         self._step[stream] = 0 if newest is None else max(stamp - newest, 0)

@@ -42,6 +42,7 @@ class FrontEnd:
 
     def __init__(self, params: Parameters) -> None:
         self._p = params
+        self._laser = LaserCheck()
         self.reset(np.array(params.node.map_start_pose), np.zeros((3, 3)))
 
     def reset(self, pose: Array, cov: Array) -> None:
@@ -54,10 +55,9 @@ class FrontEnd:
         self._scans = ScanTerm(self._p, self.state, self._motion)
         self._map = MapLocalization(self._p)
         self._correction = Correction(np.zeros(3))
-        self.health, self._laser = HealthMonitor(self._p.health), LaserCheck()
-        self._jumped, self._is_settled = False, True
+        self.health = HealthMonitor(self._p.health)
+        self._jumped, self._is_settled, self._settling = False, True, 0.0  # [s] in settle()
         self._carried = CarriedRobot()
-        self._settling = 0.0  # [s] spent in settle() since the last frame
 
     def process(self, observation: Observation) -> Frame:
         """Pose at the stamp of the observation; never raises for what was measured.
@@ -67,7 +67,7 @@ class FrontEnd:
         were ambiguous or outside their gates with the prior; each detection is used once.
         """
         began = self._finish_last_step()
-        self._laser.add_motion(observation.motion)
+        self._laser.add_motion(observation.stamp, observation.motion)
         observation = self._motion.likeliest(observation, self._scans.fit)
         self._motion.predict(self.state, observation)
         observation, sweep = self._scans.deskew(observation)

@@ -40,7 +40,7 @@ def healths():
     [
         ([0.0, 0.0, np.pi], lambda scan: scan, '180 deg away from where odometry goes'),
         ([0.0, 0.0, -np.pi / 2], lambda scan: scan, '90 deg away from where odometry goes'),
-        ([0.0, 0.0, 0.0], upside_down, 'the scans turn against odometry'),
+        ([0.0, 0.0, 0.0], upside_down, 'the pose turns against odometry'),
     ],
 )
 def test_health_is_degraded_and_says_why(healths, given, mounted, why):
