@@ -127,8 +127,8 @@ class StampCheck:
         if limit is not None and stamp <= limit:
             by = (limit - stamp) / SECOND
             digits = '.3g' if by < 1.0 else '.1f'
-            late = f'{stream} at {stamp} ns is late by {by:{digits}} s'
-            self._inputs.count(stream, 'late', late)
+            why = f'is late by {by:{digits}} s' if by else 'is not after what was used before'
+            self._inputs.count(stream, 'late', f'{stream} at {stamp} ns {why}')
             return False
         self._step[stream] = 0 if newest is None else max(stamp - newest, 0)
         self._newest_of[stream] = stamp if newest is None else max(newest, stamp)
