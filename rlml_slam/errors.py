@@ -36,3 +36,8 @@ class SolverError(RlmlError):
 
 class ClusterError(RlmlError):
     """A cluster cannot be reached, or its workers cannot be used."""
+
+
+def cause(error: Exception) -> str:
+    """What went wrong with a file, without the name of the file that an OSError repeats."""
+    return str(getattr(error, 'strerror', None) or error)

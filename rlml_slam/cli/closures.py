@@ -13,7 +13,7 @@ from typing import Any
 from rlml_slam import warm_up
 from rlml_slam.cli.support.service_call import ask
 from rlml_slam.cli.support.text_table import aligned
-from rlml_slam.errors import InputError, MapError
+from rlml_slam.errors import InputError, MapError, cause
 from rlml_slam.maps import map_container
 from rlml_slam.params import Parameters
 from rlml_slam.slam.back_end.back_end import BackEnd
@@ -80,7 +80,7 @@ def read(folder: Path) -> list[dict[str, str]]:
     try:
         return parse(path.read_text(encoding='utf-8'), str(path))
     except (OSError, UnicodeDecodeError) as e:
-        raise MapError(f'{path}: cannot be read: {getattr(e, "strerror", None) or e}') from e
+        raise MapError(f'{path}: cannot be read: {cause(e)}') from e
 
 
 def parse(table: str, name: str) -> list[dict[str, str]]:

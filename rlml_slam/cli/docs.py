@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rlml_slam.cli.support.interface import SERVICES, TOPICS
-from rlml_slam.errors import FileFormatError
+from rlml_slam.errors import FileFormatError, cause
 from rlml_slam.maps.atomic_file import write_atomically
 from rlml_slam.params import (
     Declaration,
@@ -52,9 +52,7 @@ def _read(path: Path) -> str:
     try:
         return path.read_text(encoding='utf-8')
     except (OSError, UnicodeDecodeError) as e:
-        raise FileFormatError(
-            f'{path}: cannot be read: {getattr(e, "strerror", None) or e}'
-        ) from e
+        raise FileFormatError(f'{path}: cannot be read: {cause(e)}') from e
 
 
 def filled(texts: Mapping[Path, str]) -> dict[Path, str]:

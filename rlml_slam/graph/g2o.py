@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.errors import FileFormatError
+from rlml_slam.errors import FileFormatError, cause
 from rlml_slam.graph.batch.initialization import initialize
 from rlml_slam.graph.model.factor_table import is_positive_definite
 from rlml_slam.graph.model.factors import FactorKind, Losses
@@ -147,9 +147,7 @@ def _text(path: Path) -> str:
         message = f'{path}: no g2o or TORO file, which is ASCII: byte {error.start} is not'
         raise FileFormatError(message) from None
     except (ValueError, OSError, EOFError, zlib.error) as error:
-        raise FileFormatError(
-            f'{path}: cannot be read: {getattr(error, "strerror", None) or error}'
-        ) from None
+        raise FileFormatError(f'{path}: cannot be read: {cause(error)}') from None
 
 
 def _parse(path: Path) -> tuple[dict[str, _Lines], list[tuple[int, int]], Counter[str]]:

@@ -14,7 +14,7 @@ import numpy as np
 from rlml_slam.cli.main import between
 from rlml_slam.cli.support.text_table import aligned
 from rlml_slam.datasets.tum import read_tum
-from rlml_slam.errors import FileFormatError, MapError, ParameterError
+from rlml_slam.errors import FileFormatError, MapError, ParameterError, cause
 from rlml_slam.maps import saved_map, survey
 from rlml_slam.params import Parameters, SimulatorParameters, from_mapping, read_yaml
 from rlml_slam.plain_yaml import parse_yaml
@@ -151,7 +151,7 @@ def _is_world(name: str) -> bool:
     try:
         tree = parse_yaml(path.read_text(encoding='utf-8'), name)
     except (OSError, UnicodeDecodeError) as e:
-        raise MapError(f'{name}: cannot be read: {getattr(e, "strerror", None) or e}') from e
+        raise MapError(f'{name}: cannot be read: {cause(e)}') from e
     return isinstance(tree, dict) and 'image' not in tree
 
 
