@@ -39,9 +39,15 @@ def loaded() -> list[tuple[str, Callable[[], None]]]:
     ]
 
 
-def compile_loaded() -> None:
-    """Compile the kernels of every module imported so far; quick if they are cached on disk."""
-    for _, warm_up in loaded():
+def compile_loaded(note: Callable[[str], None] = lambda text: None) -> None:
+    """Compile the kernels of every module imported so far; quick if they are cached on disk.
+
+    Where there is no library of them, ``note`` is called before each module with what is done.
+    """
+    modules = loaded()
+    for k, (_, warm_up) in enumerate(modules):
+        if not has_library():
+            note(f'compiling kernels, {k} of {len(modules)} modules; `rlml warm-up` keeps them')
         warm_up()
 
 

@@ -15,7 +15,8 @@ import numpy as np
 from rlml_slam.cli.support.service_call import PATIENCE, answer_of, asking, client_of, message_of
 from rlml_slam.errors import InputError
 
-POSE = 'initialpose'
+POSE, SET = 'initialpose', 'set'
+NAME = 'map_file_name'  # the parameter with the name under which a map is saved
 RVIZ = np.diag([0.25, 0.25, 0.0685])  # [m², m², rad²]: covariance of its "2D Pose Estimate"
 SWITCH = {'on': True, 'off': False}
 # service -> type, and the field of its request that takes the argument
@@ -37,7 +38,7 @@ def add_parser(subparsers: Any) -> None:
         help='a service of a running node: save_map, relocalize and so on',
         description='Calls a service of a running node and prints its answer.',
     )
-    names = [*SERVICES, POSE]
+    names = [*SERVICES, POSE, SET]
     # -1,2,90 is no option: Python 3.14 reads it so
     parser._negative_number_matcher = re.compile(r'-\.?\d')
     parser.add_argument('service', metavar='SERVICE', choices=names, help=', '.join(names))
@@ -45,7 +46,7 @@ def add_parser(subparsers: Any) -> None:
         'argument', metavar='ARGUMENT', nargs='?',
         help='of load_map the name of a map, which save_map takes as well, to save under another '
         'one from then on; of the two that switch something on or off; of initialpose x,y,angle '
-        '[m, degrees]',
+        '[m, degrees]; of set NAME=VALUE, a parameter that may change while the node runs',
     )  # fmt: skip
     parser.add_argument(
         '--node', metavar='NAME',
@@ -59,6 +60,14 @@ def run(args: argparse.Namespace) -> int:
     if args.service == POSE:
         print(give_pose(args.node or '/front_end', args.argument or ''))
         return 0
+    if args.service == SET:
+        parameter, equals, text = (args.argument or '').partition('=')
+        if not equals:
+            raise InputError(f'set: {args.argument or ""!r} is no NAME=VALUE')
+        with asking() as asker:
+            before = set_parameter(asker, args.node or '/back_end', parameter, text)
+        print(f'{parameter}: {before} -> {text}')
+        return 0
     package, name, field = SERVICES[args.service]
     fields = {} if field is None else {field: value_of(args.service, field, args.argument)}
     if field is None and args.argument is not None and args.service != 'save_map':
@@ -69,11 +78,11 @@ def run(args: argparse.Namespace) -> int:
         renames = args.service == 'save_map' and args.argument is not None
         if renames:
             client_of(asker, node, args.service, kind)  # no other name where nothing is saved
-        before = rename(asker, node, args.argument) if renames else ''
+        before = set_parameter(asker, node, NAME, args.argument) if renames else ''
         answer = answer_of(asker, node, args.service, kind, fields)
         if renames and not answer.success:
             with contextlib.suppress(InputError):  # what it was refused for is said below
-                rename(asker, node, before)
+                set_parameter(asker, node, NAME, before)
         if name != 'LoadMap':
             print(message_of(answer))
         elif answer.result != kind.Response.RESULT_SUCCESS:
@@ -112,18 +121,30 @@ def give_pose(node: str, argument: str) -> str:
     return f'{topic}: x = {x:g} m, y = {y:g} m, {degrees:g} degrees: sent'
 
 
-def rename(asker: Any, node: str, name: str) -> str:
-    """Save under another name from now on; the one before. InputError where it is refused."""
-    from rcl_interfaces.srv import GetParameters, SetParameters
-    from rclpy.parameter import Parameter
+def set_parameter(asker: Any, node: str, name: str, text: str) -> str:
+    """Set a parameter from the words of its value; those of the one before.
 
-    asked = {'names': ['map_file_name']}
-    before = answer_of(asker, node, 'get_parameters', GetParameters, asked).values
-    given = [Parameter('map_file_name', value=name).to_parameter_msg()]
+    InputError where the node has none of that name, or refuses it.
+    """
+    from rcl_interfaces.srv import GetParameters, SetParameters
+    from rclpy.parameter import Parameter, get_parameter_value, parameter_value_to_python
+
+    asked = {'names': [name]}
+    (before,) = answer_of(asker, node, 'get_parameters', GetParameters, asked).values or (None,)
+    kind = Parameter.Type.NOT_SET if before is None else Parameter.Type(before.type)
+    if kind == Parameter.Type.NOT_SET:
+        raise InputError(f'{node} has no parameter {name!r}')
+    value: Any = text
+    if kind != Parameter.Type.STRING:
+        value = parameter_value_to_python(get_parameter_value(text))
+    if kind == Parameter.Type.DOUBLE and type(value) is int:
+        value = float(value)
+    given = [Parameter(name, value=value).to_parameter_msg()]
     answer = answer_of(asker, node, 'set_parameters', SetParameters, {'parameters': given})
     if not answer.results[0].successful:
-        raise InputError(answer.results[0].reason)
-    return str(before[0].string_value)
+        why = str(answer.results[0].reason)
+        raise InputError(why if name in why else f'{name}: {why}')
+    return str(parameter_value_to_python(before))
 
 
 def value_of(service: str, field: str, argument: str | None) -> str | bool:

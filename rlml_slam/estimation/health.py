@@ -194,6 +194,13 @@ class HealthMonitor:
         return reasons
 
 
+def with_problems(health: Health, problems: tuple[str, ...]) -> Health:
+    """The health, DEGRADED at least where there are problems."""
+    if not problems:
+        return health
+    return Health(max(health.level, Level.DEGRADED), (*health.reasons, *problems))
+
+
 def open_direction(information: Array, heading: float, max_sigma: float) -> float | None:
     """Direction [deg, 0..180) in which the position sigma exceeds ``max_sigma``, None if none.
 

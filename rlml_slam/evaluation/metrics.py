@@ -89,6 +89,7 @@ def metrics(run: Run, errors: RunErrors | None = None) -> dict[str, Any]:
         'inputs': {stream: dict(counts) for stream, counts in run.inputs.items()},
         'topics': dict(run.topics),
         'health': {k: round(v, 4) for k, v in run.health_share().items()},
+        'health_reasons': {why: round(v, 4) for why, v in run.health_reasons()},
         'problem': run.problem,
         'about': run.origin.figures(),
     }

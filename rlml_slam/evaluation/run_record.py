@@ -6,6 +6,8 @@ Everything that is written and drawn is made from a Run.
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -167,3 +169,16 @@ class Run:
         return {
             level.name: float(np.mean(levels == level)) if len(levels) else 0.0 for level in Level
         }
+
+    def health_reasons(self, most: int = 3) -> list[tuple[str, float]]:
+        """The reasons that most frames have, each with their share.
+
+        Those that differ in numbers alone are one, in the words of the last of them.
+        """
+        counts, words = Counter[str](), dict[str, str]()
+        for reasons in self.frames.reasons:
+            for reason in reasons:
+                kind = re.sub(r'\d+(\.\d+)?', '#', reason)
+                counts[kind] += 1
+                words[kind] = reason
+        return [(words[k], n / len(self.frames.reasons)) for k, n in counts.most_common(most)]

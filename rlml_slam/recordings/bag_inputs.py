@@ -18,7 +18,7 @@ from rlml_slam.params import Parameters
 from rlml_slam.recordings.products import sources
 from rlml_slam.ros.bags.bag import TRUTH, BagReader, choose_topics
 from rlml_slam.ros.codecs import decode
-from rlml_slam.ros.sensor_input import TF, topics_of
+from rlml_slam.ros.sensor_input import TF, placement_problems, topics_of
 from rlml_slam.ros.systems.simulator_messages import TRUE_REFLECTORS
 from rlml_slam.ros.tf import Extrinsics
 from rlml_slam.ros.tf_odometry import TfOdometry
@@ -33,7 +33,7 @@ class BagInputs:
     ``topics`` by stream, as ``params`` ask for them, and ``more_scans`` those of further lidars;
     ``tf`` is the topic of transforms, '' without one; ``extrinsics`` knows the static transforms
     of the whole bag, and those on /tf as far as they are needed. ``params`` have the frames that
-    the bag has, where it has others.
+    the bag has, where it has others; ``problems`` say what is wrong with the places of lasers.
     """
 
     def __init__(self, bag: BagReader, params: Parameters) -> None:
@@ -54,6 +54,7 @@ class BagInputs:
         self._lidars = self._frames_of_scans()
         if is_on_tf and self.unplaced():  # else all of /tf has been read
             self._read_tf(None)
+        self.problems = placement_problems(n, self.unplaced(), self._lidars)
 
     def __iter__(self) -> Iterator[tuple[int, str, Any]]:
         stream_of = {topic: stream for stream, topic in self.topics.items()}
@@ -83,13 +84,17 @@ class BagInputs:
     def unplaced(self) -> list[str]:
         """Frames of scans of which no transform says where they sit on the robot."""
         base, tree = decode.frame(self.params.node.base_frame), self.extrinsics
-        return [f for f in self._lidars if f != base and tree.up(base, f) is None]
+        lidars = sorted(set(self._lidars.values()))
+        return [f for f in lidars if f != base and tree.up(base, f) is None]
 
-    def _frames_of_scans(self) -> list[str]:
+    def _frames_of_scans(self) -> dict[str, str]:
         """The frame of the first scan of each topic."""
-        scans = (self.topics.get('scan'), *self.more_scans)
-        firsts = (message for topic in scans for message in self._all(topic, 1))
-        return sorted({decode.frame(message.header.frame_id) for message in firsts})
+        scans = filter(None, (self.topics.get('scan'), *self.more_scans))
+        return {
+            topic: decode.frame(message.header.frame_id)
+            for topic in scans
+            for message in self._all(topic, 1)
+        }
 
     def _transforms(self, name: str) -> str:
         """The topic of transforms of that name, or the only one in a namespace; '' if none."""

@@ -13,6 +13,7 @@ from typing import Any
 from rlml_slam import warm_up
 from rlml_slam.ekf.slam import EkfSlam
 from rlml_slam.errors import BagError, InputError, ParameterError
+from rlml_slam.estimation.health import with_problems
 from rlml_slam.evaluation.metrics import run_errors
 from rlml_slam.evaluation.run_record import FrameLog, Origin, Run, Truth
 from rlml_slam.maps.map_container import Content
@@ -26,6 +27,7 @@ from rlml_slam.ros.bags.bag import BagReader, BagWriter
 from rlml_slam.ros.sensor_input import SensorInput
 from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.store import map_file
+from rlml_slam.types import Frame
 
 # name -> the type of its parameters and its constructor
 SYSTEMS: Mapping[str, tuple[type[Any], Callable[[Any], Slam | EkfSlam]]] = {
@@ -60,12 +62,14 @@ def replay(
     note. A damaged bag, or one whose clock jumps back, gives what came before, and
     ``Run.problem`` says so. Raises BagError if there is nothing to use at all.
     """
-    warm_up.compile_loaded()
+    warm_up.compile_loaded(lambda text: progress(0.0, text))
     origin = Origin(parameters=changed(params), system=system)
     with BagReader(path) as bag, ExitStack() as files:
         inputs = BagInputs(bag, patient(params))
         params = inputs.params
         slam = _begin(system, params, given)
+        feed = SensorInput(params, slam, slam.synchronizer.inputs)
+        feed.use_extrinsics(inputs.extrinsics)
         recording = None
         if mcap is not None:
             recording = EstimateBag(files.enter_context(BagWriter(mcap)), inputs)
@@ -73,12 +77,12 @@ def replay(
         log, problem = FrameLog(), ''
         began = time.perf_counter()
         try:
-            _drive(slam, inputs, log, recording, (bag.start, bag.end), progress)
+            _drive(slam, feed, inputs, log, recording, (bag.start, bag.end), progress)
         except BagError as e:
             problem = str(e)
         except InputError as e:
             problem = f'{path}: {e}'
-        frames = slam.finish()
+        frames = _with_health(slam.finish(), feed, inputs)
         log.add(frames)
         wall = time.perf_counter() - began
         problem = problem or bag.damage
@@ -103,6 +107,8 @@ def replay(
             result.inputs['reflectors'] = {'used': slam.synchronizer.reflectors.num_scans}
         if slam.synchronizer.delay.now:
             result.topics['odom'] += f', stamped {slam.synchronizer.delay}'
+        if 'imu' in result.topics and slam.synchronizer.gyro.fault:
+            result.topics['imu'] += f'; not used, as {slam.synchronizer.gyro.fault}'
         if recording is not None:
             recording.add(bag.end, frames, slam)
             recording.finish(slam, run_errors(result))
@@ -140,6 +146,7 @@ def patient(params: Parameters) -> Parameters:
 
 def _drive(
     slam: Slam | EkfSlam,
+    feed: SensorInput[Frame],
     inputs: BagInputs,
     log: FrameLog,
     recording: EstimateBag | None,
@@ -147,11 +154,9 @@ def _drive(
     progress: Callable[[float, str], None],
 ) -> None:
     """Feed all inputs, the same way as the live nodes do."""
-    feed = SensorInput(inputs.params, slam, slam.synchronizer.inputs)
-    feed.use_extrinsics(inputs.extrinsics)
     began, (start, end) = time.perf_counter(), span
     for k, (log_time, stream, message) in enumerate(inputs):
-        frames = feed.add(stream, message)
+        frames = _with_health(feed.add(stream, message), feed, inputs)
         log.add(frames)
         if recording is not None:
             recording.add(log_time, frames, slam)
@@ -159,3 +164,9 @@ def _drive(
             done = log_time - start
             factor = done * 1e-9 / max(time.perf_counter() - began, 1e-3)
             progress(done / max(end - start, 1), f'{factor:.0f} x real time')
+
+
+def _with_health(frames: list[Frame], feed: SensorInput[Frame], inputs: BagInputs) -> list[Frame]:
+    """The frames with the health that a node would publish."""
+    problems = (*inputs.problems, *feed.odometry_problems()) if frames else ()
+    return [replace(f, health=with_problems(f.health, problems)) for f in frames]

@@ -98,14 +98,14 @@ def fates(
 def refused(inputs: InputCounts) -> str:
     """How many scans or reflectors were late or ahead of all others, '' unless they are many.
 
-    Of odometry there is more than enough where a recording is merely out of order; where none is
-    valid, that is a problem as well. An IMU without turn rates is none.
+    Of odometry there is more than enough where a recording is merely out of order; where it jumps,
+    or none is valid, that is a problem as well. An IMU without turn rates is none.
     """
     out = []
     for stream, name in NAMES.items():
         fate = inputs.counts.get(stream, Counter())
         every = sum(fate.values()) - sum(fate[what] for what in OF_USED)
-        wrong = fate['late'] + fate['future'] if stream in MEASURED else 0
+        wrong = fate['late'] + fate['future'] if stream in MEASURED else fate['jump']
         wrong = every if fate['invalid'] == every else wrong
         if wrong > MANY * every:
             first = inputs.first_errors[stream]

@@ -11,6 +11,8 @@ from typing import Any
 
 from rlml_slam.evaluation.run_record import Run
 
+RARE = 0.005  # share of the frames, from which on a reason is a row
+
 
 def summary_rows(f: Mapping[str, Any]) -> list[tuple[str, str]]:
     """(what, figure) of the figures of metrics.json that a person looks at first."""
@@ -34,6 +36,7 @@ def summary_rows(f: Mapping[str, Any]) -> list[tuple[str, str]]:
     if 'survey' in f:
         rows.append(('survey', survey_row(f['survey'])))
     rows.append(('health', ', '.join(f'{v:.1%} {k}' for k, v in f['health'].items() if v > 0.0)))
+    rows += [('', f'{v:.1%} {why}') for why, v in f.get('health_reasons', {}).items() if v >= RARE]
     for stream, fate in f['inputs'].items():
         listed = ', '.join(f'{n} {what}' for what, n in fate.items() if n or what == 'used')
         # a bag may have one only topic of a type, by whatever name: the reader has to know

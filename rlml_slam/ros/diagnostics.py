@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
+from rlml_slam.estimation.health import with_problems
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
@@ -134,10 +135,3 @@ class HealthPublisher:
 def map_id(saved: SavedMap | None) -> str:
     """Of the saved map that a node uses."""
     return 'none: a map in the making' if saved is None else saved.id
-
-
-def with_problems(health: Health, problems: tuple[str, ...]) -> Health:
-    """The health, DEGRADED at least where there are problems."""
-    if not problems:
-        return health
-    return Health(max(health.level, Level.DEGRADED), (*health.reasons, *problems))

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from rlml_slam import se2
 from rlml_slam.errors import InputError
@@ -23,6 +25,7 @@ from rlml_slam.sensing.synchronization.input_counts import InputCounts
 from rlml_slam.types import ANONYMOUS, Detections, Imu, Odometry, Scan
 
 Out = TypeVar('Out')
+MANY = 20  # reflectors, of which most are too near to another one only in the points of a scan
 # stream of the sequencer -> parameter with the topic's name, type, whether the only topic of the
 # type may stand in, bytes of a beam or reflector with whatever else a driver says of it (without,
 # only small messages are taken). Any PointCloud2 or PoseArray may be something else.
@@ -58,6 +61,26 @@ def topics_of(node: Node, stream: str) -> tuple[str, ...]:
     """Names of the topics of a stream: one, but of as many scans as there are lidars."""
     several = tuple(filter(None, node.scan_topics)) if stream == 'scan' else ()
     return several or (str(getattr(node, STREAMS[stream][0])),)
+
+
+def placement_problems(
+    node: Node, assumed: Collection[str], frame_of: Mapping[str, str]
+) -> list[str]:
+    """What is wrong with the places of lasers, in words.
+
+    ``assumed`` are frames without a transform, ``frame_of`` the frame of each topic of scans.
+    """
+    by_frame = defaultdict[str, list[str]](list)
+    for topic, name in sorted(frame_of.items()):
+        by_frame[name].append(topic)
+    is_given = any(node.laser_pose) or node.laser_upside_down
+    guessed = () if is_given else sorted(by_frame.keys() & set(assumed))
+    out = [f'no transform to {name!r}: it is taken to sit at base_frame' for name in guessed]
+    return out + [
+        f'scans of {" and ".join(topics)} are all in the frame {name!r}: each laser needs its own'
+        for name, topics in by_frame.items()
+        if len(topics) > 1
+    ]
 
 
 class Target(Protocol[Out]):
@@ -169,7 +192,20 @@ class SensorInput(Generic[Out]):
             return decode.imu(msg, up=up)
         read = decode.detections_of_poses if hasattr(msg, 'poses') else decode.detections
         seen = self._with_names(stream, read(msg, self._p.reflector), size)
+        self._check_apart(stream, seen)
         return mirrored_detections(seen) if self.hangs(seen.frame_id) else seen
+
+    def _check_apart(self, stream: str, seen: Detections) -> None:
+        """Raise InputError where most reflectors are too near to another one: it is a scan."""
+        n, apart = len(seen), self._p.reflector.min_separation
+        if n < MANY:
+            return
+        near = np.sum(cKDTree(seen.points).query(seen.points, 2)[0][:, 1] < apart)
+        if near > 0.5 * n:
+            raise InputError(
+                f'{stream}: {near} of {n} points are less than {apart:g} m from another one: '
+                'they are of a scan, not reflectors'
+            )
 
     def _with_names(self, stream: str, seen: Detections, size: int) -> Detections:
         """The detections, without ids while they may be the numbers of the rows of each message.

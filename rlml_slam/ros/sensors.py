@@ -28,6 +28,7 @@ from rlml_slam.ros.sensor_input import (
     USED_BY,
     SensorInput,
     counted_as,
+    placement_problems,
     topics_of,
 )
 from rlml_slam.ros.tf import TF_MESSAGE, Extrinsics, subscribe_static
@@ -168,10 +169,7 @@ class Sensors:
 
     def problems(self) -> tuple[str, ...]:
         """Sensors in an assumed place, and those that several nodes publish where one is meant."""
-        is_given = any(self._p.node.laser_pose) or self._p.node.laser_upside_down
-        guessed = () if is_given else sorted(self._assumed.intersection(self._frame_of.values()))
-        out = [f'no transform to {name!r}: it is taken to sit at base_frame' for name in guessed]
-        out += _in_one_frame(self._frame_of)
+        out = placement_problems(self._p.node, self._assumed, self._frame_of)
         for stream, listener in self._queues:
             if stream not in (*PLACED, TF):
                 found = self._node.publishers_of(listener.topic_name)
@@ -307,18 +305,6 @@ class Sensors:
         self._tell_of_refused()
         for observation in observations:
             self._handle(observation)
-
-
-def _in_one_frame(frame_of: dict[str, str]) -> list[str]:
-    """Problems of several lasers, by topic, that say they are in one place."""
-    by_frame = defaultdict[str, list[str]](list)
-    for topic, name in sorted(frame_of.items()):
-        by_frame[name].append(topic)
-    return [
-        f'scans of {" and ".join(topics)} are all in the frame {name!r}: each laser needs its own'
-        for name, topics in by_frame.items()
-        if len(topics) > 1
-    ]
 
 
 def _others(node: Any, kinds: dict[str, str], known: set[str]) -> str:

@@ -15,6 +15,7 @@ from rlml_slam import se2
 from rlml_slam.cli.main import main
 from rlml_slam.cli.replay import load_known
 from rlml_slam.datasets.tum import Trajectory, read_tum, write_tum
+from rlml_slam.evaluation.run_record import FrameLog, Run
 from rlml_slam.maps import occupancy
 from rlml_slam.params import Parameters
 from rlml_slam.recordings.bag_replay import replay
@@ -24,7 +25,7 @@ from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import make_bag
 from rlml_slam.sensing.synchronization.input_counts import InputCounts
 from rlml_slam.slam.store import map_file
-from rlml_slam.types import Detections, Imu, Scan
+from rlml_slam.types import Detections, Health, Imu, Level, Reflectors, Scan
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
 SECOND = 1_000_000_000
@@ -153,6 +154,71 @@ def test_summary_says_that_no_transform_has_the_place_of_the_laser(tmp_path, cap
     assert row == f'10 used (/scan; {note})'
     f = json.loads((tmp_path / 'out' / 'metrics.json').read_text())
     assert (f['topics']['scan'], f['problem']) == (f'/scan; {note}', '')
+    # as a node says of it
+    assert f['health']['DEGRADED'] == 1.0
+    assert f['health_reasons']["no transform to 'laser': it is taken to sit at base_frame"] == 1.0
+
+
+def test_summary_has_the_most_frequent_reasons_of_bad_health(tmp_path, capsys):
+    write_scans(tmp_path / 'bag', [k * SECOND // 10 for k in range(10, 50)])
+    assert main(['replay', str(tmp_path / 'bag'), '--out', str(tmp_path / 'out')]) == 0
+    out = capsys.readouterr().out
+    assert re.search(r"health +100.0% DEGRADED\n +100.0% no transform to 'laser'.*\n", out)
+    assert re.search(r'\n +\d+\.\d% no odometry\n', out)
+
+
+def test_reasons_that_differ_in_numbers_are_one():
+    log, pose, cov = FrameLog(), np.zeros(3), np.eye(3)
+    for k in range(8):
+        reasons = (f'position sigma is 0.{k} m',) if k > 1 else ()
+        log.add_pose(k, pose, cov, Health(Level(k > 1), (*reasons, *['b'] * (k == 3))))
+    run = Run('', log, log.trajectory(), Reflectors(*(np.zeros(0),) * 6))
+    assert run.health_reasons() == [('position sigma is 0.7 m', 0.75), ('b', 0.125)]
+
+
+def seen_in_room(stamp, pose):
+    """All around, in a room of 6 x 5 m."""
+    step = np.pi / 90.0
+    angles = -np.pi + step * np.arange(180)
+    c, s = np.cos(angles + pose[2]), np.sin(angles + pose[2])
+    ranges = np.minimum(
+        (3.0 - np.sign(c) * pose[0]) / np.maximum(np.abs(c), 1e-9),
+        (2.5 - np.sign(s) * pose[1]) / np.maximum(np.abs(s), 1e-9),
+    )
+    none = np.zeros(0, np.float32)
+    frame = 'base_link'
+    return Scan(stamp, frame, -np.pi, step, 0.0, 0.1, 30.0, ranges.astype(np.float32), none)
+
+
+def write_drive(path, odometry, imu=lambda pose: None, seconds=30.0):
+    """A bag of a robot that drives in circles in a room; odometry of pose ``odometry(pose)``."""
+    with BagWriter(path) as bag:
+        for k in range(40, int(40 * seconds)):
+            t, turn = k * SECOND // 40, 0.5 * (k / 40.0 - 1.0)
+            pose = np.array([0.5 * np.sin(turn), 0.5 - 0.5 * np.cos(turn), turn])
+            msg = encode.odometry(make_bag, t, ('odom', 'base_link'), odometry(pose), np.eye(3))
+            bag.write('/odom', msg, t)
+            if (rate := imu(pose)) is not None:
+                bag.write('/imu', encode.imu(make_bag, Imu(t, rate), 'base_link', 0.01), t)
+            if k % 4 == 1:
+                bag.write('/scan', encode.laser_scan(make_bag, seen_in_room(t, pose)), t)
+
+
+def test_odometry_in_millimetres_is_a_problem(tmp_path, capsys):
+    write_drive(tmp_path / 'bag', lambda pose: pose * [1000.0, 1000.0, 1.0])
+    arguments = ['replay', str(tmp_path / 'bag'), '--out', str(tmp_path / 'out'), '--no-report']
+    assert main(arguments) == 1
+    said = capsys.readouterr().err
+    assert re.search(r'messages with odometry were not used; the first: .* in metres', said)
+
+
+def test_imu_in_degrees_per_second_is_named(tmp_path, capsys):
+    write_drive(tmp_path / 'bag', lambda pose: pose, lambda pose: np.degrees(0.5))
+    arguments = ['replay', str(tmp_path / 'bag'), '--out', str(tmp_path / 'out'), '--no-report']
+    assert main(arguments) == 0
+    row = re.search(r'input imu +(.*)', capsys.readouterr().out)
+    assert row is not None
+    assert 'not used, as it is in degrees per second' in row[1]
 
 
 @pytest.mark.parametrize(

@@ -87,6 +87,27 @@ def test_two_bad_windows_of_five_are_no_fault():
     assert drive(LaserCheck(), np.zeros(3), (good + bad + good + bad + good) * 3)[1] == ''
 
 
+def test_fault_of_the_mounting_stays_until_ten_windows_show_none():
+    """A pose that follows mirrored odometry for a while agrees with it."""
+    good, bad = [(STEP, STEP, True)] * 10, [(STEP, -STEP, True)] * 10
+    check, pose = LaserCheck(), np.zeros(3)
+    pose, found = drive(check, pose, bad * 5)
+    assert '180 deg away' in found
+    pose, found = drive(check, pose, good * 8)
+    assert '180 deg away' in found
+    pose, found = drive(check, pose, bad * 3 + good * 8)
+    assert '180 deg away' in found
+    assert drive(check, pose, good * 5)[1] == ''
+
+
+def test_odometry_that_moves_again_is_no_fault():
+    still, moves = [(np.zeros(3), STEP, True)] * 10, [(STEP, STEP, True)] * 10
+    check = LaserCheck()
+    pose, found = drive(check, np.zeros(3), still * 5)
+    assert 'stands still' in found
+    assert drive(check, pose, moves * 2)[1] == ''
+
+
 def test_robot_that_only_turns_is_compared():
     step = np.array([0.0, 0.0, 0.1])
     assert 'turns against' in drive(LaserCheck(), np.zeros(3), [(step, -step, True)] * 25)[1]

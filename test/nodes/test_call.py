@@ -73,6 +73,7 @@ def test_services_answer_in_words_and_refuse_in_words(live, command, tmp_path):
     [
         (['load_map'], 'load_map needs an argument'),
         (['reset', 'hall'], 'reset takes no argument'),
+        (['set', 'health.input_timeout'], "'health.input_timeout' is no NAME=VALUE"),
         (['set_localization_mode', 'yes'], "'yes' is neither on nor off"),
         (['initialpose', '1,2'], "'1,2' is no x,y,angle [m, degrees]"),
         (['initialpose', '-1,2'], "'-1,2' is no x,y,angle [m, degrees]"),
@@ -173,3 +174,21 @@ def test_map_is_saved_under_another_name(live, command, tmp_path):
     code, out, err = command('save_map', 'second')
     assert 'there is no map yet' in err
     assert node.params.node.map_file_name == 'map'  # a refused service changes nothing
+
+
+def test_parameter_is_set_while_the_node_runs(live, command):
+    node = live.start(FrontEndNode)
+    to = ('--node', '/front_end')
+    code, out, _ = command('set', 'health.input_timeout=3', *to)  # a whole number is a number
+    assert (code, out) == (0, 'health.input_timeout: 1.0 -> 3\n')
+    assert node.params.health.input_timeout == 3.0
+    for words, why in (
+        ('health.input_timeout=-1', 'health.input_timeout'),
+        ('health.input_timeout=long', 'health.input_timeout'),
+        ('scan_topic=/other', 'scan_topic'),
+        ('nosuchparameter=1', "/front_end has no parameter 'nosuchparameter'"),
+    ):
+        code, out, err = command('set', words, *to)
+        assert (code, out) == (1, '')
+        assert why in err
+    assert node.params.health.input_timeout == 3.0

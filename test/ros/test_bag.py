@@ -146,6 +146,14 @@ def test_bag_without_anything_to_measure_is_refused_with_its_topics():
         choose_topics(topics(('/wheels', ODOM)), Node())
 
 
+@pytest.mark.parametrize(
+    ('kind', 'hint'), [('MultiEchoLaserScan', 'laser_proc'), ('PointCloud2', 'reflectors_topic')]
+)
+def test_what_might_have_been_meant_is_named(kind, hint):
+    with pytest.raises(BagError, match=f'no scan and no reflectors .*; .*{hint}'):
+        choose_topics(topics(('/a', f'sensor_msgs/msg/{kind}')), Node())
+
+
 def test_any_cloud_is_not_taken_for_reflectors():
     clouds = topics(('/points', 'sensor_msgs/msg/PointCloud2'), ('/scan', SCAN))
     assert choose_topics(clouds, Node()) == {'scan': '/scan'}

@@ -97,6 +97,26 @@ def test_range_max_that_is_nan_stays_so(make):
     assert np.isnan(decode.scan(encode.laser_scan(make, a_scan(range_max=np.nan))).range_max)
 
 
+@pytest.mark.parametrize('last', [1.0, 1.5, 0.0, 1.9, np.nan])
+def test_angle_max_may_count_a_beam_more_or_be_missing(make, last):
+    msg = encode.laser_scan(make, a_scan())
+    msg.angle_max = last
+    assert decode.scan(msg).angle_increment == 0.5
+
+
+@pytest.mark.parametrize(
+    ('first', 'step', 'n', 'last'),
+    [(-3.14, 0.00873, 360, 3.12), (3.14, 0.0175, 360, -3.14), (-1.57, 0.0175, 181, 0.8)],
+)
+def test_angles_that_contradict_each_other_are_refused(make, first, step, n, last):
+    ranges, none = np.ones(n, np.float32), np.zeros(0, np.float32)
+    scan = a_scan(angle_min=first, angle_increment=step, ranges=ranges, intensities=none)
+    msg = encode.laser_scan(make, scan)
+    msg.angle_max = last
+    with pytest.raises(InputError, match=rf'angle_max is {last:g} rad, but {n} beams end at'):
+        decode.scan(msg)
+
+
 @pytest.mark.parametrize('stamp', [0, -1_000_000_000])
 def test_stamp_that_is_not_positive_is_refused(make, stamp):
     msg = encode.laser_scan(make, a_scan(stamp=stamp))

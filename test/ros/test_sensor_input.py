@@ -117,6 +117,35 @@ def test_farthest_range_of_inf_makes_no_range_of_inf():
     assert len(project(scan, np.zeros(3), np.zeros(3), 30.0)) == len(ranges) - 1
 
 
+def many(points):
+    n = len(points)
+    return Detections(
+        5, 'laser', points, np.tile(1e-4 * np.eye(2), (n, 1, 1)), np.full(n, -1),
+        np.full(n, np.nan),
+    )  # fmt: skip
+
+
+def test_points_of_a_scan_are_no_reflectors():
+    inputs = InputCounts()
+    feed = SensorInput(Parameters(), Target(), inputs)
+    angles = np.linspace(-2.0, 2.0, 300)
+    walls = 4.0 * np.column_stack([np.cos(angles), np.sin(angles)])
+    feed.add('reflectors', encode.detections(make_bag, many(walls)))
+    assert not feed._target.given
+    assert inputs.counts['reflectors'] == {'invalid': 1}
+    assert 'reflectors: 300 of 300 points are less than 0.25 m' in inputs.last_error
+
+
+def test_many_reflectors_and_a_few_seen_twice_are_used():
+    feed = SensorInput(Parameters(), Target(), InputCounts())
+    x, y = np.meshgrid(np.arange(10.0), np.arange(12.0))
+    racks = np.column_stack([x.ravel(), y.ravel()]) + 1.0
+    few = np.full((10, 2), 3.0) + 1e-2 * np.arange(10)[:, None]
+    for points in (racks, np.vstack([racks, racks[:30] + 0.05]), few):
+        feed.add('reflectors', encode.detections(make_bag, many(points)))
+        assert len(feed._target.given[-1]) == len(points)
+
+
 @pytest.mark.parametrize(
     ('rows', 'used'),
     [

@@ -46,6 +46,15 @@ def test_delay_is_found(delay, seed):
     assert (np.abs(said[len(said) // 2 :] / SECOND - delay) < 0.016).all()
 
 
+def test_delay_at_the_end_of_the_grid_may_be_larger():
+    assert drive(0.4)[-1] == 3 * SECOND // 10
+    delay = OdometryDelay()
+    delay.now = 3 * SECOND // 10
+    assert str(delay) == 'late by at least 0.30 s'
+    delay.now = -SECOND // 10
+    assert str(delay) == 'early by 0.10 s'
+
+
 @pytest.mark.parametrize('change', [{}, {'scale': 0.9}, {'slips': 0.01}, {'noise': 0.02}])
 def test_odometry_that_is_wrong_in_other_ways_is_not_late(change):
     assert not drive(0.0, **change).any()

@@ -35,6 +35,12 @@ from rlml_slam.ros.codecs.message_types import bag_types
 from rlml_slam.ros.sensor_input import PLACED, STREAMS, USED_BY, topics_of
 
 TRUTH = 'ground_truth'  # the name of a topic that is no sensor
+HINTS = {
+    'sensor_msgs/msg/MultiEchoLaserScan': (
+        'MultiEchoLaserScan is not read: laser_proc makes a LaserScan of it'),
+    'sensor_msgs/msg/PointCloud2': (
+        'a PointCloud2 of reflectors is read where reflectors_topic names it'),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -258,13 +264,15 @@ def choose_topics(
             several = ', or several lidars with scan_topics' if stream == 'scan' else ''
             raise BagError(
                 f'several topics fit {stream}: {", ".join(sorted(fitting))}; '
-                f'name one with the parameter {parameter}{several}'
+                f'name one with the parameter {parameter}{several}, in the YAML file of --config'
             )
         if fitting:
             chosen[stream] = fitting[0]
     if not chosen.keys() & set(PLACED):
         listed = ', '.join(f'{t.name} ({t.msgtype})' for t in topics.values()) or 'nothing'
-        raise BagError(f'no scan and no reflectors in the bag, which has {listed}')
+        kinds = {t.msgtype for t in topics.values()}
+        hints = ''.join(f'; {hint}' for kind, hint in HINTS.items() if kind in kinds)
+        raise BagError(f'no scan and no reflectors in the bag, which has {listed}{hints}')
     return chosen
 
 

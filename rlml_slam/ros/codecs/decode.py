@@ -36,6 +36,7 @@ LARGEST_SIGMA = 100.0  # [m], [rad] of a detection
 LAST_STAMP = ((1 << 31) - 60) * SECOND
 FASTEST = 1e3  # [m/s], [rad/s]
 FARTHEST = 1e4  # [m] beyond any laser
+END = 0.1  # of the view: drivers round where the last beam is, or count one more
 LARGE = 50  # rows of a covariance whose eigenvalues are not computed
 _NEAR = 1e-3  # [m] nearer than this a bearing has no meaning
 
@@ -123,18 +124,32 @@ def scan(msg: Any, topic: str = 'scan') -> Scan:
 
     A range_max of Inf, or one that leaves no range at all, as 0 does, says that the driver does
     not know it, not that Inf is a range; a range_min below 0 makes no range of what is below 0.
-    Intensities of which there are not as many as ranges are left out.
+    Intensities of which there are not as many as ranges are left out. InputError where angles
+    contradict each other.
     """
     ranges = np.array(msg.ranges, dtype=np.float32)
     intensities = np.array(msg.intensities, dtype=np.float32)
     if intensities.shape != ranges.shape:  # nobody knows which beams they are of
         intensities = intensities[:0]
+    _check_angle_max(msg, len(ranges), topic)
     least, most = max(float(msg.range_min), 0.0), min(float(msg.range_max), FARTHEST)
     return Scan(
         stamp(msg, topic), frame(msg.header.frame_id), float(msg.angle_min),
         float(msg.angle_increment), float(msg.time_increment), least,
         FARTHEST if most <= least else most, ranges, intensities,
     )  # fmt: skip
+
+
+def _check_angle_max(msg: Any, n: int, topic: str) -> None:
+    """Raise InputError where the last of n beams is elsewhere than the message says; 0: unset."""
+    step, last = float(msg.angle_increment), float(msg.angle_max)
+    view = step * (n - 1)
+    end = float(msg.angle_min) + view
+    if last != 0.0 and abs(last - end) > 2.0 * abs(step) + END * abs(view):
+        raise InputError(
+            f'{topic}: angle_max is {last:.4g} rad, but {n} beams end at angle_min + {n - 1} * '
+            f'angle_increment = {end:.4g} rad'
+        )
 
 
 def odometry(msg: Any, topic: str = 'odom') -> Odometry:

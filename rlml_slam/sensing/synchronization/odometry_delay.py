@@ -35,7 +35,8 @@ class OdometryDelay:
         self._sums, self._num = np.zeros(len(GRID)), 0.0  # over the turns, by delay
 
     def __str__(self) -> str:
-        return f'{"late" if self.now > 0 else "early"} by {abs(self.now) / SECOND:.2f} s'
+        least = 'at least ' if abs(self.now) >= GRID[-1] else ''
+        return f'{"late" if self.now > 0 else "early"} by {least}{abs(self.now) / SECOND:.2f} s'
 
     def add_odometry(self, stamp: int, heading: float) -> None:
         """One sample: its stamp [ns] as it came, and its heading [rad]."""

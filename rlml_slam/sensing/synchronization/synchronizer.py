@@ -121,7 +121,8 @@ class Synchronizer:
             if self.gyro.fault:
                 self.buffer.forget_imu_after(0)
         else:
-            self.inputs.count(TOPIC, 'jump')
+            far = 'jumps: no robot moves as far since the one before; is it in metres and radians?'
+            self.inputs.count(TOPIC, 'jump', f'odometry at {stamp} ns {far}')
             self.gyro.restart()
         if not len(self._queue):
             self._assembly.carry(stamp)
@@ -289,13 +290,14 @@ class Synchronizer:
 def invalid_geometry(scan: Scan) -> str:
     """Why a scan cannot be used, empty if it can."""
     n = len(scan.ranges)
-    geometry = (
-        scan.angle_min, scan.angle_increment, scan.time_increment, scan.range_min, scan.range_max,
-    )  # fmt: skip
     if n == 0:
         return 'it is empty'
-    if not np.all(np.isfinite(geometry)) or scan.angle_increment == 0.0 or scan.range_min < 0.0:
-        return 'its angles, times or ranges are not valid'
+    for name in ('angle_min', 'angle_increment', 'time_increment', 'range_min', 'range_max'):
+        value = getattr(scan, name)
+        if not math.isfinite(value) or (name == 'angle_increment' and value == 0.0):
+            return f'{name} is {value:g}'
+    if scan.range_min < 0.0:
+        return f'range_min is {scan.range_min:g} m'
     view = abs(scan.angle_increment) * (n - 1)
     if view > LARGEST_VIEW or (n > 1 and abs(scan.angle_increment) < FINEST):
         return f'angle_increment {scan.angle_increment:g} rad times {n} beams is no field of view'
