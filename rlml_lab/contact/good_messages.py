@@ -57,6 +57,7 @@ def private_messages(record: SessionFrame) -> dict[str, list[Any]]:
         'rlml/session_start': [build_request(make, start, 'map') for start in starts],
         'rlml/localization_grid': [encode.occupancy_grid(make, 9, 'map', grid)],
         'rlml/localization_map': [build_reflector_map(make, 9, 'map', map_)],
+        'rlml/map_entry': [make('std_msgs/msg/String', data='not yet in the map')],
         'rlml/frames': [build_record(make, record, 'rlml_local')],
         'deskewed_points': [
             build_points(make, frame.stamp, 'base_link', frame.observation.points)

@@ -72,7 +72,7 @@ class DeformableSlamNode(ManagedNode):
         self.slam.begin_at(start.pose, start.cov)
         self.get_logger().info(f'begins at {np.round(start.pose, 3).tolist()}')
 
-    def restart(self) -> None:
+    def restart(self, _: bool) -> None:
         """Forget everything: the clock jumped back."""
         self.slam.restart()
 

@@ -50,7 +50,7 @@ class EkfSlamNode(ManagedNode):
             self, self.sensors, lambda: {'map id': map_id(self.map_services.saved)}
         )
         Listener(self, PoseWithCovarianceStamped, 'initialpose', self.start_at, RELIABLE)
-        self.restart()
+        self.restart_in(self.map_services.saved)
 
     def process(self, observation: Observation) -> None:
         """One observation: estimate, publish, and map to odom."""
@@ -66,7 +66,7 @@ class EkfSlamNode(ManagedNode):
         start = decode.start_pose(msg, self.params.node.map_frame)
         self._begin(start.pose, start.cov, self.map_services.saved)
 
-    def restart(self) -> None:
+    def restart(self, _: bool) -> None:
         """Forget everything but a saved map."""
         self.restart_in(self.map_services.saved)
 

@@ -52,7 +52,7 @@ class ReflectorDetectorNode(ManagedNode):
             self._publisher.publish(encode.detections(make_rclpy, seen, found.intensities))
         self.health.update(scan, found)
 
-    def restart(self) -> None:
+    def restart(self, _: bool) -> None:
         """The clock jumped back: scans are independent of each other, nothing is forgotten."""
 
 

@@ -52,7 +52,6 @@ class HealthPublisher:
         )
         self._heard = time.monotonic()
         self._is_silent = False
-        self._found: tuple[str, ...] = ()
         node.every(PERIOD, self.publish)
         node.every(WATCH, self.watch)
         self._publish_health()
@@ -81,10 +80,10 @@ class HealthPublisher:
         if self._frame is None:
             last = '' if self._sensors is None else self._sensors.synchronizer.inputs.last_error
             reasons = ('no input yet', f'not used: {last}') if last else ('no input yet',)
-            return with_problems(Health(Level.DEGRADED, reasons), self._found)
+            return with_problems(Health(Level.DEGRADED, reasons), self._problems())
         # who is lost stays lost in silence
         silence = ('no new scan or reflectors',) if self._is_silent else ()
-        return with_problems(with_problems(self._frame.health, silence), self._found)
+        return with_problems(with_problems(self._frame.health, silence), self._problems())
 
     def end(self) -> None:
         """Say that the node is inactive from now on."""
@@ -116,7 +115,6 @@ class HealthPublisher:
             figures['wall time of the last frame [ms]'] = f'{self._frame.wall_ms:.2f}'
             self._is_silent = self._is_silent or self._frames == self._reported
         self._reported = self._frames
-        self._found = self._problems()
         health = self.health()
         message = encode.diagnostics(
             make_rclpy, self.newest, self._name, health, {**figures, **self._figures()}

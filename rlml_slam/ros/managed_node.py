@@ -8,6 +8,8 @@ sensors and publishes nothing. Nothing that was estimated is lost by deactivate.
 from __future__ import annotations
 
 import gc
+import math
+import time
 import traceback
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -25,6 +27,7 @@ from rlml_slam.ros.kernels import prepare
 from rlml_slam.ros.run import SIGNALS
 
 BELOW = 'shadow'
+RECENT = 1.0  # [s] for which who publishes a topic is not asked again
 # what a node hears from the other end; all else is from the robot and its user
 OURS = ('rlml/', 'deskewed_points', 'reflectors/associated')
 KINDS = {
@@ -49,6 +52,7 @@ class ManagedNode(LifecycleNode):
         super().__init__(name, **options)
         self.checks: dict[str, Check] = {}
         self._own: dict[str, set[Any]] = {}
+        self._heard_of: dict[str, tuple[float, list[str]]] = {}  # by topic, and when they were
         self._failure: Exception | None = None
         self.exits = ExitStack()
         self.params: Any = declare(self, of, self.checks)
@@ -221,9 +225,13 @@ class ManagedNode(LifecycleNode):
         return super().create_service(srv_type, self._name(srv_name), callback, **options)
 
     def publishers_of(self, topic: str) -> list[str]:
-        """Full names of the nodes that publish a topic, itself among them."""
-        found = self.get_publishers_info_by_topic(topic)
-        return sorted(f'{i.node_namespace.rstrip("/")}/{i.node_name}' for i in found)
+        """Full names of the nodes that publish a topic, itself among them; at most RECENT old."""
+        now, (since, names) = time.monotonic(), self._heard_of.get(topic, (-math.inf, []))
+        if now - since > RECENT:
+            found = self.get_publishers_info_by_topic(topic)
+            names = sorted(f'{i.node_namespace.rstrip("/")}/{i.node_name}' for i in found)
+            self._heard_of[topic] = now, names
+        return names
 
     def every(self, period: float, act: Callable[[], object]) -> Any:
         """A timer [s] of the wall clock, whatever /clock does: its silence has to be noticed."""

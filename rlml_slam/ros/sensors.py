@@ -63,12 +63,13 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 class Sensors:
     """Feeds the messages of the streams to a Synchronizer and its observations to ``handle``.
 
-    Where the clock jumps back by more than the buffer holds, ``restart`` is called and a new
-    sequencer begins. At the start, scans and detections wait, in order, until /tf_static has where
-    one of their sensors is, but no longer than TF_PATIENCE: then a sensor without a transform is
-    taken to sit at ``laser_pose``, one for each topic; where its transform comes after all, a map
-    begins again. Later, a message in another frame without transform is refused, and holds up
-    nothing. Where all inputs fall silent, what still waits for odometry is used as it is.
+    Where the clock jumps back by more than the buffer holds, ``restart(False)`` is called and a
+    new sequencer begins. At the start, scans and detections wait, in order, until /tf_static has
+    where one of their sensors is, but no longer than TF_PATIENCE: then a sensor without a
+    transform is taken to sit at ``laser_pose``, one for each topic; where its transform comes
+    after all, a map begins again, by ``restart(True)``. Later, a message in another frame without
+    transform is refused, and holds up nothing. Where all inputs fall silent, what still waits for
+    odometry is used as it is.
     """
 
     def __init__(
@@ -77,7 +78,7 @@ class Sensors:
         params: Parameters,
         streams: Iterable[str],
         handle: Callable[[Observation], None],
-        restart: Callable[[], None],
+        restart: Callable[[bool], None],
     ) -> None:
         self._logger = node.get_logger()
         self._p = params
@@ -264,7 +265,8 @@ class Sensors:
         if sensor in self._assumed and self._is_placed(msg):
             self._assumed.discard(sensor)
             if _sits_elsewhere(self._feed, self._p.node, sensor):
-                self._start_again(f'{stream}: the place of {sensor!r} is on /tf_static only now')
+                why = f'{stream}: the place of {sensor!r} is on /tf_static only now'
+                self._start_again(why, misplaced=True)
         if len(seen) < MAX_SENSORS:
             seen.add(sensor)
         self._use(stream, msg)
@@ -291,10 +293,10 @@ class Sensors:
         if use is REFUSED:
             self._count_invalid(stream, self._guard.last)
 
-    def _start_again(self, why: str) -> None:
+    def _start_again(self, why: str, misplaced: bool = False) -> None:
         self._logger.warning(f'{why}: the front end starts again')
         self._begin(self.extrinsics)
-        self._restart()
+        self._restart(misplaced)
 
     def _observe(self, stream: str, msg: Any) -> None:
         try:

@@ -18,8 +18,9 @@ from rlml_slam.slam.keyframes import FoundPose
 from rlml_slam.slam.search_area import SearchArea
 from rlml_slam.types import Belief, Frame, Observation
 
-RESTARTED, GIVEN = 0, 1  # `request` of a session that nobody asked for, and of a user's pose
-FIRST_REQUEST = 2
+# `request` of a session that nobody asked for, of a user's pose, and after a misplaced sensor
+RESTARTED, GIVEN, MISPLACED = 0, 1, 2
+FIRST_REQUEST = 3
 ANY = 0  # a session, in a command that is meant for whichever there is
 
 
@@ -27,8 +28,9 @@ ANY = 0  # a session, in a command that is meant for whichever there is
 class SessionFrame:
     """A frame of the front end and where it stands in the conversation.
 
-    ``request``: number of the newest request carried out, or RESTARTED or GIVEN where the session
-    began without one. ``mode``: number of the newest LocalizeIn carried out, 0 before the first.
+    ``request``: number of the newest request carried out, or RESTARTED, GIVEN or MISPLACED where
+    the session began without one. ``mode``: number of the newest LocalizeIn carried out, 0 before
+    the first.
     """
 
     session: int

@@ -18,6 +18,7 @@ from rlml_slam.se2 import Array
 from rlml_slam.slam.conversation import (
     ANY,
     GIVEN,
+    MISPLACED,
     RESTARTED,
     Correct,
     FrontEndCommand,
@@ -70,9 +71,10 @@ class FrontEndSession:
             self._lost_since = frame.stamp
         return SessionFrame(self.session, frame, self.request, self.mode)
 
-    def restart(self) -> None:
-        """Begin at ``map_start_pose``: the clock jumped back."""
-        self._begin(np.array(self._p.node.map_start_pose), np.zeros((3, 3)), RESTARTED)
+    def restart(self, misplaced: bool = False) -> None:
+        """Begin at ``map_start_pose``: the clock jumped back, or a sensor was ``misplaced``."""
+        request = MISPLACED if misplaced else RESTARTED
+        self._begin(np.array(self._p.node.map_start_pose), np.zeros((3, 3)), request)
 
     def start_at(self, stamp: int, pose: Array, cov: Array) -> Array:
         """Begin where a user says (3,), (3, 3); the stamp of a frame says when that was.

@@ -18,6 +18,7 @@ class MappedFrames:
 
     While ``is_paused``, frames are left out, and their motion is added to that of the next one.
     ``jumps``: no motion leads to the next frame. ``found``: where a search has found the robot.
+    ``next_key``: the first that no reflector of the map has.
     """
 
     def __init__(self) -> None:
@@ -29,6 +30,7 @@ class MappedFrames:
         self.session: int | None = None
         self.jumps, self._skipped = False, STILL
         self.found: FoundPose | None = None
+        self.next_key = 0
 
     def add(self, record: SessionFrame) -> list[Command]:
         """The command to map a frame, none while paused."""
@@ -44,6 +46,7 @@ class MappedFrames:
         if self.jumps:
             frame, self.jumps = replace(frame, jumped=True), False
         self.session = record.session
+        self.next_key = max(self.next_key, 1 + int(frame.landmarks.max(initial=-1)))
         found, self.found = self.found, None
         return [MapFrame(record.session, frame, found)]
 

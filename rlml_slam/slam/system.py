@@ -20,6 +20,7 @@ from rlml_slam.slam.back_end.back_end import Update
 from rlml_slam.slam.conversation import (
     ANY,
     FIRST_REQUEST,
+    RESTARTED,
     Answer,
     Command,
     Correct,
@@ -28,7 +29,6 @@ from rlml_slam.slam.conversation import (
     LocalizeIn,
     PublishMap,
     Relocate,
-    RememberPose,
     SessionFrame,
     StartSession,
     TakeMap,
@@ -36,9 +36,9 @@ from rlml_slam.slam.conversation import (
     warning,
 )
 from rlml_slam.slam.keyframes import FoundPose
+from rlml_slam.slam.last_run import LastRun
 from rlml_slam.slam.map_entry import MapEntry
 from rlml_slam.slam.mapped_frames import MappedFrames, corrections
-from rlml_slam.slam.relocalization.pose_test import verified
 from rlml_slam.slam.relocalization.recovery import Recovery
 from rlml_slam.slam.relocalization.relocalize_answer import relocalize_answer
 from rlml_slam.slam.relocalization.scan_relocalization import Relocation
@@ -53,8 +53,9 @@ CERTAIN = 1e-6 * np.eye(3)
 class System:
     """Decides what front end and back end do; every event returns commands, to be run in order.
 
-    ``map`` is what is localized in, None while a map is made. ``entry`` is there while a saved map
-    is to be continued and the robot's place in it is not known: then nothing is mapped.
+    ``map`` is what is localized in, None while a map is made. ``entry`` is there while a map is to
+    be continued, a saved one or that in the making after a restart of the front end, and the
+    robot's place in it is not known: then nothing is mapped.
     ``mode`` is the number of the newest LocalizeIn; ``T_map_local`` (3,) is the graph's newest
     correction of the session, ``newest`` the newest frame.
     """
@@ -70,9 +71,9 @@ class System:
         self.T_map_local = np.zeros(3)
         self.frames = MappedFrames()
         self.mode = 0
+        self._patience = params.health.new_session_time
         self._past: deque[int] = deque(maxlen=PAST)
-        self._last_pose: Array | None = None  # of the last run, until it was tested
-        self._remembers = False
+        self._last_run = LastRun()
 
     def localize_in(
         self, saved: SavedMap, last_pose: Array | None = None, remembers: bool = False
@@ -82,13 +83,13 @@ class System:
         ``remembers``: the pose is written down for the next start.
         """
         self.map, self.entry = saved, None
-        self._last_pose, self._remembers = last_pose, remembers
+        self._last_run = LastRun(last_pose, remembers)
         return [*self._announce_mode(), PublishMap()]
 
     def make_map(self) -> list[Command]:
         """Make a map; it begins where the robot is, in the axes of a map that was localized in."""
         leaves, self.map = self.map is not None, None
-        self._last_pose, self._remembers = None, False
+        self._last_run = LastRun()
         out = self._announce_mode()
         return [*out, *self._forget('localization ended')] if leaves else out
 
@@ -101,13 +102,13 @@ class System:
         out = self._supersede('another map was loaded')
         self.requests.drop()
         self._forget_graph()
-        self.entry = MapEntry(saved, first_key)
+        self.entry, self.frames.next_key = MapEntry(saved, first_key), first_key
         return [*keep, *out, TakeMap(), PublishMap()]
 
     def reset(self, pose: Array) -> list[Command]:
         """Begin at a pose (3,) of the map; a map in the making is forgotten."""
         out = self._supersede('the system was reset')
-        self.entry, self._last_pose = None, None
+        self.entry, self._last_run.pose = None, None
         if self.map is None:
             out.append(self._forget_graph())
         return [*out, self._start(None, pose, CERTAIN)]
@@ -131,6 +132,9 @@ class System:
     def _forget(self, why: str) -> list[Command]:
         keep: list[Command] = [] if self.frames.session is None else [KeepMap(why)]
         return [*keep, self._forget_graph()]
+
+    def _begin_map(self, why: str) -> list[Command]:
+        return [warning(f'{why}: another map begins'), *self._forget(why)]
 
     def _forget_graph(self) -> ForgetMap:
         self.frames.forget()
@@ -166,9 +170,7 @@ class System:
             out += self.frames.add(record)
         if self.map is not None or not self.frames.is_paused:
             out += self._restore(record) + self._recover(record)
-        if self._remembers and self._last_pose is None:
-            out.append(RememberPose(record.frame))
-        return out
+        return out + self._last_run.remember(record.frame)
 
     def is_current(self, record: SessionFrame) -> bool:
         """Whether a frame is of the session that is mapped or localized in."""
@@ -187,14 +189,17 @@ class System:
         out = self._supersede('the front end began another session')
         if not self.requests.is_own(record):
             self.requests.drop()
-            self._last_pose = None
+            self._last_run.pose = None
         if self.entry is not None:
             if record.request in self.entry.requests:
-                out.append(info(f'the saved map is continued: {self.entry.why}'))
+                out.append(info(self.entry.success))
                 self.entry, self.frames.jumps = None, True
         elif self.map is None and self.frames.session is not None:
-            out.append(warning('the front end began elsewhere: another map begins'))
-            out += self._forget('the front end began elsewhere')
+            if record.request == RESTARTED:
+                self.entry = MapEntry(None, self.frames.next_key, self._patience)
+                out.append(warning(f'the front end started again: {self.entry.why}'))
+            else:
+                out += self._begin_map('the front end began elsewhere')
         elif self.map is None and is_first and not self.requests.is_own(record):
             frame = record.frame
             if not np.array_equal(frame.T_map_base, frame.T_local_base):
@@ -226,16 +231,13 @@ class System:
         return command.number, [command]
 
     def _search_entry(self, entry: MapEntry, record: SessionFrame) -> list[Command]:
-        if self.searches.is_pending(Purpose.ENTER, Purpose.CONFIRM):
-            return []
-        purpose = entry.next_search(record)
-        return [] if purpose is None else [self.searches.begin(purpose, record, entry.saved)]
+        if not entry.is_over(record.frame.stamp):
+            return entry.search(record, self.searches)
+        self.entry, out = None, self._supersede('another map begins')
+        return [*out, *self._begin_map('the robot was not found in the map')]
 
     def _restore(self, record: SessionFrame) -> list[Command]:
-        seen = record.frame.observation
-        if self._last_pose is None or self.searches.is_pending(Purpose.RESTORE):
-            return []
-        if seen.points is None and seen.detections is None:
+        if self.searches.is_pending(Purpose.RESTORE) or not self._last_run.can_be_tested(record):
             return []
         return [self.searches.begin(Purpose.RESTORE, record, self.map)]
 
@@ -254,6 +256,8 @@ class System:
         """The answer to DrawMap, however late."""
         if self.searches.purpose(number) is Purpose.RECOVER:
             self.recovery.map = saved
+        elif self.entry is not None and self.entry.saved is None:
+            self.entry.saved = saved
         return self.searches.on_drawn(number, saved)
 
     def on_search_result(self, number: int, found: Relocation) -> list[Command]:
@@ -266,9 +270,8 @@ class System:
             return self._answer(number, pending, found)
         assert record is not None
         if pending.purpose is Purpose.RESTORE:
-            assert self._last_pose is not None
-            (start, why), self._last_pose = verified(self._last_pose, found), None
-            return [warning(why)] if start is None else [info(why), self._start(record, *start)]
+            start, said = self._last_run.test(found)
+            return [said] if start is None else [said, self._start(record, *start)]
         if pending.purpose is Purpose.RECOVER:
             self.recovery.why = found.why
         elif self.entry is not None:
@@ -293,10 +296,7 @@ class System:
             believed = se2.compose(self.T_map_local, record.frame.T_local_base)
         may_jump = self.map is not None or self.entry is not None
         success, text = relocalize_answer(found, believed, may_jump)
-        out: list[Command] = [Answer(number, success, text)]
-        if success and may_jump:
-            assert record is not None
-            assert found.pose is not None
-            assert found.cov is not None
-            return [self._start(record, found.pose, found.cov), *out]
-        return out
+        said = Answer(number, success, text)
+        if not (success and may_jump) or record is None or found.pose is None or found.cov is None:
+            return [said]
+        return [self._start(record, found.pose, found.cov), said]

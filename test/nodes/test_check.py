@@ -223,7 +223,8 @@ def test_a_laser_that_hangs_upside_down(checked):
 
     def hanging(topic, msg):
         if topic == '/scan':
-            msg.angle_min, msg.angle_increment = -msg.angle_min, -msg.angle_increment
+            msg.angle_min, msg.angle_max = -msg.angle_min, -msg.angle_max
+            msg.angle_increment = -msg.angle_increment
         return [msg]
 
     _, wrong = checked(edit=hanging)

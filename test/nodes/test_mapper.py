@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import os
 import resource
+import shutil
 import threading
 import time
 from collections import defaultdict
@@ -29,7 +30,7 @@ from rlml_slam.ros.back_end.mapper import Mapper
 from rlml_slam.ros.back_end.user_requests import UserRequests
 from rlml_slam.ros.codecs.reflector_clouds import read_reflector_map
 from rlml_slam.ros.codecs.request_message import read_request
-from rlml_slam.slam.conversation import SessionFrame
+from rlml_slam.slam.conversation import GIVEN, SessionFrame
 from rlml_slam.slam.store import map_file
 from rlml_slam.types import Detections, Frame, Health, Level, Motion, Observation, Reflectors
 
@@ -181,7 +182,7 @@ def test_interval_of_the_map_changes_at_run_time(make, monkeypatch):
 def test_correction_of_one_session_is_not_of_the_next(mapper):
     give(mapper, 0, local=np.array([1.0, 0.0, 0.0]))
     mapper.system.T_map_local = np.array([1.0, 0.0, 0.0])
-    add(mapper, 1, pose=(0.5, 0.0, 0.0), session=2)
+    add(mapper, 1, pose=(0.5, 0.0, 0.0), session=2, request=GIVEN)
     *_, T = mapper.transforms[-1]
     np.testing.assert_allclose(se2.compose(T, ODOMETRY), [0.5, 0.0, 0.0], atol=1e-12)
 
@@ -294,7 +295,7 @@ def test_automatic_maps_displace_none_that_is_there(make, ear, tmp_path):
         path.write_bytes(b'x')
     mapper = make(map_directory=str(tmp_path))
     drives(mapper, range(60))
-    give(mapper, 61, session=2)
+    give(mapper, 61, session=2, request=GIVEN)
     assert all(path.read_bytes() == b'x' for path in old)
     assert len([*tmp_path.glob('*.lost-*')]) == 21
 
@@ -304,14 +305,14 @@ def test_map_is_kept_when_the_front_end_begins_anew(make, ear, tmp_path):
     drives(mapper, range(60))
     keys = len(mapper.back_end.keyframes)
     assert keys > 10
-    give(mapper, 61, session=2)
+    give(mapper, 61, session=2, request=GIVEN)
     assert lost(tmp_path) == {'map.lost-5.rlml': keys}
     assert ear.warnings[-1].find('the map until now is kept: ') > 0
     # nothing is in the new map, and what is in a file already is not kept twice
-    drives(mapper, range(62, 120), session=2)
+    drives(mapper, range(62, 120), session=2, request=GIVEN)
     mapper.back_end.reflectors = lambda: posts(5)
     mapper.requests.save('map')
-    give(mapper, 120, session=3)
+    give(mapper, 120, session=3, request=GIVEN)
     assert len(lost(tmp_path)) == 1
 
 
@@ -336,7 +337,7 @@ def test_map_that_cannot_be_kept_does_not_stop_the_next_one(make, ear, tmp_path)
     (tmp_path / 'file').touch()
     mapper = make(map_directory=str(tmp_path / 'file'))
     drives(mapper, range(60))
-    give(mapper, 61, session=2)
+    give(mapper, 61, session=2, request=GIVEN)
     assert ear.warnings[-1].find('the map until now is not kept: ') > 0
     assert len(mapper.back_end.keyframes) == 1
 
@@ -349,7 +350,7 @@ def test_map_made_here_stays_whole_while_it_is_localized_in(make, ear, tmp_path)
     mapper.back_end.reflectors = lambda: posts(5)
     mapper.requests.localize(True)
     mapper.back_end.reflectors = found
-    drives(mapper, range(60, 70), session=2)
+    drives(mapper, range(60, 70), session=2, request=GIVEN)
     np.testing.assert_array_equal(mapper.system.T_map_local, np.zeros(3))
     mapper.requests.save('map')
     assert len(map_file.load(tmp_path / 'map.rlml').arrays['pose']) == keys
@@ -583,6 +584,19 @@ def test_end_of_the_node_saves_nothing_twice(make, tmp_path):
     assert [p for p in tmp_path.iterdir() if 'autosave' in p.name or 'journal' in p.name] == []
 
 
+def test_pause_is_named_where_nothing_is_mapped(make, tmp_path):
+    mapper = make(map_directory=str(tmp_path))
+    mapper.execute(mapper.system.pause(True))
+    drives(mapper, range(3))
+    with pytest.raises(MapError, match='no map yet: new measurements are left out'):
+        mapper.requests.save('map')
+    mapper.execute(mapper.system.localize_in(SavedMap(posts(5))))
+    assert 'left out' in mapper.requests.localize(False)
+    mapper.execute(mapper.system.pause(False))
+    mapper.execute(mapper.system.localize_in(SavedMap(posts(5))))
+    assert 'left out' not in mapper.requests.localize(False)
+
+
 def test_map_of_a_killed_process_is_recovered(make, ear, tmp_path):
     mapper = make(map_directory=str(tmp_path), journal_period=1e-3)
     drives(mapper, range(60))
@@ -637,7 +651,7 @@ def test_journal_that_cannot_be_written_is_reported_once(make, ear, tmp_path):
 def test_journal_begins_again_with_another_map(make, tmp_path):
     mapper = make(map_directory=str(tmp_path), journal_period=1e-3)
     drives(mapper, range(60))
-    drives(mapper, range(62, 120), session=2)
+    drives(mapper, range(62, 120), session=2, request=GIVEN)
     keys = len(mapper.back_end.keyframes)
     killed(mapper)
     searched(make(map_directory=str(tmp_path)))
@@ -676,6 +690,40 @@ def test_full_disk_is_reported_and_what_was_written_is_recovered(make, ear, tmp_
     assert again.problems() == ()
     (saved,) = tmp_path.glob('map.autosave-*.rlml')
     assert 10 < len(map_file.load(saved).arrays['pose']) < keys
+
+
+def test_journal_goes_on_once_the_map_was_saved(make, ear, tmp_path):
+    mapper = make(map_directory=str(tmp_path), journal_period=1e-3)
+    mapper.back_end.reflectors = lambda: posts(5)
+    drives(mapper, range(60))
+    (left,) = journals(tmp_path)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (left.stat().st_size + 100, before[1]))
+    try:
+        drives(mapper, range(60, 90))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert 'File too large' in mapper.problems()[0]
+    mapper.requests.save('map')
+    assert mapper.problems() == ()
+    drives(mapper, range(90, 120))
+    poses = mapper.back_end.graph.poses.copy()
+    killed(mapper)
+    again = make(map_directory=str(tmp_path), continue_map=True)
+    np.testing.assert_allclose(again.back_end.graph.poses, poses, atol=1e-6)
+
+
+def test_journal_that_was_removed_is_reported(make, ear, tmp_path):
+    mapper = make(map_directory=str(tmp_path / 'maps'), journal_period=1e-3)
+    mapper.back_end.reflectors = lambda: posts(5)
+    drives(mapper, range(60))
+    shutil.rmtree(tmp_path / 'maps')
+    drives(mapper, range(60, 90))
+    assert 'was removed: save the map' in mapper.problems()[0]
+    mapper.requests.save('map')
+    drives(mapper, range(90, 100))
+    assert mapper.problems() == ()
+    assert len(journals(tmp_path / 'maps')) == 1
 
 
 def test_journals_count_as_automatic_files(make, ear, tmp_path):

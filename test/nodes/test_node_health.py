@@ -13,6 +13,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
 from live import LATCHED, room
+from std_msgs.msg import String
 
 from rlml_slam.nodes.back_end import BackEndNode
 from rlml_slam.nodes.deformable_slam import DeformableSlamNode
@@ -71,6 +72,27 @@ def test_each_scan_has_its_health_at_once(live, node):
     assert poses > 20
 
 
+def test_problems_are_part_of_the_first_health(live, node):
+    """They had come with the figures, up to a second later."""
+    for stream, msg in room(('/scan', '/odom'), seconds=3.0):
+        node.sensors.add(stream, msg)
+        if node.last is not None:
+            break
+    node.health._problems = lambda: ('not yet in the map',)
+    node.health.update(node.last)
+    live.spin_until(lambda: 'not yet in the map' in live.heard[HEALTH][-1].message, timeout=0.5)
+    assert level(live.heard[HEALTH][-1]) == Level.DEGRADED
+
+
+def test_back_end_in_another_process_says_that_poses_are_not_in_its_map(live, node):
+    text = String(data='not yet in the saved map: it is searched')
+    publisher = live.ear.create_publisher(String, 'rlml/map_entry', LATCHED)
+    publisher.publish(text)
+    live.spin_until(lambda: text.data in node.problems())
+    publisher.publish(String())
+    live.spin_until(lambda: not any('saved map' in problem for problem in node.problems()))
+
+
 def test_level_is_logged_where_it_changes(live, node):
     live.listen('/rosout', 'rcl_interfaces/msg/Log', 100)
     live.spin_until(lambda: live.ear.count_publishers('/rosout') > 1)
@@ -78,7 +100,6 @@ def test_level_is_logged_where_it_changes(live, node):
     for health in (Health(), Health(), Health(Level.LOST, ('nothing fits', 'slow'))):
         frame.health = health
         node.health.update(frame)
-        node.health._found = ()
         node.health._problems = tuple
         node.health.publish()
     live.spin_until(lambda: [m.msg for m in live.heard['/rosout'] if 'health' in m.msg][1:])
@@ -102,7 +123,7 @@ def test_another_publisher_of_the_pose_is_a_problem(live, node, monkeypatch):
 def test_silence_is_said_without_waiting_for_diagnostics(live, node, monkeypatch):
     for stream, msg in room(('/scan', '/odom'), seconds=2.0):
         node.sensors.add(stream, msg)
-    node.health._found = ()
+    node.health._problems = tuple
     heard = node.health._heard
     live.heard[HEALTH].clear()
     monkeypatch.setattr(diagnostics.time, 'monotonic', lambda: heard + 1.1)

@@ -241,8 +241,8 @@ SCENARIOS = (
         node=LOCALIZES, empty=True,
     ),
     Scenario(
-        'restart of the front end', TWICE, se2.inverse(TWICE[100]), ('map',),
-        ((100, 'restart_front_end', ()),), kept=1,
+        'restart of the front end', TWICE, HOME, ('map', 'start'),
+        ((100, 'restart_front_end', ()),),
     ),
     Scenario(
         'restart of the front end while localizing', TWICE, HOME, ('localize', 'relocate'),
@@ -257,8 +257,8 @@ SCENARIOS = (
         ((40, 'load', (SAVED,)),), delay=5.0, more=True,
     ),
     Scenario(
-        'clock that jumps back', TWICE, se2.inverse(TWICE[110]), ('map',),
-        ((100, 'jump_back', (30.0,)),), kept=1,
+        'clock that jumps back', TWICE, HOME, ('map', 'start'),
+        ((100, 'jump_back', (30.0,)),),
     ),
     Scenario(
         'set_localization_mode', TWICE, HOME, ('map', 'localize', 'map'),

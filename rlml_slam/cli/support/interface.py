@@ -65,6 +65,9 @@ TOPICS = (
           'of the back end: reflectors to localize in; a cloud without fields ends it'),
     Topic('front_end', IN, 'rlml/localization_grid', 'nav_msgs/OccupancyGrid', LATCHED,
           'of the back end: the grid of that map, for the scans'),
+    Topic('front_end', IN, 'rlml/map_entry', 'std_msgs/String', LATCHED,
+          'of the back end: why poses are not in the map that is to be continued; empty where '
+          'they are'),
     Topic('front_end', IN, '/tf', TF, SENSOR, ODOM_TF),
     Topic('front_end', IN, '/tf_static', 'tf2_msgs/TFMessage', LATCHED, 'where the sensors sit'),
     Topic('front_end', OUT, 'pose', POSE, RELIABLE,
@@ -99,6 +102,8 @@ TOPICS = (
           'for the front end: reflectors to localize in; the stamp is a number'),
     Topic('back_end', OUT, 'rlml/localization_grid', 'nav_msgs/OccupancyGrid', LATCHED,
           'for the front end: the grid of that map; the stamp is a number'),
+    Topic('back_end', OUT, 'rlml/map_entry', 'std_msgs/String', LATCHED,
+          'for the front end: why poses are not in the map that is to be continued'),
     Topic('back_end', OUT, 'updates', CLOUD, RELIABLE,
           'what each keyframe cost, and the loop closures that it brought'),
     Topic('back_end', OUT, '/tf', 'tf2_msgs/TFMessage', RELIABLE,

@@ -81,6 +81,8 @@ class MapJournal:
             if self._file is None:
                 self._file = self._open()
             self._journal.write(self._file)
+            if os.fstat(self._file.fileno()).st_nlink == 0:
+                self._stop('was removed: save the map')
             if self._file.tell() > MAX_BYTES:
                 self._stop(f'has {MAX_BYTES / 1e9:.0f} GB: save the map and start again')
         except OSError as e:

@@ -39,6 +39,15 @@ class MapTopics:
         self._updates = node.create_publisher(cloud, 'updates', 50)
         self._grid = node.create_publisher(grid, 'rlml/localization_grid', LATCHED)
         self._reflectors = node.create_publisher(cloud, 'rlml/localization_map', LATCHED)
+        text = rclpy_class('std_msgs/msg/String')
+        self._entry = node.create_publisher(text, 'rlml/map_entry', LATCHED)
+        self._problem: str | None = None  # the newest that was published there
+
+    def show_entry(self, problem: str) -> None:
+        """Why poses are not in the map that is to be continued, '' where they are."""
+        if problem != self._problem:
+            self._problem = problem
+            self._entry.publish(make_rclpy('std_msgs/msg/String', data=problem))
 
     def show_alive(self) -> None:
         """Let front ends know that this back end runs."""

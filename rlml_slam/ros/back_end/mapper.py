@@ -112,12 +112,14 @@ class Mapper:
             self.transform.restart()
         self._session = record.session
         self._heard = time.monotonic()
-        if self.system.entry is None:
+        goes_on = self.system.session in (None, record.session) or record.request != say.RESTARTED
+        if self.system.entry is None and goes_on:
             self.transform.follow(record.frame)
         self.worker.submit(lambda: self._add(record))
 
     def _add(self, record: say.SessionFrame) -> None:
         self.execute(self.system.on_frame(record))
+        self._topics.show_entry('; '.join(self.entry_problems()))
         if not self.system.is_current(record):
             return
         self._newest = record.frame
@@ -215,6 +217,7 @@ class Mapper:
     def settle(self) -> None:
         """Now and then: show that it runs, write the journal, and send the map in a silence."""
         self._topics.show_alive()
+        self._topics.show_entry('; '.join(self.entry_problems()))
         if self.journal.is_due:
             self.worker.submit(self.journal.write)
         silent = time.monotonic() - self._heard >= IDLE
@@ -267,4 +270,4 @@ class Mapper:
     def entry_problems(self) -> tuple[str, ...]:
         """Why poses are not in the saved map that is to be continued."""
         entry = self.system.entry
-        return () if entry is None else (f'not yet in the saved map: {entry.why}',)
+        return () if entry is None else (entry.problem,)

@@ -18,6 +18,8 @@ from rlml_slam.slam.closures.closure_table import describe
 from rlml_slam.slam.conversation import Answer, Command
 from rlml_slam.slam.store import map_file
 
+PAUSED = 'new measurements are left out, see pause_new_measurements'
+
 
 class UserRequests:
     """Methods are called in the mapper's worker; files are read and checked before they act.
@@ -83,7 +85,13 @@ class UserRequests:
             raise MapError('the map that was loaded does not change: nothing to save')
         current = mapper.current()
         undrawn = mapper.products.undrawn if mapper.system.map is None else ''
-        return self._archive.save(name, mapper.back_end, current, undrawn)
+        if mapper.system.frames.is_paused and not mapper.back_end.keyframes:
+            undrawn = undrawn or f'there is no map yet: {PAUSED}'
+        text = self._archive.save(name, mapper.back_end, current, undrawn)
+        if mapper.journal.problem and mapper.back_end.keyframes:  # what has come since is in it
+            content = map_file.content_of(mapper.back_end, self._p, current.grid)
+            mapper.journal.restart(content)
+        return text
 
     def load(self, name: str) -> SavedMap:
         """Localize in another saved map, or while mapping go on with it.
@@ -130,7 +138,8 @@ class UserRequests:
             return 'localizes already' if on else 'maps already'
         if not on:
             mapper.execute(system.make_map())
-            return 'maps: a new map begins where the robot is, in the axes of the old one'
+            paused = f'; {PAUSED}' if system.frames.is_paused else ''
+            return f'maps: a new map begins where the robot is, in the axes of the old one{paused}'
         current = require_contents(mapper.current())
         self._is_loaded, mapper.last_pose = False, None
         mapper.execute(system.localize_in(current))

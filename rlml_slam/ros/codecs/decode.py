@@ -145,7 +145,7 @@ def _check_angle_max(msg: Any, n: int, topic: str) -> None:
     step, last = float(msg.angle_increment), float(msg.angle_max)
     view = step * (n - 1)
     end = float(msg.angle_min) + view
-    if last != 0.0 and abs(last - end) > 2.0 * abs(step) + END * abs(view):
+    if n > 1 and view and last and abs(last - end) > 2.0 * abs(step) + END * abs(view):
         raise InputError(
             f'{topic}: angle_max is {last:.4g} rad, but {n} beams end at angle_min + {n - 1} * '
             f'angle_increment = {end:.4g} rad'

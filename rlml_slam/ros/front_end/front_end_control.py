@@ -32,6 +32,8 @@ ABSENT = 2.0  # [s] without a sign of the back end, after which it is reported
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 CLOUD = 'sensor_msgs/msg/PointCloud2'
 GRID = 'nav_msgs/msg/OccupancyGrid'
+TEXT = 'std_msgs/msg/String'
+LONGEST = 500  # characters of a text that is passed on
 
 
 class FrontEndControl:
@@ -71,7 +73,9 @@ class FrontEndControl:
             (CLOUD, 'rlml/session_start', self.on_request, RELIABLE, SMALL),
             (GRID, 'rlml/localization_grid', self.on_grid, LATCHED, LARGE),
             (CLOUD, 'rlml/localization_map', self.on_map, LATCHED, LARGE),
+            (TEXT, 'rlml/map_entry', self.on_entry, LATCHED, SMALL),
         )
+        self._entry: tuple[str, ...] = ()  # why poses are not in the back end's map
         self._absent: float | None = None if has_back_end else time.monotonic()
         for kind, topic, use, qos, largest in (
             (POSE, 'initialpose', self.start_at, RELIABLE, SMALL),
@@ -89,12 +93,12 @@ class FrontEndControl:
         """What makes the front end's health DEGRADED besides its estimate."""
         silent = 0.0 if self._absent is None else time.monotonic() - self._absent
         if silent < ABSENT:
-            return ()
+            return self._entry
         return (f'no correction for {silent:.1f} s: is back_end running?',)
 
-    def restart(self) -> None:
-        """Begin at ``map_start_pose``: the clock jumped back."""
-        self.session.restart()
+    def restart(self, misplaced: bool = False) -> None:
+        """Begin at ``map_start_pose``: the clock jumped back, or a sensor was ``misplaced``."""
+        self.session.restart(misplaced)
         self._began()
 
     def start_at(self, msg: Any) -> None:
@@ -103,6 +107,10 @@ class FrontEndControl:
         pose = self.session.start_at(start.stamp, start.pose, start.cov)
         self._began()
         self._logger.info(f'begins at {np.round(pose, 3).tolist()}, as given on initialpose')
+
+    def on_entry(self, msg: Any) -> None:
+        """Why poses are not in the map that the back end is to continue, '' where they are."""
+        self._entry = (msg.data[:LONGEST],) if msg.data else ()
 
     def on_request(self, msg: Any) -> None:
         """A place where the back end found the robot."""
