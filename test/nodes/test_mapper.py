@@ -55,6 +55,11 @@ class Ear:
         self.warnings = []
         self.now = SECOND
 
+    namespace = '/'
+
+    def get_namespace(self):
+        return self.namespace
+
     def get_clock(self):
         return SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=self.now))
 
@@ -518,6 +523,13 @@ def test_robot_that_was_moved_while_it_was_off_does_not(make, ear, switched_off)
     assert 'is not restored: the robot is rather at x = -1.5' in ear.warnings[-1]
 
 
+def test_robots_of_one_map_have_a_last_pose_each(make, ear, switched_off):
+    ear.namespace = '/hall/r2'
+    mapper = make(map_directory=str(switched_off), mode='localization', restore_pose=True)
+    assert mapper.last_pose is not None
+    assert mapper.last_pose._path == switched_off / 'map.hall.r2.pose'
+
+
 def test_last_pose_that_is_damaged_or_not_wanted_is_left(make, ear, switched_off):
     mapper = make(mode='localization', map_directory=str(switched_off), restore_pose=False)
     sees(mapper, 0, HERE, Level.DEGRADED)
@@ -653,6 +665,7 @@ def test_journal_begins_again_with_another_map(make, tmp_path):
     drives(mapper, range(60))
     drives(mapper, range(62, 120), session=2, request=GIVEN)
     keys = len(mapper.back_end.keyframes)
+    mapper.journal.flush()  # the last frame may have come within its period
     killed(mapper)
     searched(make(map_directory=str(tmp_path)))
     (saved,) = tmp_path.glob('map.autosave-*.rlml')
@@ -724,6 +737,15 @@ def test_journal_that_was_removed_is_reported(make, ear, tmp_path):
     drives(mapper, range(90, 100))
     assert mapper.problems() == ()
     assert len(journals(tmp_path / 'maps')) == 1
+
+
+@pytest.mark.parametrize('name', ['a\nb', 'map.autosave-5', 'x.journal-1', 'map.lost-7.rlml'])
+def test_names_that_no_map_should_have_are_refused(make, tmp_path, name):
+    mapper = make(map_directory=str(tmp_path))
+    mapper.back_end.reflectors = lambda: posts(5)
+    drives(mapper, range(30))
+    with pytest.raises(MapError, match=r'is a name of automatic files|is no name of a file'):
+        mapper.requests.save(name)
 
 
 def test_journals_count_as_automatic_files(make, ear, tmp_path):

@@ -14,7 +14,7 @@ from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved_map import SavedMap, newer_image
 from rlml_slam.motion import SECOND
 from rlml_slam.params import Parameters
-from rlml_slam.ros.back_end.map_folder import AUTOSAVE, LOST, SUFFIXES, MapFolder
+from rlml_slam.ros.back_end.map_folder import AUTOMATIC, AUTOSAVE, LOST, SUFFIXES, MapFolder
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.store import map_file
 
@@ -54,6 +54,8 @@ class MapArchive:
     def save(self, name: str, back_end: BackEnd, current: SavedMap, undrawn: str) -> str:
         """Write a map under a name; what was written. Raises MapError."""
         whole = self.folder.whole(name)
+        if any(kind in whole.name for kind in AUTOMATIC):
+            raise MapError(f'{name!r} is a name of automatic files, which are removed in time')
         if current.grid is None and len(current.reflectors) == 0:
             raise MapError(undrawn or 'there is no map yet')
         try:

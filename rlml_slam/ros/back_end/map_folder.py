@@ -43,7 +43,7 @@ class MapFolder:
 
     def _inside(self, name: str, what: str) -> Path:
         """A path of the folder, links followed; MapError where it leads out, or is none."""
-        if '\0' in name or len(name.encode(errors='replace')) > MAX_NAME:
+        if any(ord(c) < ord(' ') for c in name) or len(name.encode(errors='replace')) > MAX_NAME:
             raise MapError(f'{what} {name[:MAX_NAME]!r} is no name of a file')
         path = (self.root / name).resolve()
         if not path.is_relative_to(self.root):

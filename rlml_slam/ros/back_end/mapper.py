@@ -51,6 +51,8 @@ class Mapper:
     ) -> None:
         self._p = params
         self._logger = node.get_logger()
+        # by which names of files differ between robots: that of the namespace, '' without one
+        self.robot = node.get_namespace().rstrip('/').replace('/', '.')
         self.archive = MapArchive(params, self._logger)
         self.journal = MapJournal(self.archive.folder, params, self._logger)
         self._is_kept = True  # whether what KeepMap asked for was written

@@ -112,7 +112,7 @@ class UserRequests:
         saved, last, pose = self._archive.load_saved(name), None, None
         if self._p.node.restore_pose:
             path = folder.path(name)
-            last = LastPose(path.with_name(path.name + '.pose'))
+            last = LastPose(path.with_name(f'{path.name}{self._mapper.robot}.pose'))
             try:
                 pose = last.read() if is_first else None
             except FileFormatError as e:
