@@ -183,7 +183,7 @@ class User(Node):
         first = int(self._figures['keyframes'])
 
         def grows() -> bool:
-            entered = 'saved map not entered' not in self._figures
+            entered = 'map not entered' not in self._figures
             return entered and int(self._figures['keyframes']) > first
 
         entered = self.wait(grows, most)

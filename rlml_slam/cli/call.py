@@ -135,10 +135,13 @@ def set_parameter(asker: Any, node: str, name: str, text: str) -> str:
     if kind == Parameter.Type.NOT_SET:
         raise InputError(f'{node} has no parameter {name!r}')
     value: Any = text
-    if kind != Parameter.Type.STRING:
-        value = parameter_value_to_python(get_parameter_value(text))
-    if kind == Parameter.Type.DOUBLE and type(value) is int:
-        value = float(value)
+    try:
+        if kind == Parameter.Type.DOUBLE:
+            value = float(text)
+        elif kind != Parameter.Type.STRING:
+            value = parameter_value_to_python(get_parameter_value(text))
+    except Exception as e:  # of whatever reads YAML there
+        raise InputError(f'{name}: {text!r} is no value of it') from e
     given = [Parameter(name, value=value).to_parameter_msg()]
     answer = answer_of(asker, node, 'set_parameters', SetParameters, {'parameters': given})
     if not answer.results[0].successful:

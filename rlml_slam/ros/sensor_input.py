@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rlml_slam import se2
 from rlml_slam.errors import InputError
@@ -25,7 +24,7 @@ from rlml_slam.sensing.synchronization.input_counts import InputCounts
 from rlml_slam.types import ANONYMOUS, Detections, Imu, Odometry, Scan
 
 Out = TypeVar('Out')
-MANY = 20  # reflectors, of which most are too near to another one only in the points of a scan
+MANY, MOST = 20, 0.7  # rows, and the share that is near to the next one only in a scan
 # stream of the sequencer -> parameter with the topic's name, type, whether the only topic of the
 # type may stand in, bytes of a beam or reflector with whatever else a driver says of it (without,
 # only small messages are taken). Any PointCloud2 or PoseArray may be something else.
@@ -196,15 +195,15 @@ class SensorInput(Generic[Out]):
         return mirrored_detections(seen) if self.hangs(seen.frame_id) else seen
 
     def _check_apart(self, stream: str, seen: Detections) -> None:
-        """Raise InputError where most reflectors are too near to another one: it is a scan."""
-        n, apart = len(seen), self._p.reflector.min_separation
-        if n < MANY:
-            return
-        near = np.sum(cKDTree(seen.points).query(seen.points, 2)[0][:, 1] < apart)
-        if near > 0.5 * n:
+        """Raise InputError where most rows without id are too near to the next: it is a scan."""
+        points, apart = seen.points[seen.ids == ANONYMOUS], self._p.reflector.min_separation
+        steps = np.hypot(*np.diff(points, axis=0).T)
+        steps = steps[steps > 0.0]  # the others are there twice, or fill the cloud up
+        near = int(np.sum(steps < apart))
+        if len(steps) >= MANY and near > MOST * len(steps):
             raise InputError(
-                f'{stream}: {near} of {n} points are less than {apart:g} m from another one: '
-                'they are of a scan, not reflectors'
+                f'{stream}: {near} of {len(points)} points are less than {apart:g} m from the '
+                'next one: they are of a scan, not reflectors'
             )
 
     def _with_names(self, stream: str, seen: Detections, size: int) -> Detections:

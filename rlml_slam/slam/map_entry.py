@@ -18,7 +18,8 @@ class MapEntry:
     and that the frame confirms; never at one that is only assumed. ``saved`` is None until a map
     in the making is drawn. ``first_key`` is the first that no reflector of the map has.
     ``requests`` are the numbers of sessions in the map that were asked for. A ``patience`` [s] is
-    for a map in the making: where the robot is not found in it, another one begins.
+    for a map in the making: where the robot is not found in it, another one begins. It counts for
+    each session, and where a search was answered.
     """
 
     def __init__(
@@ -31,6 +32,7 @@ class MapEntry:
         self.is_saved = patience is None
         self._patience = 0 if patience is None else round(1e9 * patience)
         self._since: int | None = None  # stamp
+        self._is_answered = False
         self._schedule: SearchSchedule | None = None
         self._given_until: int | None = None  # stamp
         self._session: int | None = None
@@ -47,28 +49,50 @@ class MapEntry:
         """What to say when the map is entered."""
         return f'the {"saved map" if self.is_saved else "map"} is continued: {self.why}'
 
-    def is_over(self, stamp: int) -> bool:
+    def start(self, number: int) -> int:
+        """A session in the map is asked for by this number; the key of its first new reflector."""
+        self.requests.add(number)
+        self._since, self._is_answered = None, False  # where the request is lost
+        return self.first_key
+
+    def on_answer(self, why: str) -> None:
+        """What a search has found."""
+        self.why, self._is_answered = why, True
+
+    def is_over(self, record: SessionFrame, searches: Searches) -> bool:
         """Whether the robot has been searched for longer than the patience."""
+        stamp = record.frame.stamp
+        if record.session != self._session:
+            self._begin_session(record)
         if self._since is None or stamp < self._since:
             self._since = stamp
-        return not self.is_saved and stamp - self._since > self._patience
+        late = stamp - self._since > self._patience and not self._is_given(stamp)
+        return late and self._is_answered and not (self.is_saved or _is_searched(searches))
 
     def search(self, record: SessionFrame, searches: Searches) -> list[Command]:
         """The search of a frame, none while another one is under way."""
-        purpose = (
-            None if searches.is_pending(Purpose.ENTER, Purpose.CONFIRM) else self._next(record)
-        )
+        if _is_searched(searches):
+            return []
+        purpose = self._purpose(record)
         if purpose is None:
             return []
         return [searches.begin(purpose, record, self.saved, self.is_saved)]
 
-    def _next(self, record: SessionFrame) -> Purpose | None:
-        stamp = record.frame.stamp
-        if record.session != self._session:
-            self._session = record.session
-            self._given_until = stamp + GIVEN_TIME if record.request == GIVEN else None
-        if self._given_until is not None and stamp <= self._given_until:
+    def _begin_session(self, record: SessionFrame) -> None:
+        self._session, self._since, self._is_answered = record.session, None, False
+        is_given = record.request == GIVEN
+        self._given_until = record.frame.stamp + GIVEN_TIME if is_given else None
+
+    def _is_given(self, stamp: int) -> bool:
+        return self._given_until is not None and stamp <= self._given_until
+
+    def _purpose(self, record: SessionFrame) -> Purpose | None:
+        if self._is_given(record.frame.stamp):
             return Purpose.CONFIRM
-        if self._schedule is None or stamp < self._schedule.since:
-            self._schedule = SearchSchedule(stamp)
+        if self._schedule is None or record.frame.stamp < self._schedule.since:
+            self._schedule = SearchSchedule(record.frame.stamp)
         return Purpose.ENTER if self._schedule.is_due(record.frame) else None
+
+
+def _is_searched(searches: Searches) -> bool:
+    return searches.is_pending(Purpose.ENTER, Purpose.CONFIRM)

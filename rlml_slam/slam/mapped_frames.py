@@ -18,7 +18,8 @@ class MappedFrames:
 
     While ``is_paused``, frames are left out, and their motion is added to that of the next one.
     ``jumps``: no motion leads to the next frame. ``found``: where a search has found the robot.
-    ``next_key``: the first that no reflector of the map has.
+    ``next_key``: the first that no reflector of the map has; ``has_map``: there is something in
+    the graph.
     """
 
     def __init__(self) -> None:
@@ -30,7 +31,7 @@ class MappedFrames:
         self.session: int | None = None
         self.jumps, self._skipped = False, STILL
         self.found: FoundPose | None = None
-        self.next_key = 0
+        self.next_key, self.has_map = 0, False
 
     def add(self, record: SessionFrame) -> list[Command]:
         """The command to map a frame, none while paused."""
@@ -45,7 +46,7 @@ class MappedFrames:
             return []
         if self.jumps:
             frame, self.jumps = replace(frame, jumped=True), False
-        self.session = record.session
+        self.session, self.has_map = record.session, True
         self.next_key = max(self.next_key, 1 + int(frame.landmarks.max(initial=-1)))
         found, self.found = self.found, None
         return [MapFrame(record.session, frame, found)]

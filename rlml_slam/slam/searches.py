@@ -14,7 +14,7 @@ from rlml_slam.slam.search_area import SearchArea, search_area
 class Purpose(Enum):
     """What a search is for."""
 
-    ENTER = 'to enter a saved map'
+    ENTER = 'to enter a map that is to be continued'
     CONFIRM = 'to test the pose that a user gave'
     RECOVER = 'to find a lost robot'
     RESTORE = 'to test the pose of the last run'
@@ -25,12 +25,14 @@ class Purpose(Enum):
 class Pending:
     """A search under way: of which frame, None where there was none yet, and where.
 
-    In a map in the making, what fits outside of the ``area`` may be a twin of what is not mapped.
+    The map is ``complete``, or drawn while it is made. In a map in the making, what fits outside
+    of the ``area`` may be a twin of what is not mapped.
     """
 
     purpose: Purpose
     record: SessionFrame | None
     area: SearchArea | None
+    complete: bool
 
 
 class Searches:
@@ -57,15 +59,15 @@ class Searches:
         is_unfinished = saved is None or not complete
         if purpose is Purpose.RECOVER and is_unfinished and record is not None:
             area = search_area(record.frame)
-        self._pending[number] = Pending(purpose, record, area)
+        self._pending[number] = Pending(purpose, record, area, complete)
         if saved is None:
             return DrawMap(number)
         return self._search(number, saved, complete)
 
     def on_drawn(self, number: int, saved: SavedMap) -> list[Command]:
-        """The search that the map was drawn for; it is not complete while a robot is lost."""
-        purpose = self.purpose(number)
-        return [] if purpose is None else [self._search(number, saved, purpose is Purpose.ANSWER)]
+        """The search that the map was drawn for."""
+        pending = self._pending.get(number)
+        return [] if pending is None else [self._search(number, saved, pending.complete)]
 
     def _search(self, number: int, saved: SavedMap, complete: bool) -> Search:
         pending = self._pending[number]

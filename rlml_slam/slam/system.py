@@ -20,6 +20,7 @@ from rlml_slam.slam.back_end.back_end import Update
 from rlml_slam.slam.conversation import (
     ANY,
     FIRST_REQUEST,
+    MISPLACED,
     RESTARTED,
     Answer,
     Command,
@@ -53,11 +54,9 @@ CERTAIN = 1e-6 * np.eye(3)
 class System:
     """Decides what front end and back end do; every event returns commands, to be run in order.
 
-    ``map`` is what is localized in, None while a map is made. ``entry`` is there while a map is to
-    be continued, a saved one or that in the making after a restart of the front end, and the
-    robot's place in it is not known: then nothing is mapped.
-    ``mode`` is the number of the newest LocalizeIn; ``T_map_local`` (3,) is the graph's newest
-    correction of the session, ``newest`` the newest frame.
+    ``map`` is what is localized in, None while a map is made. With an ``entry``, the robot's place
+    in a map to be continued is not known, and nothing is mapped. ``mode`` is the number of the
+    newest LocalizeIn; ``T_map_local`` (3,) is the graph's newest correction of the session.
     """
 
     def __init__(self, params: Parameters, first_request: int = FIRST_REQUEST) -> None:
@@ -66,11 +65,10 @@ class System:
         self.recovery = Recovery(params)
         self.map: SavedMap | None = None
         self.entry: MapEntry | None = None
-        self.newest: SessionFrame | None = None
+        self.newest: SessionFrame | None = None  # frame
         self.session: int | None = None
-        self.T_map_local = np.zeros(3)
+        self.mode, self.T_map_local = 0, np.zeros(3)
         self.frames = MappedFrames()
-        self.mode = 0
         self._patience = params.health.new_session_time
         self._past: deque[int] = deque(maxlen=PAST)
         self._last_run = LastRun()
@@ -103,6 +101,7 @@ class System:
         self.requests.drop()
         self._forget_graph()
         self.entry, self.frames.next_key = MapEntry(saved, first_key), first_key
+        self.frames.has_map = True
         return [*keep, *out, TakeMap(), PublishMap()]
 
     def reset(self, pose: Array) -> list[Command]:
@@ -143,10 +142,8 @@ class System:
     def _start(self, record: SessionFrame | None, pose: Array, cov: Array) -> StartSession:
         """Begin a session at a pose that a frame has, or that is the robot's now."""
         session, stamp = (ANY, 0) if record is None else (record.session, record.frame.stamp)
-        number, first_key = self.requests.new_number(), 0
-        if self.entry is not None:
-            first_key = self.entry.first_key
-            self.entry.requests.add(number)
+        number = self.requests.new_number()
+        first_key = 0 if self.entry is None else self.entry.start(number)
         return self.requests.ask(StartSession(number, session, stamp, pose, cov, first_key))
 
     def on_frame(self, record: SessionFrame) -> list[Command]:
@@ -185,16 +182,17 @@ class System:
         is_first = self.session is None
         if self.session is not None:
             self._past.append(self.session)
-        self.session, self.T_map_local = record.session, np.zeros(3)
+        self.T_map_local = np.zeros(3)
         out = self._supersede('the front end began another session')
         if not self.requests.is_own(record):
             self.requests.drop()
             self._last_run.pose = None
-        if self.entry is not None:
+        if self.entry is not None and (self.entry.is_saved or record.request != MISPLACED):
             if record.request in self.entry.requests:
                 out.append(info(self.entry.success))
                 self.entry, self.frames.jumps = None, True
-        elif self.map is None and self.frames.session is not None:
+        elif self.map is None and self.frames.has_map:
+            self.entry = None
             if record.request == RESTARTED:
                 self.entry = MapEntry(None, self.frames.next_key, self._patience)
                 out.append(warning(f'the front end started again: {self.entry.why}'))
@@ -205,6 +203,7 @@ class System:
             if not np.array_equal(frame.T_map_base, frame.T_local_base):
                 # another run of the back end has corrected it: the map begins where it is
                 out.append(self._start(record, frame.T_map_base, frame.cov_map))
+        self.session = record.session  # last: another thread looks at it
         return out
 
     def on_update(
@@ -226,15 +225,17 @@ class System:
 
     def relocalize(self) -> tuple[int, list[Command]]:
         """Find the newest frame anywhere in the map, for a user: the number of the Answer."""
-        known = self.map if self.entry is None else self.entry.saved
-        command = self.searches.begin(Purpose.ANSWER, self.newest, known)
+        entry = self.entry
+        known, complete = (self.map, True) if entry is None else (entry.saved, entry.is_saved)
+        command = self.searches.begin(Purpose.ANSWER, self.newest, known, complete)
         return command.number, [command]
 
     def _search_entry(self, entry: MapEntry, record: SessionFrame) -> list[Command]:
-        if not entry.is_over(record.frame.stamp):
+        if self.frames.is_paused or not entry.is_over(record, self.searches):
             return entry.search(record, self.searches)
         self.entry, out = None, self._supersede('another map begins')
-        return [*out, *self._begin_map('the robot was not found in the map')]
+        out += self._begin_map('the robot was not found in the map')
+        return out + self.frames.add(record)
 
     def _restore(self, record: SessionFrame) -> list[Command]:
         if self.searches.is_pending(Purpose.RESTORE) or not self._last_run.can_be_tested(record):
@@ -275,7 +276,7 @@ class System:
         if pending.purpose is Purpose.RECOVER:
             self.recovery.why = found.why
         elif self.entry is not None:
-            self.entry.why = found.why
+            self.entry.on_answer(found.why)
         if found.verdict is not Verdict.UNIQUE or pose is None or cov is None:
             return []
         area, frame = pending.area, record.frame

@@ -182,9 +182,14 @@ def test_parameter_is_set_while_the_node_runs(live, command):
     code, out, _ = command('set', 'health.input_timeout=3', *to)  # a whole number is a number
     assert (code, out) == (0, 'health.input_timeout: 1.0 -> 3\n')
     assert node.params.health.input_timeout == 3.0
+    assert command('set', 'health.input_timeout=2e0', *to)[0] == 0
+    assert command('set', 'health.input_timeout=3.0', *to)[0] == 0
     for words, why in (
         ('health.input_timeout=-1', 'health.input_timeout'),
-        ('health.input_timeout=long', 'health.input_timeout'),
+        ('health.input_timeout=long', "'long' is no value of it"),
+        ('health.input_timeout=@1', "'@1' is no value of it"),
+        ('health.input_timeout={a: 1}', 'is no value of it'),
+        ('use_scan=@1', 'is no value of it'),
         ('scan_topic=/other', 'scan_topic'),
         ('nosuchparameter=1', "/front_end has no parameter 'nosuchparameter'"),
     ):

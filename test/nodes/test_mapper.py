@@ -338,6 +338,29 @@ def test_keyframes_are_counted_as_they_come(make, ear, tmp_path):
     assert [name.split('-')[0] for name in written] == ['map.lost', 'map.autosave']
 
 
+def test_front_end_that_starts_again_is_not_in_the_map_until_it_is_found(mapper, ear, tmp_path):
+    mapper.back_end.reflectors = lambda: posts(5)
+    drives(mapper, range(60))
+    keys, sent = len(mapper.back_end.keyframes), len(mapper.transforms)
+    for k in range(61, 64):
+        add(mapper, k, session=2)
+        mapper.send_transform()
+    searched(mapper)
+    mapper.send_transform()
+    assert len(mapper.transforms) == sent  # nobody knows where it is
+    assert len(mapper.back_end.keyframes) == keys
+    (problem,) = mapper.problems()
+    assert problem.startswith('not yet in the map: ')
+    assert [m.data for m in ear.sent['rlml/map_entry']][-1] == problem
+    figures = mapper.figures()
+    assert figures['map not entered'] in problem
+    assert figures['map id'] == 'none: a map in the making'
+    with pytest.raises(MapError, match='not yet in the map'):
+        mapper.requests.localize(True)
+    assert '5 reflectors' in mapper.requests.save('hall')
+    assert len(mapper.back_end.keyframes) == keys
+
+
 def test_map_that_cannot_be_kept_does_not_stop_the_next_one(make, ear, tmp_path):
     (tmp_path / 'file').touch()
     mapper = make(map_directory=str(tmp_path / 'file'))

@@ -97,7 +97,7 @@ def test_range_max_that_is_nan_stays_so(make):
     assert np.isnan(decode.scan(encode.laser_scan(make, a_scan(range_max=np.nan))).range_max)
 
 
-@pytest.mark.parametrize('last', [1.0, 1.5, 0.0, 1.9, np.nan])
+@pytest.mark.parametrize('last', [1.0, 1.5, 0.0, 1.9, np.nan, np.inf, 1.0 + 2.0 * np.pi])
 def test_angle_max_may_count_a_beam_more_or_be_missing(make, last):
     msg = encode.laser_scan(make, a_scan())
     msg.angle_max = last
@@ -106,7 +106,7 @@ def test_angle_max_may_count_a_beam_more_or_be_missing(make, last):
 
 @pytest.mark.parametrize(
     ('first', 'step', 'n', 'last'),
-    [(-3.14, 0.00873, 360, 3.12), (3.14, 0.0175, 360, -3.14), (-1.57, 0.0175, 181, 0.8)],
+    [(-3.14, 0.00873, 360, 3.12), (2.36, 0.00436, 1081, -2.356), (-1.57, 0.0175, 181, 0.8)],
 )
 def test_angles_that_contradict_each_other_are_refused(make, first, step, n, last):
     ranges, none = np.ones(n, np.float32), np.zeros(0, np.float32)

@@ -133,7 +133,7 @@ def test_points_of_a_scan_are_no_reflectors():
     feed.add('reflectors', encode.detections(make_bag, many(walls)))
     assert not feed._target.given
     assert inputs.counts['reflectors'] == {'invalid': 1}
-    assert 'reflectors: 300 of 300 points are less than 0.25 m' in inputs.last_error
+    assert 'reflectors: 299 of 300 points are less than 0.25 m' in inputs.last_error
 
 
 def test_many_reflectors_and_a_few_seen_twice_are_used():
@@ -141,7 +141,10 @@ def test_many_reflectors_and_a_few_seen_twice_are_used():
     x, y = np.meshgrid(np.arange(10.0), np.arange(12.0))
     racks = np.column_stack([x.ravel(), y.ravel()]) + 1.0
     few = np.full((10, 2), 3.0) + 1e-2 * np.arange(10)[:, None]
-    for points in (racks, np.vstack([racks, racks[:30] + 0.05]), few):
+    twice = np.repeat(racks, 2, axis=0) + 0.05 * (np.arange(240) % 2)[:, None]
+    filled = np.vstack([racks[:12], np.zeros((60, 2))])
+    two_lasers = np.vstack([racks, racks + 0.05])
+    for points in (racks, twice, filled, two_lasers, few):
         feed.add('reflectors', encode.detections(make_bag, many(points)))
         assert len(feed._target.given[-1]) == len(points)
 

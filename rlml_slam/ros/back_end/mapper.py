@@ -121,7 +121,6 @@ class Mapper:
 
     def _add(self, record: say.SessionFrame) -> None:
         self.execute(self.system.on_frame(record))
-        self._topics.show_entry('; '.join(self.entry_problems()))
         if not self.system.is_current(record):
             return
         self._newest = record.frame
@@ -137,6 +136,7 @@ class Mapper:
         """In the worker: run the conductor's commands."""
         for command in commands:
             self._executes[type(command)](command)
+        self._topics.show_entry('; '.join(self.entry_problems()))
 
     def _map_frame(self, command: say.MapFrame) -> None:
         frame = command.frame
@@ -219,7 +219,6 @@ class Mapper:
     def settle(self) -> None:
         """Now and then: show that it runs, write the journal, and send the map in a silence."""
         self._topics.show_alive()
-        self._topics.show_entry('; '.join(self.entry_problems()))
         if self.journal.is_due:
             self.worker.submit(self.journal.write)
         silent = time.monotonic() - self._heard >= IDLE
@@ -257,8 +256,8 @@ class Mapper:
             'closures accepted': back_end.loop_closer.tried[True],
             'closures rejected': back_end.loop_closer.tried[False],
             **state_counts(back_end.loop_closer.records),
-            'map id': map_id(self.system.map if entry is None else entry.saved),
-            **({} if entry is None else {'saved map not entered': entry.why}),
+            'map id': map_id(entry.saved if entry and entry.is_saved else self.system.map),
+            **({} if entry is None else {'map not entered': entry.why}),
             **({} if survey_frame is None else {'survey': survey_frame.why}),
             'constellations not searched': back_end.constellation_search.not_searched,
             'frames waiting for the worker': self.worker.backlog,

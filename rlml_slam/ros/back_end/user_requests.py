@@ -140,6 +140,8 @@ class UserRequests:
             mapper.execute(system.make_map())
             paused = f'; {PAUSED}' if system.frames.is_paused else ''
             return f'maps: a new map begins where the robot is, in the axes of the old one{paused}'
+        if system.entry is not None and not system.entry.is_saved:
+            raise MapError(system.entry.problem)
         current = require_contents(mapper.current())
         self._is_loaded, mapper.last_pose = False, None
         mapper.execute(system.localize_in(current))

@@ -141,11 +141,17 @@ def scan(msg: Any, topic: str = 'scan') -> Scan:
 
 
 def _check_angle_max(msg: Any, n: int, topic: str) -> None:
-    """Raise InputError where the last of n beams is elsewhere than the message says; 0: unset."""
+    """Raise InputError where the last of n beams looks elsewhere than the message says.
+
+    An ``angle_max`` of 0, or one that is not finite, is not set; whole turns do not count.
+    """
     step, last = float(msg.angle_increment), float(msg.angle_max)
     view = step * (n - 1)
     end = float(msg.angle_min) + view
-    if n > 1 and view and last and abs(last - end) > 2.0 * abs(step) + END * abs(view):
+    is_set = last != 0.0 and math.isfinite(last - end) and view != 0.0 and n > 1
+    if is_set and abs(math.remainder(last - end, 2.0 * math.pi)) > 2.0 * abs(step) + END * abs(
+        view
+    ):
         raise InputError(
             f'{topic}: angle_max is {last:.4g} rad, but {n} beams end at angle_min + {n - 1} * '
             f'angle_increment = {end:.4g} rad'

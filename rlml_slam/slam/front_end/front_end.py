@@ -42,7 +42,6 @@ class FrontEnd:
 
     def __init__(self, params: Parameters) -> None:
         self._p = params
-        self._laser = LaserCheck()
         self.reset(np.array(params.node.map_start_pose), np.zeros((3, 3)))
 
     def reset(self, pose: Array, cov: Array) -> None:
@@ -50,7 +49,7 @@ class FrontEnd:
         m = self._p.motion
         wheels = (*m.first_scale_errors, m.drift_sigma)
         self.state = JointState(pose, cov, m.imu_bias_sigma, m.constant_velocity_sigma, wheels)
-        self._motion = MotionTerm(self._p)
+        self._motion, self._laser = MotionTerm(self._p), LaserCheck()
         self._reflectors = ReflectorTerm(self._p, self.state)
         self._scans = ScanTerm(self._p, self.state, self._motion)
         self._map = MapLocalization(self._p)

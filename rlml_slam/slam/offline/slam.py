@@ -98,9 +98,11 @@ class Slam(SynchronizedSystem):
     def finish(self) -> list[Frame]:
         """Everything that still waits; then the last optimisation."""
         frames = self.process(self.synchronizer.flush())
-        if self.system.map is None and self.system.entry is None:
+        entry = self.system.entry
+        if self.system.map is None and (entry is None or not entry.is_saved):
             self.back_end.finish()
-            self._look_back()
+            if entry is None:
+                self._look_back()
         return frames
 
     def _look_back(self) -> None:
