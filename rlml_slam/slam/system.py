@@ -231,7 +231,7 @@ class System:
         return command.number, [command]
 
     def _search_entry(self, entry: MapEntry, record: SessionFrame) -> list[Command]:
-        if self.frames.is_paused or not entry.is_over(record, self.searches):
+        if not entry.is_over(record, self.searches) or self.frames.is_paused:
             return entry.search(record, self.searches)
         self.entry, out = None, self._supersede('another map begins')
         out += self._begin_map('the robot was not found in the map')
