@@ -54,3 +54,19 @@ def test_nothing_is_said_of_a_laser_that_is_where_its_transform_says(healths):
     assert found[-1] == Health(Level.OK)
     reasons = [reason for health in found for reason in health.reasons]
     assert not any('where odometry goes' in r or 'against odometry' in r for r in reasons), reasons
+
+
+def test_transform_that_comes_late_ends_the_fault_of_the_assumed_place():
+    slam, healths, late = Slam(Parameters()), [], False
+    slam.set_sensor_pose('laser', np.array([0.0, 0.0, np.pi]))
+    for m in messages(ROOM, DRIVE, reflectors=False, rng=np.random.default_rng(0)):
+        if not late and healths and 'away from where odometry' in ' '.join(healths[-1].reasons):
+            slam.set_sensor_pose('laser', np.zeros(3))
+            slam.session.restart(misplaced=True)
+            healths.clear()
+            late = True
+        add = slam.add_odometry if isinstance(m, Odometry) else slam.add_scan
+        healths += [frame.health for frame in add(m)]
+    assert late
+    assert len(healths) > 20
+    assert not any('away from' in reason for health in healths for reason in health.reasons)
