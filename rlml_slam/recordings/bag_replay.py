@@ -169,4 +169,6 @@ def _drive(
 def _with_health(frames: list[Frame], feed: SensorInput[Frame], inputs: BagInputs) -> list[Frame]:
     """The frames with the health that a node would publish."""
     problems = (*inputs.problems, *feed.odometry_problems()) if frames else ()
+    if not problems:
+        return frames
     return [replace(f, health=with_problems(f.health, problems)) for f in frames]

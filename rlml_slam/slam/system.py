@@ -65,7 +65,7 @@ class System:
         self.recovery = Recovery(params)
         self.map: SavedMap | None = None
         self.entry: MapEntry | None = None
-        self.newest: SessionFrame | None = None  # frame
+        self.newest: SessionFrame | None = None  # of the frames
         self.session: int | None = None
         self.mode, self.T_map_local = 0, np.zeros(3)
         self.frames = MappedFrames()

@@ -706,21 +706,28 @@ def test_slow_robot_loses_no_more_than_a_fast_one(make, ear, tmp_path):
     assert len(map_file.load(saved).arrays['pose']) == keys
 
 
+@contextlib.contextmanager
+def no_file_larger_than(size):
+    """As on a full disk: a file that grows beyond so many bytes cannot be written."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
 def test_full_disk_is_reported_and_what_was_written_is_recovered(make, ear, tmp_path):
     mapper = make(map_directory=str(tmp_path), journal_period=1e-3)
     drives(mapper, range(60))
     (left,) = journals(tmp_path)
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (left.stat().st_size + 100, before[1]))
-    try:
+    with no_file_larger_than(left.stat().st_size + 100):
         drives(mapper, range(60, 120))
         assert 'File too large' in mapper.problems()[0]
         keys = len(mapper.back_end.keyframes)
         with contextlib.suppress(OSError):  # of what could not be written
             killed(mapper)
         mapper._ended = True
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
     again = make(map_directory=str(tmp_path))
     searched(again)
     assert again.problems() == ()
@@ -733,12 +740,8 @@ def test_journal_goes_on_once_the_map_was_saved(make, ear, tmp_path):
     mapper.back_end.reflectors = lambda: posts(5)
     drives(mapper, range(60))
     (left,) = journals(tmp_path)
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (left.stat().st_size + 100, before[1]))
-    try:
+    with no_file_larger_than(left.stat().st_size + 100):
         drives(mapper, range(60, 90))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert 'File too large' in mapper.problems()[0]
     mapper.requests.save('map')
     assert mapper.problems() == ()

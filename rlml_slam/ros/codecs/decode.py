@@ -148,10 +148,9 @@ def _check_angle_max(msg: Any, n: int, topic: str) -> None:
     step, last = float(msg.angle_increment), float(msg.angle_max)
     view = step * (n - 1)
     end = float(msg.angle_min) + view
-    is_set = last != 0.0 and math.isfinite(last - end) and view != 0.0 and n > 1
-    if is_set and abs(math.remainder(last - end, 2.0 * math.pi)) > 2.0 * abs(step) + END * abs(
-        view
-    ):
+    if n < 2 or 0.0 in (last, view) or not math.isfinite(last - end):
+        return
+    if abs(math.remainder(last - end, 2.0 * math.pi)) > 2.0 * abs(step) + END * abs(view):
         raise InputError(
             f'{topic}: angle_max is {last:.4g} rad, but {n} beams end at angle_min + {n - 1} * '
             f'angle_increment = {end:.4g} rad'
