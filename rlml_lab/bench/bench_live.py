@@ -13,7 +13,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from rlml_slam.cli.support.live_session import LISTENERS, Source, drive
+from rlml_slam.cli.support.live_session import LISTENERS, SYSTEM, Source, drive
 from rlml_slam.errors import RlmlError
 from rlml_slam.evaluation.metrics import metrics
 from rlml_slam.params import Laser, Simulator
@@ -29,7 +29,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         'live',
         help='whether the live nodes keep up with a fast laser',
-        description='Simulator, front end and back end as three processes over DDS, in real time: '
+        description='Simulator and system as processes of their own over DDS, in real time: '
         'odometry and IMU at 100 Hz, reflectors and scans at the rate of the laser.',
     )
     parser.add_argument('--minutes', type=float, default=1.0, help='default: %(default)s')
@@ -39,6 +39,10 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         '--rate', type=float, default=1.0, metavar='X',
         help='simulated seconds per second (default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--processes', type=int, choices=(1, 2), default=2,
+        help='1: slam, 2: front_end and back_end (default: %(default)s)',
     )  # fmt: skip
     parser.add_argument('--json', action='store_true', help='one JSON object on stdout')
 
@@ -86,7 +90,8 @@ def source(args: argparse.Namespace, duration: float, folder: str) -> Source:
             'wait_for_subscribers': LISTENERS,
         },
         lambda recorder: recorder.elapsed() / duration,
-        {'laser_pose': list(Simulator().laser_pose), 'map_directory': folder},
+        nodes=SYSTEM if args.processes == 2 else ('slam',),
+        system={'laser_pose': list(Simulator().laser_pose), 'map_directory': folder},
     )  # fmt: skip
 
 

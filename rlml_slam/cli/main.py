@@ -127,9 +127,10 @@ def main(
 ) -> int:
     """Run one command line of the command ``prog``; the exit code."""
     module: ModuleType | None = None
-    if isinstance(sys.stdout, io.TextIOWrapper):  # not every terminal has ±, or all file names
-        sys.stdout.reconfigure(errors='backslashreplace')
     try:
+        # not every terminal has ±, or all file names
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            sys.stdout.reconfigure(errors='backslashreplace')
         if '_ARGCOMPLETE' in os.environ:
             complete(table, prog)
         arguments = list(sys.argv[1:] if argv is None else argv)

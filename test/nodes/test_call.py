@@ -21,10 +21,16 @@ from rlml_slam.nodes.front_end import FrontEndNode
 from rlml_slam.ros.back_end.map_folder import MapFolder
 from rlml_slam.types import Reflectors
 
-CALL = (
-    "import sys; from rlml_slam.cli.main import main; print('ready', flush=True); "
-    'sys.exit(main(sys.argv[1:]))'
-)
+CALL = """
+import sys
+from rlml_slam.cli.main import main
+
+def words():  # which the command reads first, where it can be interrupted
+    print('ready', flush=True)
+    yield from sys.argv[1:]
+
+sys.exit(main(words()))
+"""
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import os
 import signal
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,7 +40,7 @@ LISTENERS = 2  # of the sensor: front end and recorder; time begins when both ar
 class Source:
     """What takes the place of a robot: an executable of this package with its parameters.
 
-    ``system`` are parameters of front end and back end, ``config`` their parameter file.
+    ``system`` are parameters of the ``nodes``, ``config`` their parameter file.
     ``sensor`` is the (topic, type) whose every message asks for a pose. ``progress`` shows the
     share of the drive that is done. ``keeps_map``: the run gets the whole map at its end.
     ``mcap`` is a file for all that was heard, ``inputs`` the types of the topics that it needs
@@ -59,6 +59,7 @@ class Source:
     mcap: Path | None = None
     inputs: Mapping[str, str] = field(default_factory=dict)
     view_port: int | None = None
+    nodes: tuple[str, ...] = SYSTEM
 
 
 def drive(source: Source, out: Path, quiet: bool) -> Run:
@@ -84,9 +85,9 @@ def drive(source: Source, out: Path, quiet: bool) -> Run:
         executor.add_node(recorder)
         try:
             _start(processes, source, maps)
-            load = Load(processes)
+            load = Load(processes, source.nodes)
             with Progress('driving', 1.0, quiet) as progress:
-                for _ in _listen(processes, recorder, executor, source.executable):
+                for _ in _listen(processes, recorder, executor, source):
                     check()
                     load.sample(recorder)
                     progress.update(source.progress(recorder), recorder.note())
@@ -151,14 +152,14 @@ def _compile(quiet: bool) -> None:
 
 
 def _start(processes: Processes, source: Source, maps: str) -> None:
-    """The three nodes; the source waits until the others listen."""
+    """All nodes; the source waits until the others listen."""
     system = dict(source.system)
     if source.keeps_map:
         system |= {'map_directory': maps, 'map_file_name': live_map.NAME}
     if source.view_port is not None:
         # nobody asks how it is: a viewer that ends costs the drive nothing
         processes.start('view', ['rlml_slam', 'view', '--port', str(source.view_port)])
-    for name in SYSTEM:
+    for name in source.nodes:
         processes.start(name, node(name, system, source.config))
     processes.start(source.executable, node(source.executable, source.parameters))
 
@@ -174,7 +175,7 @@ def node(name: str, parameters: Mapping[str, Any], config: Path | None = None) -
 
 
 def _listen(
-    processes: Processes, recorder: Recorder, executor: SingleThreadedExecutor, source: str
+    processes: Processes, recorder: Recorder, executor: SingleThreadedExecutor, source: Source
 ) -> Iterator[None]:
     """Hear the whole drive, bit by bit; RlmlError if a process dies or falls silent."""
     began = time.monotonic()
@@ -183,8 +184,8 @@ def _listen(
         executor.spin_once(timeout_sec=0.1)
         now = time.monotonic()
         recorder.is_ready()
-        processes.check(*SYSTEM)
-        if finished is None and processes.has_ended(source):
+        processes.check(*source.nodes)
+        if finished is None and processes.has_ended(source.executable):
             finished = now
         if not recorder.frames.stamps and now - began > START_TIMEOUT:
             raise RlmlError(f'no pose within {START_TIMEOUT:g} s of the start')
@@ -196,9 +197,9 @@ def _listen(
 class Load:
     """CPU time and memory of the system's nodes, from the first pose on."""
 
-    def __init__(self, processes: Processes) -> None:
+    def __init__(self, processes: Processes, nodes: Sequence[str]) -> None:
         self._processes = processes
-        self._samples: dict[str, list[Usage]] = {name: [] for name in SYSTEM}
+        self._samples: dict[str, list[Usage]] = {name: [] for name in nodes}
         self._due = 0.0
 
     def sample(self, recorder: Recorder) -> None:
