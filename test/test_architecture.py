@@ -192,7 +192,7 @@ MAX_CLASS = 250  # lines
 # odometry that is late
 MAX_LINES = 59_030
 MAX_LONG_LISTS = 11
-MAX_WORDS = 60  # in code and docs, the changelog aside
+MAX_WORDS = 30  # in code and docs, the changelog aside
 # tests that need a study's scenes, drives or graphs; a new one belongs into test/lab
 TESTS_WITH_A_STUDY = {
     'cli/test_doctor.py', 'cli/test_main.py',

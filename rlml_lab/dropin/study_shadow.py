@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 class Witness(Node):
-    """Hears every topic, and writes those that tell poses to a bag."""
+    """Hears every topic, and writes those of poses to a bag."""
 
     def __init__(self, writer: BagWriter) -> None:
         super().__init__('witness')

@@ -97,7 +97,7 @@ def cluster() -> Iterator[str]:
     try:
         yield address
     finally:
-        for process in (workers, scheduler):  # workers wait for a scheduler that has gone
+        for process in (workers, scheduler):  # workers wait for a scheduler that has ended
             process.terminate()
             process.wait(30.0)
 

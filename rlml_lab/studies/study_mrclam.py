@@ -2,7 +2,7 @@
 """``study mrclam``: maps of RLML and EKF from MR.CLAM, with known ids and without.
 
 Where a data set has no true path, a run is compared with that of RLML with known ids. Anonymous
-runs are scored by the ids that they were not given: these tell the frame of the true landmarks.
+runs are scored by the ids that they were not given: these give the frame of the true landmarks.
 """
 
 from __future__ import annotations

@@ -230,10 +230,10 @@ def test_loop_closures_are_listed_and_revoked_by_service(live):
     assert parse(listed.message, 'back_end')[0]['state'] == 'active'
 
     ask = AddDiagnostics.Request
-    for number, told in (('7', 'there is no loop closure 7'), ('x', 'is not the number')):
+    for number, reason in (('7', 'there is no loop closure 7'), ('x', 'is not the number')):
         answer = live.call(AddDiagnostics, 'back_end/revoke_closure', ask(load_namespace=number))
         assert not answer.success
-        assert told in answer.message
+        assert reason in answer.message
     answer = live.call(AddDiagnostics, 'back_end/revoke_closure', ask(load_namespace='0'))
     assert answer.success, answer.message
     assert not back_end.graph.edges.enabled[edge]
@@ -275,7 +275,7 @@ def test_saved_map_serves_for_localization(live, tmp_path):
 
 
 def test_robot_that_was_carried_away_finds_itself_in_its_map(live, tmp_path):
-    """Mapped, then localizing, then told a wrong pose: one call brings it back."""
+    """Mapped, then localizing, then given a wrong pose: one call brings it back."""
     front, back = start(live)
     drive(live, front, back, end=6.0)
     call = live.call

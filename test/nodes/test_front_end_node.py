@@ -105,10 +105,10 @@ def test_detections_are_told_what_became_of_them(live, node):
     live.heard['/diagnostics'].clear()
     node.health.publish()
     live.spin_until(lambda: live.heard['/diagnostics'])
-    told = {v.key: v.value for v in live.heard['/diagnostics'][0].status[0].values}
+    shown = {v.key: v.value for v in live.heard['/diagnostics'][0].status[0].values}
     for status in Status:
         count = int((np.concatenate(heard) == status).sum())
-        assert told[f'detections {status.name.lower()}'] == str(count)
+        assert shown[f'detections {status.name.lower()}'] == str(count)
 
 
 def correction(node, T_map_local, cov=None, session=None):
@@ -205,9 +205,9 @@ def test_silence_is_told(live, node):
 
 
 @pytest.mark.parametrize(
-    ('before', 'told'), [(Level.OK, Level.DEGRADED), (Level.LOST, Level.LOST)]
+    ('before', 'then'), [(Level.OK, Level.DEGRADED), (Level.LOST, Level.LOST)]
 )
-def test_silence_makes_health_no_better(live, node, before, told):
+def test_silence_makes_health_no_better(live, node, before, then):
     feed(node, 2.0)
     node.health.update(dataclasses.replace(node.last, health=Health(before, ('why',))))
     node.health.publish()
@@ -216,7 +216,7 @@ def test_silence_makes_health_no_better(live, node, before, told):
     node.health.publish()
     live.spin_until(lambda: live.heard['/diagnostics'])
     status = live.heard['/diagnostics'][0].status[0]
-    assert status.level == bytes([told])
+    assert status.level == bytes([then])
     assert 'why' in status.message
     assert 'no new scan' in status.message
 
@@ -345,7 +345,7 @@ def test_late_and_future_messages_are_counted_and_harmless(live, node):
     node.sensors.add('scan', future)
     assert used(node, 'scan', 'late') == 1
     assert node.last is before
-    # whether time did go on is told by what comes next
+    # what comes next shows whether time did go on
     stream, last = next((s, m) for s, m in reversed(sent) if s == 'odom')
     for k in range(1, CONFIRM + 1):
         after = copy.deepcopy(last)
@@ -696,12 +696,12 @@ def test_bad_input_over_dds_is_counted_in_the_diagnostics(live, node):
             live.spin_until(lambda due=sent - 5: len(live.heard['pose']) >= due)
     figures = {}
 
-    def told():
+    def answered():
         for m in live.heard['/diagnostics']:
             figures.update({v.key: v.value for v in m.status[0].values})
         return int(figures.get('scan used', 0)) >= scans - 7
 
-    live.spin_until(told)
+    live.spin_until(answered)
     assert int(figures['scan invalid']) == 4
     assert int(figures['scan late']) == int(figures['scan future']) == 1
     assert int(figures['scan no_returns']) == 1

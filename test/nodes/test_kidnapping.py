@@ -85,8 +85,8 @@ def test_carried_robot_is_lost_and_found_again(live, localizes):
         back.mapper.worker.submit(lambda: back.requests.localize(True)).result()
         live.spin_until(lambda: front.control.session.map is not None)
         frames = []
-    more, told = drive(live, front, back, events, 40.0)
-    t, levels, errors = judged([*frames, *more], truth | told)
+    more, also_true = drive(live, front, back, events, 40.0)
+    t, levels, errors = judged([*frames, *more], truth | also_true)
     lost = t[levels == Level.LOST]
     assert 0.0 < lost[0] < 1.0
     back_at = t[(levels == Level.OK) & (t > lost[0])][0]

@@ -371,7 +371,7 @@ def test_map_that_cannot_be_kept_does_not_stop_the_next_one(make, ear, tmp_path)
 
 
 def test_map_made_here_stays_whole_while_it_is_localized_in(make, ear, tmp_path):
-    """The front end begins anew in it, and the graph can be saved all the same."""
+    """The front end begins again in it, and the graph can be saved all the same."""
     mapper = make(map_directory=str(tmp_path))
     drives(mapper, range(60))
     keys, found = len(mapper.back_end.keyframes), mapper.back_end.reflectors
@@ -526,23 +526,23 @@ def switched_off(make, tmp_path):
     return tmp_path
 
 
-def told(ear):
+def poses_given(ear):
     return [read_request(m).pose[:2] for m in ear.sent['rlml/session_start']]
 
 
 def test_robot_starts_where_it_was_switched_off(make, ear, switched_off):
-    assert told(ear) == []
+    assert poses_given(ear) == []
     mapper = make(mode='localization', map_directory=str(switched_off))
     sees(mapper, 0, HERE, Level.DEGRADED)
-    np.testing.assert_allclose(told(ear), [HERE[:2]], atol=0.02)
+    np.testing.assert_allclose(poses_given(ear), [HERE[:2]], atol=0.02)
     sees(mapper, 1, HERE)
-    assert len(told(ear)) == 1
+    assert len(poses_given(ear)) == 1
 
 
 def test_robot_that_was_moved_while_it_was_off_does_not(make, ear, switched_off):
     mapper = make(mode='localization', map_directory=str(switched_off))
     sees(mapper, 0, np.array([-1.5, 0.5, -2.0]), Level.DEGRADED)
-    assert told(ear) == []
+    assert poses_given(ear) == []
     assert 'is not restored: the robot is rather at x = -1.5' in ear.warnings[-1]
 
 
@@ -560,7 +560,7 @@ def test_last_pose_that_is_damaged_or_not_wanted_is_left(make, ear, switched_off
     mapper = make(mode='localization', map_directory=str(switched_off))
     sees(mapper, 0, HERE, Level.DEGRADED)
     sees(mapper, 1, HERE)
-    assert told(ear) == []
+    assert poses_given(ear) == []
     assert 'map.pose: no pose' in ear.warnings[-1]
     assert LastPose(switched_off / 'map.pose').read() is not None  # a new one is kept
 
@@ -589,7 +589,7 @@ def journals(folder):
 
 
 def killed(mapper):
-    """As if the process was killed: nothing is saved, and its locks are gone."""
+    """As if the process was killed: nothing is saved, and its locks are free."""
     mapper.searcher.close()
     mapper.worker.close()
     mapper.journal._file.close()

@@ -51,11 +51,11 @@ def test_every_scan_gets_its_cloud_with_its_stamp_and_frame(live, node):
         assert read_cloud(msg).dtype.names == FIELDS
         seen = decode.detections(msg, Reflector())
         assert (seen.ids == ANONYMOUS).all()
-        told = markers.get(seen.stamp)
-        if told is None or not len(seen):
+        marked = markers.get(seen.stamp)
+        if marked is None or not len(seen):
             continue
         # the simulated detections have 2 cm and 3 mrad of noise, and now and then a ghost
-        apart = np.linalg.norm(seen.points[:, None] - told.points, axis=-1).min(axis=1)
+        apart = np.linalg.norm(seen.points[:, None] - marked.points, axis=-1).min(axis=1)
         near += int((apart < 0.1).sum())
         total += len(seen)
     assert total > 50

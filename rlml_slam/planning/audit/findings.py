@@ -77,14 +77,14 @@ def of_reflectors(
         if not np.isnan(shift.delta[k, 0]):
             found.append(_displaced(e, k, shift.delta[k], float(shift.sigma[k]), share))
         elif there.is_low[k]:
-            gone = there.seen[k] < GONE * there.usual * there.expected[k]
-            near = _nearest(e.site.reflectors.points[k], others, used) if gone else -1
+            missing = there.seen[k] < GONE * there.usual * there.expected[k]
+            near = _nearest(e.site.reflectors.points[k], others, used) if missing else -1
             if near >= 0:
                 used.add(near)
                 d = others[near].place - e.site.reflectors.points[k]
                 found.append(_displaced(e, k, d, 0.0, share))
             else:
-                found.append(_missed(e, there, k, gone, share))
+                found.append(_missed(e, there, k, missing, share))
     found += [_ghost(e, g, num) for k, g in enumerate(others) if k not in used]
     return found
 
@@ -105,11 +105,11 @@ def _displaced(e: Evidence, k: int, d: Array, sigma: float, share: float) -> Fin
     return Finding(Kind.MOVED, k, x, y, what, advice, share, shift=d)
 
 
-def _missed(e: Evidence, there: Presence, k: int, gone: bool, share: float) -> Finding:
+def _missed(e: Evidence, there: Presence, k: int, missing: bool, share: float) -> Finding:
     x, y = e.site.reflectors.points[k]
     n, s = there.expected[k], there.seen[k]
     what = f'{name_of(e, k)} was seen {s:.0f} of {n:.0f} times, others {there.usual:.0%}'
-    if gone:
+    if missing:
         advice = 'see whether it was removed or something stands before it'
         return Finding(Kind.HIDDEN, k, x, y, what, advice, share)
     good, bad = _sides(e, there.usual, k)

@@ -85,7 +85,7 @@ def submap_of(grid: OccupancyGrid, parameters: params.Submap) -> GridSubmap:
 
 
 def along_lattice(cells: NDArray[np.int8]) -> Array:
-    """Share (2,) of the walls that tell x, and y, of which all cells lie in line.
+    """Share (2,) of the walls that fix x, and y, of which all cells lie in line.
 
     Such a wall is off by the same all along, uniformly within half a cell. One across the lattice
     is drawn as stairs, whose mean is where it stands.
