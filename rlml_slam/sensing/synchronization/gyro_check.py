@@ -84,7 +84,9 @@ class GyroCheck:
             self.restart()
 
     def _turn(self, k: int, heading: float) -> None:
-        self._turns[k] += np.nan_to_num(se2.wrapped(heading - self._headings[k]))
+        turn = se2.wrapped(heading - self._headings[k])
+        if math.isfinite(turn):
+            self._turns[k] += turn
         self._headings[k] = heading
 
     def _compare(self, gyro: float, odometry: float, scans: float) -> None:

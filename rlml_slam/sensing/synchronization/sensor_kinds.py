@@ -25,21 +25,29 @@ class SensorKinds:
 
     def __init__(self) -> None:
         self._seen: list[deque[Kind]] = []
+        self._usual: list[Kind] = []  # of the last message, if none of it is rare
 
     def is_foreign(self, frame_id: str, angle: float = 0.0, *increments: float) -> bool:
         """Add a message; whether its frame, first angle or an increment is rare beside another."""
         kinds = [(frame_id, value) for value in (angle, *increments)]
         while len(self._seen) < len(kinds):
             self._seen.append(deque(maxlen=MEMORY))
+        for seen, kind in zip(self._seen, kinds, strict=True):
+            seen.append(kind)
+        if kinds == self._usual:  # once more, and no rarer by that
+            return False
+        pairs = list(zip(self._seen, kinds, strict=True))
+        rare = [RARE * seen.count(kind) < len(seen) for seen, kind in pairs]
+        self._usual = [] if any(rare) else kinds
         shares = [0.0, *[ALIKE] * len(increments)]
-        return any([_is_rare(*each) for each in zip(self._seen, kinds, shares, strict=True)])
+        return any(
+            is_rare and _is_foreign(seen, kind, share)
+            for is_rare, (seen, kind), share in zip(rare, pairs, shares, strict=True)
+        )
 
 
-def _is_rare(seen: deque[Kind], kind: Kind, share: float) -> bool:
-    """Add what one message has; whether almost all others have something else."""
-    seen.append(kind)
-    if RARE * seen.count(kind) >= len(seen):
-        return False
+def _is_foreign(seen: deque[Kind], kind: Kind, share: float) -> bool:
+    """Whether almost all messages, but for some newest ones, have something else."""
     newest = [seen[-k] for k in range(1, REPEATED + 1)]
     alike = sum(_is_same(kind, other, share) for other in seen)
     most = max(Counter(seen).values())
