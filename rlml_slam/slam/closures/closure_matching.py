@@ -3,7 +3,8 @@
 
 Verified by the score, for which end points behind walls fit nothing, by the ratio of the
 second-best score to the best one, and by the covariance: a scan has to constrain its pose in all
-directions. Where the drift is large, weak matches are searched for as well (weak_match.py).
+directions, by walls that the submap saw from the same side. Where the drift is large, weak matches
+are searched for as well (weak_match.py).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from rlml_slam.matching.scans.scan_match import linearize, match
 from rlml_slam.matching.scans.search_pyramid import Pyramid
 from rlml_slam.matching.scans.submap import P_MIN, Submap
 from rlml_slam.matching.scans.visibility import hidden_share
+from rlml_slam.matching.scans.wall_sides import least_share, of_seen_sides
 from rlml_slam.params import LoopClosure, Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.closure_candidates import Candidate
@@ -40,11 +42,13 @@ PYRAMIDS = (
 )
 WEAK_SHARE = 0.85  # of the smallest score: below, wrong places of a local map score as well
 MAX_LOOKUPS = 5_000_000  # of a search, after which weak matches are not looked for any more
+LEAST_SEEN = 0.2  # share of the information that has to be of seen sides, in each direction
 SEARCH_SIGMA = np.array([0.5, 0.5, 0.2])  # [m, m, rad] prior of the refinement at the best cell
 
 AMBIGUOUS, DEGENERATE = 'a second pose fits as well', 'the scan does not constrain one direction'
 HIDDEN = 'walls of the submap hide what the scan sees'
-UNDECIDED = (AMBIGUOUS, DEGENERATE, HIDDEN)  # such a match contradicts nothing
+OTHER_SIDE = 'walls that hold it in one direction were seen from the other side'
+UNDECIDED = (AMBIGUOUS, DEGENERATE, HIDDEN, OTHER_SIDE)  # such a match contradicts nothing
 
 
 @dataclass(frozen=True)
@@ -152,6 +156,10 @@ class ClosureMatcher:
         information = scan_information.information(submap, points, found.pose, self._p.scan_match)
         if _largest_variance(information) > MAX_SIGMA**2:
             return rejected(DEGENERATE, seen, found.pose)
+        facing = points[of_seen_sides(submap, points, key.origin, found.pose)]
+        faced = scan_information.information(submap, facing, found.pose, self._p.scan_match)
+        if least_share(faced, information) < LEAST_SEEN:  # eq. 66
+            return rejected(OTHER_SIDE, seen, found.pose)
         term = linearize(submap, points, found.pose)
         second = math.nan if result.second is None else result.second.score / result.best.score
         overlap = term.inliers / max(term.count, 1)
