@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from rlml_slam import se2
 from rlml_slam.ekf.branch import Associations, Branch, MeasuredFrame, most_branches
+from rlml_slam.ekf.contradiction import Contradiction
 from rlml_slam.ekf.extraction import Measured, measure
 from rlml_slam.ekf.filter import Filter
 from rlml_slam.ekf.likelihood import DECORRELATION
@@ -59,6 +60,7 @@ class Estimator:
         self.branches = [Branch(self._p, self._matcher, filter_)]
         self.health = HealthMonitor(self._p.health)
         self.confirmation = MapConfirmation(self._p)
+        self.contradiction = Contradiction(self._p.health)
         self.fates: Counter[str] = Counter()
         self._mapping = self._p.node.mode == 'mapping'
         self._last_stamp: int | None = None
@@ -120,7 +122,8 @@ class Estimator:
             self._since = np.zeros(2)
         keys = itertools.count(self._next_key)
         key_of = cache(lambda i: next(keys))
-        frame = MeasuredFrame(seen, stamp, weight, self._mapping, key_of)
+        mapping = self._mapping and not self.contradiction.holds
+        frame = MeasuredFrame(seen, stamp, weight, mapping, key_of)
         self.branches = _best(
             [child for b in self.branches for child in b.update(frame)],
             len(seen.z),
@@ -158,6 +161,10 @@ class Estimator:
         in_map = self.confirmation
         agree = agree_with_map(n, used)
         in_map.check(observation.stamp, travel, n, used, agree, GridMatch(math.nan))
+        elsewhere = self.contradiction
+        if seen is not None and not in_map.is_pending:
+            known = keys[statuses == Status.USED]
+            elsewhere.check(observation.stamp, n, known, self._next_key, self._mapping)
         health = self.health.evaluate(
             observation.stamp,
             HealthInputs(
@@ -166,8 +173,8 @@ class Estimator:
                 detections=None if seen is None else n,
                 matched=used,
                 cov_map=cov,
-                unconfirmed=in_map.reason,
-                is_lost=in_map.is_lost,
+                unconfirmed=in_map.reason or elsewhere.reason,
+                is_lost=in_map.is_lost or elsewhere.is_lost,
                 maps=self._mapping,
                 position=pose[:2],
             ),
