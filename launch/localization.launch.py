@@ -13,7 +13,12 @@ from launch_ros.actions import Node
 from launch import LaunchDescription
 
 ARGUMENTS = {
-    'map': (None, 'the map: a .rlml file, a .yaml file of nav2, or the name without suffix'),
+    'map': (
+        None,
+        'the map: a .rlml file, a .yaml file of nav2, or the path without suffix; '
+        'a name without a folder is one of map_directory',
+    ),
+    'map_directory': ('maps', 'folder of a map that is given by its name'),
     'params_file': ('', 'parameter file, such as a copy of config/default.yaml'),
     'use_sim_time': ('false', 'time of /clock, for simulators and bags'),
     'namespace': ('', 'of all nodes, where there are several robots'),
@@ -27,10 +32,11 @@ def nodes(context):
     files = [given['params_file']] if given['params_file'] else []
     sim_time = {'use_sim_time': given['use_sim_time'].lower() == 'true'}
     common = {'package': 'rlml_slam', 'namespace': given['namespace'], 'output': 'screen'}
-    file = Path(given['map']).expanduser().absolute()
+    file = Path(given['map']).expanduser()
+    folder = given['map_directory'] if given['map'] == file.stem else str(file.absolute().parent)
     own = {
         'mode': 'localization',
-        'map_directory': str(file.parent),
+        'map_directory': folder,
         'map_file_name': file.name,
     }
     out = [Node(executable='slam', parameters=[*files, sim_time, own], **common)]

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.datasets.tum import Trajectory, read_tum
-from rlml_slam.errors import InputError, MapError
+from rlml_slam.errors import InputError, MapError, ParameterError
 from rlml_slam.evaluation.ate import trajectory_errors
 from rlml_slam.evaluation.metrics import metrics
 from rlml_slam.evaluation.relations import Relations, read_relations, relation_errors
@@ -33,6 +33,7 @@ from rlml_slam.params import Node, Parameters, from_mapping, read_yaml
 from rlml_slam.recordings.bag_inputs import BagInputs
 from rlml_slam.recordings.bag_replay import Given
 from rlml_slam.recordings.bag_replay import replay as run_replay
+from rlml_slam.recordings.measurements import Measurement, checked
 from rlml_slam.recordings.products import collect
 from rlml_slam.report.outputs import write_outputs
 from rlml_slam.ros.bags.bag import BagReader
@@ -44,7 +45,6 @@ from rlml_slam.slam.offline.slam import Slam as System
 from rlml_slam.slam.store import map_file
 from rlml_slam.types import Detections, Frame, Imu, Odometry, Reflectors, Scan
 
-Measurement: TypeAlias = Odometry | Imu | Scan | Detections
 File: TypeAlias = str | Path
 
 
@@ -76,7 +76,7 @@ class Bag:
 
     def __init__(self, path: File, parameters: Parameters | None = None) -> None:
         self.path = Path(path)
-        self.parameters = parameters or Parameters()
+        self.parameters = _parameters(parameters, Parameters())
         self.skipped: Mapping[str, int] = {}
         with BagReader(self.path) as bag:
             inputs = BagInputs(bag, self.parameters)
@@ -161,6 +161,8 @@ def save_map(map_: Map, path: File) -> Path:
     the path cannot be written, or if a .rlml file is asked for of a map without its graph.
     """
     path = Path(path)
+    if not isinstance(map_, Map):
+        raise MapError(f'{path}: a Map is needed, not {type(map_).__name__}')
     if path.suffix == '.rlml':
         if map_.graph is None:
             raise MapError(
@@ -246,10 +248,10 @@ class Slam:
         parameters: Parameters | None = None,
         sensor_poses: Mapping[str, Sequence[float] | Array] | None = None,
         *,
-        localize_in: Map | None = None,
-        continue_from: Map | None = None,
+        localize_in: Map | File | None = None,
+        continue_from: Map | File | None = None,
     ) -> None:
-        self.parameters = parameters or Parameters()
+        self.parameters = _parameters(parameters, Parameters())
         known, begun = _start(localize_in, continue_from)
         if known is not None:
             node = replace(self.parameters.node, mode='localization')
@@ -262,30 +264,24 @@ class Slam:
         self._is_localizing = known is not None
         self._log = FrameLog()
         for frame_id, pose in (sensor_poses or {}).items():
-            place = np.asarray(pose, dtype=np.float64)
-            if place.shape != (3,) or not np.isfinite(place).all():
-                raise InputError(f'sensor_poses: {frame_id}: {pose} is not x, y, heading')
-            self._system.set_sensor_pose(frame_id, place)
+            self._system.set_sensor_pose(frame_id, _place(frame_id, pose))
 
     def add(self, measurement: Measurement) -> list[Frame]:
         """One measurement; the frames that it made ready, in the order of their stamps.
 
         A frame has ``stamp`` [ns], ``T_map_base`` (3,), ``cov_map`` (3, 3) and ``health``. Raises
-        InputError where the stamps jump back, as those of a bag that is played in a loop do.
+        InputError for a measurement whose stamp or arrays are of another kind or shape, and where
+        the stamps jump back, as those of a bag that is played in a loop do.
         """
+        measurement = checked(measurement)
         if isinstance(measurement, Odometry):
             frames = self._system.add_odometry(measurement)
         elif isinstance(measurement, Imu):
             frames = self._system.add_imu(measurement)
         elif isinstance(measurement, Scan):
             frames = self._system.add_scan(measurement)
-        elif isinstance(measurement, Detections):
-            frames = self._system.add_detections(measurement)
         else:
-            raise InputError(
-                f'add: {type(measurement).__name__} is no measurement; use Odometry, Imu, Scan or '
-                'Detections of rlml_slam.types'
-            )
+            frames = self._system.add_detections(measurement)
         self._log.add(frames)
         return frames
 
@@ -320,8 +316,8 @@ def replay(
     bag: File | Bag,
     parameters: Parameters | None = None,
     *,
-    localize_in: Map | None = None,
-    continue_from: Map | None = None,
+    localize_in: Map | File | None = None,
+    continue_from: Map | File | None = None,
 ) -> Result:
     """Run the system over a bag, as ``rlml replay`` does: the same input gives the same bytes.
 
@@ -330,7 +326,7 @@ def replay(
     """
     path, own = (bag.path, bag.parameters) if isinstance(bag, Bag) else (bag, Parameters())
     known, begun = _start(localize_in, continue_from)
-    return Result(run_replay(path, parameters or own, given=Given(known, begun)))
+    return Result(run_replay(path, _parameters(parameters, own), given=Given(known, begun)))
 
 
 def evaluate(
@@ -367,16 +363,52 @@ def evaluate(
 def _as_trajectory(given: Result | Trajectory | File) -> Trajectory:
     if isinstance(given, Result):
         return given.trajectory
-    return given if isinstance(given, Trajectory) else read_tum(given)
+    if isinstance(given, Trajectory):
+        return given
+    if not isinstance(given, str | Path):
+        raise InputError(f'evaluate: {type(given).__name__} is no Result, Trajectory or file')
+    return read_tum(given)
 
 
 def _start(
-    localize_in: Map | None, continue_from: Map | None
+    localize_in: Map | File | None, continue_from: Map | File | None
 ) -> tuple[SavedMap | None, Content | None]:
     """The map to localize in and the one to extend, at most one of them."""
     if localize_in is not None and continue_from is not None:
         raise MapError('localize_in and continue_from exclude each other: give one map')
-    if continue_from is not None and continue_from.graph is None:
-        raise MapError('continue_from: this map has no graph; load one that was saved as .rlml')
-    known = SavedMap(localize_in.reflectors, localize_in.grid) if localize_in else None
-    return known, continue_from.graph if continue_from else None
+    if continue_from is not None:
+        begun = _map('continue_from', continue_from)
+        if begun.graph is None:
+            raise MapError('continue_from: this map has no graph; one that was saved as .rlml has')
+        return None, begun.graph
+    if localize_in is None:
+        return None, None
+    known = _map('localize_in', localize_in)
+    whole = SavedMap(known.reflectors, known.grid)
+    return saved_map.require_contents(whole, saved_map.EMPTY), None
+
+
+def _map(name: str, given: Map | File) -> Map:
+    if isinstance(given, str | Path):
+        return load_map(given)
+    if not isinstance(given, Map):
+        raise MapError(f'{name}: a Map or the path of one is needed, not {type(given).__name__}')
+    return given
+
+
+def _parameters(given: Parameters | None, default: Parameters) -> Parameters:
+    if given is not None and not isinstance(given, Parameters):
+        raise ParameterError(
+            f'parameters: {type(given).__name__} is not Parameters; use read_parameters(changes=…)'
+        )
+    return default if given is None else given
+
+
+def _place(frame_id: str, pose: Sequence[float] | Array) -> Array:
+    try:
+        place = np.asarray(pose, dtype=np.float64)
+    except (TypeError, ValueError):
+        place = np.full(3, np.nan)
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise InputError(f'sensor_poses: {frame_id}: {pose} is not x, y, heading')
+    return place

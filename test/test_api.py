@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import runpy
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import pytest
 
 import rlml_slam
 from rlml_slam.datasets.tum import Trajectory, write_tum
+from rlml_slam.types import Detections, Imu, Odometry, Scan
 
 ROOT = Path(__file__).resolve().parents[1]
 ROOM = ROOT / 'bags' / 'room'
@@ -180,3 +182,83 @@ def test_other_things_are_no_measurements():
         rlml_slam.Slam().add(3)
     with pytest.raises(rlml_slam.RlmlError, match='no measurement could be used'):
         rlml_slam.Slam().finish()
+
+
+def test_stamps_of_numpy_are_stamps(bag):
+    """With jitter, the sums of the filter of stamps are beyond 64 bits."""
+    rng = np.random.default_rng(3)
+    shifts = 1_760_000_000_000_000_000 + rng.integers(0, 20_000_000, 3000)
+    poses = []
+    for kind in (int, np.int64):
+        slam = rlml_slam.Slam(sensor_poses=bag.sensor_poses)
+        frames = []
+        for m, shift in zip(bag, shifts.tolist(), strict=False):
+            frames += slam.add(dataclasses.replace(m, stamp=kind(m.stamp + shift)))
+        poses.append([f.T_map_base for f in frames])
+    assert len(poses[0]) > 50
+    np.testing.assert_array_equal(*poses)
+
+
+ONE = np.eye(2)[None] * 1e-4
+WRONG = {
+    'Odometry.pose': Odometry(1, np.zeros(2)),
+    'Odometry.stamp': Odometry(1.5e9, np.zeros(3)),
+    'Imu.yaw_rate': Imu(1, 'fast'),
+    'Scan.stamp': Scan('1', 'laser', 0.0, 0.1, 0.0, 0.1, 9.0, np.ones(9), np.zeros(0)),
+    'Scan.ranges': Scan(1, 'laser', 0.0, 0.1, 0.0, 0.1, 9.0, np.ones((3, 3)), np.zeros(0)),
+    'Detections.points': Detections(1, 'laser', np.ones(2), ONE, [1], [0.1]),
+    'Detections.cov': Detections(1, 'laser', np.ones((1, 2)), np.eye(2), [1], [0.1]),
+    'Detections.ids': Detections(1, 'laser', np.ones((1, 2)), ONE, [1, 2], [0.1]),
+    'Detections.diameters': Detections(1, 'laser', np.ones((1, 2)), ONE, [1], 0.1),
+}
+
+
+@pytest.mark.parametrize('name', WRONG)
+def test_measurement_of_another_shape_is_refused_and_harms_nothing(bag, name):
+    slam = rlml_slam.Slam(sensor_poses=bag.sensor_poses)
+    with pytest.raises(rlml_slam.RlmlError, match=re.escape(name)):
+        slam.add(WRONG[name])
+    frames = [f for m, _ in zip(bag, range(400), strict=False) for f in slam.add(m)]
+    assert len(frames) > 5
+
+
+def test_lists_and_other_numbers_are_measurements(bag):
+    poses = []
+    for listed in (False, True):
+        slam = rlml_slam.Slam(sensor_poses=bag.sensor_poses)
+        frames = []
+        for m, _ in zip(bag, range(400), strict=False):
+            if listed and isinstance(m, Scan):
+                m = dataclasses.replace(
+                    m, ranges=m.ranges.tolist(), intensities=m.intensities.astype(np.float64)
+                )
+            elif listed and isinstance(m, Odometry):
+                m = dataclasses.replace(m, pose=tuple(m.pose.tolist()))
+            frames += slam.add(m)
+        poses.append([f.T_map_base for f in frames])
+    np.testing.assert_array_equal(*poses)
+
+
+@pytest.mark.parametrize(
+    ('call', 'said'),
+    [
+        (lambda b: rlml_slam.replay(b, {'use_odom': False}), 'dict is not Parameters'),
+        (lambda b: rlml_slam.Slam({'use_odom': False}), 'read_parameters'),
+        (lambda b: rlml_slam.read_bag(ROOM, {}), 'read_parameters'),
+        (lambda b: rlml_slam.replay(b, localize_in=3), 'localize_in: a Map'),
+        (lambda b: rlml_slam.replay(b, continue_from='nosuch.rlml'), 'nosuch.rlml'),
+        (lambda b: rlml_slam.Slam(localize_in=rlml_slam.Slam().map()), 'the map is empty'),
+        (lambda b: rlml_slam.Slam(sensor_poses={'laser': 'abc'}), 'not x, y, heading'),
+        (lambda b: rlml_slam.save_map(b, 'x.rlml'), 'a Map is needed, not Bag'),
+        (lambda b: rlml_slam.evaluate(np.zeros((2, 3)), truth=b.truth), 'ndarray is no Result'),
+    ],
+)
+def test_likely_mistakes_are_errors_of_the_package(bag, call, said):
+    with pytest.raises(rlml_slam.RlmlError, match=re.escape(said)):
+        call(bag)
+
+
+def test_map_may_be_given_by_its_path(result, tmp_path):
+    path = rlml_slam.save_map(result.map, tmp_path / 'room.rlml')
+    by_path, by_map = rlml_slam.Slam(localize_in=path), rlml_slam.Slam(localize_in=result.map)
+    np.testing.assert_array_equal(by_path.map().reflectors.points, by_map.map().reflectors.points)

@@ -93,6 +93,17 @@ def test_map_is_a_path_as_users_of_nav2_give_it(launched):
     assert values['use_sim_time'] is True
 
 
+def test_map_by_its_name_is_where_mapping_saved_it(launched):
+    (mapping,) = launched(ROOT / 'launch' / 'mapping.launch.py', map_file_name='warehouse')
+    (node,) = launched(ROOT / 'launch' / 'localization.launch.py', map='warehouse')
+    for name in ('map_directory', 'map_file_name'):
+        assert given_to(node)[name] == given_to(mapping)[name]
+    (node,) = launched(ROOT / 'launch' / 'localization.launch.py', map='maps/warehouse')
+    assert given_to(node)['map_directory'] == str(Path('maps').absolute())
+    (node,) = launched(ROOT / 'launch' / 'localization.launch.py', map='warehouse.yaml')
+    assert given_to(node)['map_directory'] == str(Path.cwd())
+
+
 def test_launch_files_and_config_are_installed():
     for folder in ('launch', 'config'):
         assert re.search(rf"glob\('{folder}/\*", SETUP)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A gate before the drives: the robot stops where the localization is LOST or says nothing.
 
-Run it beside the robot, with the controller publishing on ``cmd_vel_in``::
+It is the last link before the drives, which listen to nothing but ``cmd_vel_checked``::
 
-    python3 docs/examples/cmd_vel_gate.py --ros-args -r health:=/front_end/health
+    python3 docs/examples/cmd_vel_gate.py --ros-args -r health:=/front_end/health \\
+        -r cmd_vel_in:=cmd_vel -r cmd_vel:=cmd_vel_checked
 """
 
 from __future__ import annotations
@@ -57,6 +58,10 @@ class CmdVelGate(Node):
         """Stop the robot again and again while the gate is closed."""
         if not self.is_open():
             self._publisher.publish(Twist())
+        topic = self._publisher.topic_name
+        if self.count_publishers(topic) > 1:
+            text = f'another node publishes on {topic}: the gate cannot stop the robot'
+            self.get_logger().warning(text, throttle_duration_sec=10.0)
 
 
 def main() -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -78,6 +79,8 @@ def run(args: argparse.Namespace) -> int:
     truth = Truth(read_tum(args.truth), is_map=False) if args.truth else None
     if args.map and (args.go_on or args.survey):
         raise ParameterError('replay: --map excludes --continue and --survey')
+    for name, option in unused(args, params):
+        print(f'rlml: {name} is for the nodes, and is not used: give {option}', file=sys.stderr)
     known = load_known(args.map) if args.map else None
     begun = map_file.load(args.go_on) if args.go_on else None
     surveyed = survey.load(args.survey) if args.survey else None
@@ -99,13 +102,24 @@ def run(args: argparse.Namespace) -> int:
     return print_summary(result, figures, args.out, args.json, not args.no_report)
 
 
+def unused(args: argparse.Namespace, params: Any) -> Iterator[tuple[str, str]]:
+    """Parameters that say which map or survey a node begins with, and the options of a replay."""
+    if not isinstance(params, Parameters):
+        return
+    if params.back_end.survey and not args.survey and not args.map:
+        yield 'back_end.survey', '--survey FILE'
+    if params.node.continue_map and not args.go_on and not args.map:
+        yield 'continue_map', '--continue MAP'
+
+
 def load_known(path: Path) -> SavedMap:
     """A map to localize in: a .rlml file, a .yaml of nav2 or a .csv of reflectors, a folder."""
     if (path / 'map.rlml').exists():
         path /= 'map.rlml'  # as the nodes: the text beside it may be older than a --revoke
     if path.suffix in ('.yaml', '.csv') or path.is_dir():
-        return saved_map.load(path)
+        return saved_map.require_contents(saved_map.load(path), f'{path}: {saved_map.EMPTY}')
     content = map_file.load(path)
     if note := saved_map.newer_image(path):
         print(f'rlml: {note}', file=sys.stderr)
-    return map_file.saved_map(content)
+    whole = map_file.saved_map(content)
+    return saved_map.require_contents(whole, f'{path}: {saved_map.EMPTY}')

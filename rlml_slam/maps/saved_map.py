@@ -16,6 +16,8 @@ from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.types import Reflectors
 
 ID_DIGITS = 12
+NOT_YET = 'there is no map yet: drive through the place first'
+EMPTY = 'the map is empty: it has no grid and no reflectors'
 
 
 @dataclass(frozen=True)
@@ -42,10 +44,10 @@ class SavedMap:
         return content.hexdigest()[:ID_DIGITS]
 
 
-def require_contents(saved: SavedMap) -> SavedMap:
-    """The map itself; MapError where there is nothing in it to localize in."""
+def require_contents(saved: SavedMap, why: str = NOT_YET) -> SavedMap:
+    """The map itself; MapError, which says ``why``, where there is nothing in it."""
     if saved.grid is None and len(saved.reflectors) == 0:
-        raise MapError('there is no map yet: drive through the place first')
+        raise MapError(why)
     return saved
 
 

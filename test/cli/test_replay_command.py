@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import rlml_slam
 from rlml_slam import se2
 from rlml_slam.cli.main import main
 from rlml_slam.cli.replay import load_known
@@ -110,6 +111,25 @@ def test_folder_without_a_map_is_refused(tmp_path, capsys):
     arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out')]
     assert main([*arguments, '--map', str(tmp_path)]) == 1
     assert 'neither reflectors.csv nor map.csv' in capsys.readouterr().err
+
+
+def test_empty_map_is_refused(tmp_path, capsys):
+    rlml_slam.save_map(rlml_slam.Slam().map(), tmp_path / 'nothing')
+    arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out')]
+    assert main([*arguments, '--map', str(tmp_path / 'nothing')]) == 1
+    assert 'nothing: the map is empty' in capsys.readouterr().err
+
+
+def test_map_and_survey_of_a_node_are_not_used_and_named(tmp_path, capsys):
+    config = tmp_path / 'c.yaml'
+    config.write_text(
+        '/**:\n  ros__parameters:\n    continue_map: true\n    back_end: {survey: plant.csv}\n'
+    )
+    arguments = ['replay', str(BAGS / 'room'), '--out', str(tmp_path / 'out'), '--no-report']
+    assert main([*arguments, '--config', str(config)]) == 0
+    said = capsys.readouterr().err
+    assert 'back_end.survey is for the nodes, and is not used: give --survey FILE' in said
+    assert 'continue_map is for the nodes, and is not used: give --continue MAP' in said
 
 
 def test_given_truth_is_aligned(mapped, tmp_path, capsys):

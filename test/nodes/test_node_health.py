@@ -174,6 +174,19 @@ def test_gate_stops_the_robot_that_is_lost(live):
     assert live.heard['cmd_vel'][0].linear.x == 0.0
 
 
+def test_gate_warns_of_commands_that_pass_beside_it(live, monkeypatch):
+    gate = live.start(runpy.run_path(str(GATE))['CmdVelGate'])
+    said = []
+    monkeypatch.setattr(
+        gate, 'get_logger', lambda: SimpleNamespace(warning=lambda text, **_: said.append(text))
+    )
+    live.spin_until(lambda: gate.count_publishers('cmd_vel') == 1)
+    assert not said
+    live.ear.create_publisher(Twist, 'cmd_vel', 10)
+    live.spin_until(lambda: said)
+    assert 'another node publishes on /cmd_vel' in said[0]
+
+
 def test_problems_do_not_make_a_lost_robot_better():
     lost = Health(Level.LOST, ('nothing fits',))
     found = diagnostics.with_problems(lost, ('no correction',))
