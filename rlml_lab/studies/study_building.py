@@ -5,8 +5,10 @@ The robot drives around the building, back to where it began, and through corrid
 laser looks ahead only, and its odometry is a poor one. Rooms and corridors look alike, and a
 scan that is displaced by the width of a corridor fits there almost as well.
 
-``--stall`` lets the odometry stand still again and again, and then catch up in one step; ``--cut``
-leaves out all messages. In a bare corridor no scan says how far the robot drove meanwhile.
+``--closed`` closes all doors: then nothing but their niches, and crossings, says how far the robot
+is. ``--stall`` lets the odometry stand still again and again, and then catch up in one step;
+``--cut`` leaves out all messages. In a bare corridor no scan says how far the robot drove
+meanwhile.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_lab.support.office_building import CORRIDOR, PITCH, Building
+from rlml_lab.support.office_building import CORRIDOR, PITCH, Building, ClosedBuilding
 from rlml_slam import se2
 from rlml_slam.cli.support.text_table import aligned
 from rlml_slam.params import Parameters
@@ -60,6 +62,7 @@ class Drive:
     stall: float = 0.0
     cut: float = 0.0
     interval: float = 60.0
+    closed: bool = False
 
 
 def add_parser(subparsers: Any) -> None:
@@ -75,13 +78,16 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument('--stall', type=float, default=0.0, metavar='S', help='of the odometry')
     parser.add_argument('--cut', type=float, default=0.0, metavar='S', help='without any message')
     parser.add_argument('--every', type=float, default=60.0, metavar='S', help='for both of these')
+    parser.add_argument('--closed', action='store_true', help='all doors')
     parser.add_argument('--seeds', type=int, default=3, help='number of buildings')
     parser.add_argument('--first', type=int, default=0, help='the first seed')
 
 
 def run(args: argparse.Namespace) -> int:
     """Drive through each building and print a row."""
-    how = Drive(args.size, args.rate, args.poor, args.speed, args.stall, args.cut, args.every)
+    how = Drive(
+        args.size, args.rate, args.poor, args.speed, args.stall, args.cut, args.every, args.closed
+    )  # fmt: skip
     seeds = range(args.first, args.first + args.seeds)
     print(aligned([HEADER, *((f'{seed}', *drive(how, seed)) for seed in seeds)]))
     return 0
@@ -135,7 +141,8 @@ def is_within(stamps: Array, interval: float, lasts: float, start: float) -> NDA
 
 def drive(how: Drive, seed: int) -> tuple[str, ...]:
     """The row of one building."""
-    building, rng = Building(seed, how.size), np.random.default_rng(seed + 100)
+    kind = ClosedBuilding if how.closed else Building
+    building, rng = kind(seed, how.size), np.random.default_rng(seed + 100)
     poses = route(how.size, 1.0 / how.rate, how.speed)
     odometry = odometry_of(poses, how.poor, rng)
     seconds, start = np.arange(len(poses)) / how.rate, how.interval * float(rng.random())

@@ -16,6 +16,7 @@ from rlml_slam.simulation.world import Geometry
 CORRIDOR = 2.4  # [m] width
 PITCH = 20.0  # [m] about, from corridor to corridor
 DOOR = 0.95  # [m]
+NICHE = 0.12  # [m] depth of a closed door
 HALLS = 0.25  # share of the blocks between corridors
 REACH = 30.0  # [m] of the laser
 NOISE = 0.01  # [m] 1 sigma of a range
@@ -112,6 +113,36 @@ class Building:
         chosen = self.poses[self.rng.permutation(len(self.poses))[:number]]
         low, high = (-0.3, -0.3, -np.pi), (0.3, 0.3, np.pi)
         return chosen + self.rng.uniform(low, high, chosen.shape)
+
+
+class ClosedBuilding(Building):
+    """All doors are closed: corridors are bare, but for the niches of the doors."""
+
+    def _hall(self, x0: float, y0: float, x1: float, y1: float) -> None:
+        self._rooms(x0, y0, x1, y1)
+
+    def _rooms(self, x0: float, y0: float, x1: float, y1: float) -> None:
+        self._wall(x0, x1, y0, NICHE, 1)
+        self._wall(x0, x1, y1, -NICHE, 1)
+        self._wall(y0, y1, x0, NICHE, -1)
+        self._wall(y0, y1, x1, -NICHE, -1)
+
+    def _wall(self, begin: float, end: float, at: float, niche: float, axis: int) -> None:
+        """Along x (``axis`` 1) or y (-1), with doors that are set back by ``niche`` [m]."""
+
+        def part(a: float, b: float, before: float, behind: float) -> None:
+            (p, q), (u, v) = (a, at + before)[::axis], (b, at + behind)[::axis]
+            self._walls.append((p, q, u, v))
+
+        t = begin
+        while t < end:
+            door = min(t + self.rng.uniform(3.0, 9.0), end)
+            after = min(door + 1.0, end)
+            part(t, door, 0.0, 0.0)
+            part(door, door, 0.0, niche)
+            part(door, after, niche, niche)
+            part(after, after, niche, 0.0)
+            t = after
 
 
 def _box(x0: float, y0: float, x1: float, y1: float) -> Walls:

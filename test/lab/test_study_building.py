@@ -30,7 +30,7 @@ def test_stalls_and_cuts_come_again_and_again():
 
 def row_of(capsys, **options):
     usual = {'size': 40.0, 'rate': 2.0, 'poor': 1.0, 'speed': study.SPEED, 'stall': 0.0}
-    more = {'cut': 0.0, 'every': 30.0, 'seeds': 1, 'first': 0}
+    more = {'cut': 0.0, 'every': 30.0, 'closed': False, 'seeds': 1, 'first': 0}
     assert study.run(argparse.Namespace(**{**usual, **more, **options})) == 0
     header, row = capsys.readouterr().out.splitlines()
     assert 'enabled wrong' in header
@@ -52,3 +52,18 @@ def test_odometry_that_stalls_in_bare_corridors_is_not_lost(capsys):
     assert before_closing < 3.0
     assert rms < 0.2
     assert ok_and_wrong == '0.00%'
+
+
+def test_way_back_through_bare_corridors_closes_no_loop_by_walls_across(capsys):
+    """Displaced by the width of a crossing, it fits those that it saw on the way there."""
+    row = row_of(capsys, size=60.0, poor=2.0, closed=True, first=7)
+    assert float(row[4]) < 0.1
+    assert row[-3:-1] == ['0', '0.00%']
+
+
+def test_closed_building_has_walls_along_all_corridors():
+    walls = np.array(study.ClosedBuilding(3, 60.0).geometry.segments)[:, :4]
+    lengths = np.hypot(walls[:, 2] - walls[:, 0], walls[:, 3] - walls[:, 1])
+    along = np.minimum(np.abs(walls[:, 2] - walls[:, 0]), np.abs(walls[:, 3] - walls[:, 1]))
+    assert along.max() < 1e-9
+    assert lengths.max() <= 60.0

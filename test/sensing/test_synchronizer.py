@@ -215,6 +215,15 @@ def test_late_and_duplicate_inputs_are_counted_and_left_out():
     assert synchronizer.buffer.newest == before
 
 
+def test_scan_in_millimetres_is_named_and_codes_for_no_return_are_not():
+    synchronizer, t = running()
+    in_mm = replace(scan(t, (400.0, 2100.0, 9000.0, 30000.0)), range_max=30000.0)
+    assert add(synchronizer, in_mm) == []
+    assert 'are they in millimetres?' in synchronizer.inputs.last_error
+    coded = replace(scan(t, (4.0, 65535.0, 65535.0, 65535.0)), range_max=65535.0)
+    assert len(feed(synchronizer, [coded, odometry(t + 20 * MS)])) == 1
+
+
 @pytest.mark.parametrize(
     ('stream', 'bad'),
     [
@@ -230,6 +239,7 @@ def test_late_and_duplicate_inputs_are_counted_and_left_out():
         ('scan', replace(scan(T0 + 4 * SECOND), angle_increment=1e-9)),
         ('scan', replace(scan(T0 + 4 * SECOND), angle_min=-25.0)),
         ('scan', replace(scan(T0 + 4 * SECOND), time_increment=float('inf'))),
+        ('scan', replace(scan(T0 + 4 * SECOND, (4e2, 2e3, np.nan, 9e3, 3e4)), range_max=3e4)),
         ('reflectors', detections(T0 + 4 * SECOND, ((np.nan, 1.0),))),
         (
             'reflectors',

@@ -36,6 +36,7 @@ from rlml_slam.types import Detections, Frame, Imu, Observation, Odometry, Scan,
 MEASURED = ('scan', 'reflectors')  # streams that give observations
 LARGEST_VIEW = 2.2 * math.pi  # [rad] some drivers repeat beams at the end of a turn
 FINEST = 1e-5  # [rad] between beams: the finest lidars have twenty times that
+FARTHEST = 300.0  # [m] that any 2D laser measures
 WAITED = 0.75  # share of ``odom_timeout`` by which odometry is corrected at most
 
 
@@ -303,4 +304,8 @@ def invalid_geometry(scan: Scan) -> str:
         return f'angle_increment {scan.angle_increment:g} rad times {n} beams is no field of view'
     if abs(scan.angle_min) > LARGEST_VIEW:
         return f'angle_min is {scan.angle_min:g} rad, more than a turn'
+    if scan.range_max > FARTHEST:
+        seen = scan.ranges[scan.ranges < scan.range_max]
+        if len(seen) and (middle := float(np.median(seen))) > FARTHEST:
+            return f'half of its ranges are above {middle:.0f} m: are they in millimetres?'
     return ''
