@@ -81,14 +81,16 @@ def load(path: str | Path) -> Survey:
 
 def _checked(where: str, row: Mapping[str, Any]) -> tuple[float, float, float, float]:
     """Id, x, y and diameter; ValueError says where one is wrong."""
-    try:
-        id_ = int(row['id']) if row.get('id') not in (None, '') else ANONYMOUS
-        x, y = float(row['x']), float(row['y'])
-        diameter = float(row['diameter']) if row.get('diameter') not in (None, '') else math.nan
-    except KeyError as e:
-        raise ValueError(f'{where}: {e.args[0]} is missing') from e
-    except (ValueError, TypeError, OverflowError) as e:
-        raise ValueError(f'{where}: {e}') from e
+    read: dict[str, Any] = {'id': ANONYMOUS, 'diameter': math.nan}
+    for name, kind in (('id', int), ('x', float), ('y', float), ('diameter', float)):
+        value = row.get(name)
+        try:
+            read[name] = read[name] if value in (None, '') else kind(value)
+        except KeyError as e:
+            raise ValueError(f'{where}: {name} is missing') from e
+        except (ValueError, TypeError, OverflowError) as e:
+            raise ValueError(f'{where}: {name} is no number: {str(value)[:50]}') from e
+    id_, x, y, diameter = (read[name] for name in ('id', 'x', 'y', 'diameter'))
     if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST):
         raise ValueError(f'{where}: the place is not finite, or beyond {FARTHEST:g} m')
     diameter = diameter or math.nan  # 0: flat, or not known

@@ -15,7 +15,7 @@ from rlml_slam.ros.run import run
 from rlml_slam.ros.sensors import SENSOR, Sensors
 from rlml_slam.ros.systems.detector_diagnostics import DetectorHealth
 from rlml_slam.sensing.mirror import mirrored_detections
-from rlml_slam.sensing.reflectors.reflector_detector import detect
+from rlml_slam.sensing.reflectors.reflector_detector import IntensityCheck, detect
 from rlml_slam.types import Observation
 
 
@@ -38,6 +38,7 @@ class ReflectorDetectorNode(ManagedNode):
         streams = ('scan', 'odom', 'imu')
         self.sensors = Sensors(self, shared, streams, self.process, self.restart)
         self.health = DetectorHealth(self, self.sensors)
+        self.intensities = IntensityCheck()
 
     def process(self, observation: Observation) -> None:
         """One scan: detect and publish; no reflectors are published as an empty cloud."""
@@ -48,9 +49,10 @@ class ReflectorDetectorNode(ManagedNode):
         seen = found.at_stamp(scan, observation.T_base_laser, observation.sweep)
         if self.sensors.hangs(scan.frame_id):
             seen = mirrored_detections(seen)  # as the laser has them
-        if len(scan.intensities):  # without any, nothing was looked at
+        fault = self.intensities.fault(scan)
+        if not fault:  # an empty cloud says that there is no reflector
             self._publisher.publish(encode.detections(make_rclpy, seen, found.intensities))
-        self.health.update(scan, found)
+        self.health.update(scan, found, fault)
 
     def restart(self, _: bool) -> None:
         """The clock jumped back: scans are independent of each other, nothing is forgotten."""

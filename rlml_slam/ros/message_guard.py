@@ -56,14 +56,19 @@ class MessageGuard:
         """Count a message; the reason goes to the log once, whatever numbers it has."""
         self.refused[topic] += 1
         self.last = reason[:500]
-        kind = (topic, NUMBERS.sub('#', self.last))
-        if kind in self._logged or len(self._logged) >= MAX_LOGGED * (2 if trace else 1):
+        if not self.is_new(topic, self.last, MAX_LOGGED * (2 if trace else 1)):
             return  # errors have as much room again
-        self._logged.add(kind)
         if trace:
             self._logger.error(f'not used: {self.last}; please report this:\n{trace}')
         else:
             self._logger.warning(f'not used: {self.last}')
+
+    def is_new(self, topic: str, reason: str, most: int = MAX_LOGGED) -> bool:
+        """Whether a reason is to be logged: once for a topic or stream, whatever its numbers."""
+        before, kind = len(self._logged), (topic, NUMBERS.sub('#', reason))
+        if before < most:
+            self._logged.add(kind)
+        return len(self._logged) > before
 
     def figures(self) -> dict[str, object]:
         """Figures for /diagnostics."""

@@ -97,7 +97,6 @@ class Sensors:
         self._queues: list[tuple[str, Listener]] = []
         self.arrange: Callable[[list[str]], None] = lambda topics: None  # of what was taken
         self._heard, self._began = time.monotonic(), 0.0  # the latter of being active
-        self._told: set[str] = set()
         for stream in streams:
             # without scan matching, a scan still asks for a pose at its stamp
             if getattr(params.node, USED_BY[stream]) or stream == 'scan':
@@ -190,15 +189,15 @@ class Sensors:
             others = _others(self._node, kinds, {q.topic_name for _, q in self._queues})
             self._logger.warning(f'waiting for {", ".join(named)}{others}')
 
-    def _tell_of_refused(self) -> None:
-        """Say of each stream once why an input was not used; /diagnostics count all of them."""
-        for stream, error in self.synchronizer.inputs.first_errors.items():
-            if stream not in self._told:
-                self._told.add(stream)
+    def _log_refused(self) -> None:
+        """Log each reason why inputs of a stream are not used once; /diagnostics count all."""
+        errors = self.synchronizer.inputs.new_errors
+        while errors:
+            stream, error = errors.popleft()
+            if self._guard.is_new(stream, error):
                 self._logger.warning(f'{stream}: not used: {error}')
         comparison = self.synchronizer.odometry.comparison
-        if comparison.differ and TF not in self._told:
-            self._told.add(TF)
+        if comparison.differ and self._guard.is_new(TF, 'the odometry topic differs'):
             self._logger.warning(f'the odometry topic and /tf differ: {comparison}')
 
     def _taken(self, index: int) -> list[tuple[str, Any]]:
@@ -279,7 +278,7 @@ class Sensors:
 
     def _count_invalid(self, stream: str, why: str) -> None:
         self.synchronizer.inputs.count(counted_as(stream), 'invalid', why)
-        self._tell_of_refused()
+        self._log_refused()
 
     def _is_placed(self, msg: Any) -> bool:
         try:
@@ -304,7 +303,7 @@ class Sensors:
         except InputError as e:
             self._start_again(str(e))
             return
-        self._tell_of_refused()
+        self._log_refused()
         for observation in observations:
             self._handle(observation)
 

@@ -87,7 +87,12 @@ def test_id_and_diameter_may_be_missing(tmp_path):
     [
         ('a.csv', 'x,z\n1,2\n', 'no columns of x and y; the header has x, z'),
         ('a.csv', 'x,y\n1,nan\n', 'line 2: the place is not finite'),
-        ('a.csv', 'x,y\n1,far\n', 'line 2: could not convert'),
+        ('a.csv', 'x,y\n1,far\n', 'line 2: y is no number: far'),
+        ('a.csv', 'x,y\n1,\n', 'line 2: y is missing'),
+        ('a.json', '[{"x": 1, "y": null}]', 'entry 1: y is missing'),
+        ('a.json', '[{"x": 1}]', 'entry 1: y is missing'),
+        ('a.json', '[{"x": 1, "y": [2]}]', 'entry 1: y is no number: .2.'),
+        ('a.json', '[{"x": 1, "y": 2, "id": "gate"}]', 'entry 1: id is no number: gate'),
         ('a.csv', 'x,y\n', 'no reflector'),
         ('a.csv', 'id,x,y\n3,1,2\n3,4,5\n', 'two reflectors'),
         ('a.csv', 'id,x,y\n1,"10,5","20,5"\n', 'line 2: 10,5: write 1.5, or'),
@@ -122,6 +127,14 @@ def mapped(points, rng=None, sigma=0.01):
         100 + np.arange(n), points + noise, np.tile(sigma**2 * np.eye(2), (n, 1, 1)),
         np.full(n, ANONYMOUS), np.full(n, 5), np.full(n, np.nan),
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(('in_map', 'in_survey', 'which'), [(5, 2, 'survey'), (2, 5, 'map')])
+def test_too_few_reflectors_are_said_of_the_one_that_has_them(in_map, in_survey, which):
+    points = np.random.default_rng(0).uniform(-9.0, 9.0, (5, 2))
+    surveyed = Survey(np.full(in_survey, ANONYMOUS), points[:in_survey], np.full(in_survey, 0.1))
+    with pytest.raises(MapError, match=f': the {which} has 2 reflectors, three are needed'):
+        map_survey.compare(mapped(points[:in_map]), surveyed)
 
 
 @pytest.fixture(scope='module')

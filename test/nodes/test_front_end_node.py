@@ -299,6 +299,24 @@ def test_first_refusal_of_a_stream_is_told_on_the_console(live, node, monkeypatc
     assert re.fullmatch(r'scan: not used: scan at \d+ ns: it is empty', text)
 
 
+def test_each_reason_of_a_stream_is_on_the_console_once(live, node, monkeypatch):
+    said = []
+    monkeypatch.setattr(node.sensors, '_logger', SimpleNamespace(warning=said.append, info=print))
+    for k, (_, msg) in enumerate(room(['/scan'], seconds=3.0)):
+        if k % 3 == 0:
+            msg.ranges = msg.intensities = array('f')
+        elif k % 3 == 1:
+            msg.header.stamp.sec = msg.header.stamp.nanosec = 0
+        else:
+            msg.angle_increment = 0.0
+        node.sensors.add('scan', msg)
+    reasons = [re.sub(r'\d+', '#', text) for text in said]
+    assert len(set(reasons)) == len(reasons) == 3, said
+    for k in range(1000):  # reasons without end
+        node.sensors._count_invalid('scan', 'x' * k)
+    assert len(said) == 100
+
+
 def test_what_never_came_is_told_once(live, node, monkeypatch):
     said = []
     monkeypatch.setattr(node.sensors, '_logger', SimpleNamespace(warning=said.append, info=print))

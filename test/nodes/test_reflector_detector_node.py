@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from array import array
+
 import numpy as np
 import pytest
 from live import room
@@ -11,7 +13,7 @@ from rlml_slam.nodes.reflector_detector import ReflectorDetectorNode
 from rlml_slam.params import Reflector
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.codecs.point_cloud import read_cloud
-from rlml_slam.types import ANONYMOUS
+from rlml_slam.types import ANONYMOUS, Health, Level
 
 CLOUD = 'sensor_msgs/msg/PointCloud2'
 FIELDS = ('x', 'y', 'id', 'sigma_range', 'sigma_bearing', 'diameter', 'intensity')
@@ -92,11 +94,56 @@ def test_a_scan_without_intensities_is_told_and_gets_no_cloud(live, node):
 def test_a_scan_with_no_reflector_gets_an_empty_cloud(live, node):
     for stream, msg in room(seconds=2.0):
         if stream == 'scan':
-            msg.intensities = [100.0] * len(msg.ranges)
+            msg.intensities = [0.01 + 0.001 * (k % 3) for k in range(len(msg.ranges))]  # dark
         if stream != 'reflectors':
             node.sensors.add(stream, msg)
     live.spin_until(lambda: live.heard['reflectors'])
     assert all(m.width == 0 for m in live.heard['reflectors'])
+
+
+def spoiled(msg, kind):
+    """A scan whose intensities show nothing."""
+    n = len(msg.ranges)
+    if kind == 'no range':
+        msg.ranges = [np.nan] * n
+    elif kind == 'one value':
+        # what did not return has another one
+        msg.ranges[: n // 2] = array('f', [np.inf] * (n // 2))
+        msg.intensities = [0.0] * (n // 2) + [47.0] * (n - n // 2)
+    else:
+        msg.intensities = [] if kind == 'none' else [float(kind)] * n
+
+
+@pytest.mark.parametrize(
+    ('kind', 'reason'),
+    [
+        ('none', 'scans have no intensities'),
+        ('0', 'no beam with a valid range has an intensity above 0'),
+        ('nan', 'no beam with a valid range has an intensity above 0'),
+        ('no range', 'no beam with a valid range has an intensity above 0'),
+        ('one value', 'all beams of a scan have the same intensity'),
+    ],
+)
+def test_intensities_that_vanish_are_named_and_get_no_cloud(live, node, kind, reason):
+    live.listen('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray')
+    items = [(stream, msg) for stream, msg in room(seconds=4.0) if stream != 'reflectors']
+    for stream, msg in items[: len(items) // 2]:
+        node.sensors.add(stream, msg)
+    assert node.health.health() == Health()
+    node.health.publish()
+    before = node.health.counts['scans']
+    live.drain()
+    sent = len(live.heard['reflectors'])
+    for stream, msg in items[len(items) // 2 :]:
+        if stream == 'scan':
+            spoiled(msg, kind)
+        node.sensors.add(stream, msg)
+    assert node.health.health() == Health(Level.DEGRADED, (reason,))
+    live.drain()
+    late = [m for m in live.heard['reflectors'][sent:] if m.width == 0]
+    assert len(live.heard['reflectors']) - sent <= 2, len(late)  # scans that waited
+    assert node.health.counts['scans without intensities'] >= 15
+    assert node.health.counts['scans'] > before
 
 
 def test_the_process_detects_what_it_hears_and_ends_cleanly(live, start):

@@ -11,6 +11,7 @@ import pytest
 from rlml_slam import se2
 from rlml_slam.params import Detector, SimulatorParameters, from_mapping
 from rlml_slam.sensing.reflectors.reflector_calibration import ReflectorCalibration, calibrated
+from rlml_slam.sensing.reflectors.reflector_detector import IntensityCheck
 from rlml_slam.sensing.reflectors.scan_reflectors import ScanReflectors
 from rlml_slam.simulation.simulation import Simulation
 from rlml_slam.simulation.world_file import load_world
@@ -92,6 +93,51 @@ def test_reflectors_are_found_on_any_scale(change, kind):
     assert (off.min(axis=1) < 0.03 + kind.get('radius', 0.04)).all()
     assert len(set(off.argmin(axis=1))) >= 5  # one may be hidden
     assert 'in a scan' in said
+
+
+@pytest.mark.parametrize('mode', ['on', 'auto'])
+@pytest.mark.parametrize('value', [0.0, 47.0, np.nan])
+def test_intensities_that_vanish_are_no_look(mode, value):
+    """After good scans: None, not "looked and saw none", which would take reflectors away."""
+    reflectors, kept = ScanReflectors(Detector(), mode), []
+    for k, s in enumerate(scans()):
+        kept.append(reflectors.detections(s, STILL, STILL))
+        blind = replace(s, stamp=s.stamp + 1, intensities=np.full_like(s.intensities, value))
+        if k > 30:
+            assert reflectors.detections(blind, STILL, STILL) is None
+    assert len(kept[-1]) > 0
+    dark = replace(s, intensities=(0.01 + 1e-4 * np.arange(len(s.ranges)) % 3).astype('f4'))
+    found = reflectors.detections(dark, STILL, STILL)
+    assert found is not None
+    assert len(found) == 0
+
+
+def test_laser_with_levels_has_looked_where_all_is_0():
+    reflectors = ScanReflectors(Detector(), 'auto')
+    for s in scans(levels):
+        reflectors.detections(s, STILL, STILL)
+    found = reflectors.detections(
+        replace(s, intensities=np.zeros_like(s.intensities)), STILL, STILL
+    )
+    assert found is not None
+    assert len(found) == 0
+
+
+@pytest.mark.parametrize('values', [(0.0, 1.0), (100.0, 255.0)])
+def test_laser_that_marks_reflectors_has_looked_where_no_beam_is_marked(values):
+    check, frames = IntensityCheck(), list(scans())
+    marked = [
+        replace(s, intensities=np.where(s.intensities > 2000.0, values[1], values[0]).astype('f4'))
+        for s in frames
+    ]
+    none = [replace(s, intensities=np.full_like(s.intensities, values[0])) for s in frames]
+    assert check.fault(none[0])  # it may as well measure none
+    assert not check.fault(marked[1])
+    assert not check.fault(none[2])
+    assert check.fault(replace(none[3], frame_id='other'))
+    assert check.fault(replace(none[4], ranges=np.full_like(none[4].ranges, np.nan)))
+    assert not check.fault(frames[5])  # it has levels
+    assert check.fault(none[6])
 
 
 @pytest.mark.parametrize('gloss', [0.0, 4000.0])

@@ -47,6 +47,10 @@ def place(found: Reflectors, surveyed: Survey, sigma: float) -> Placement:
         d2 = np.einsum('ni,ni->n', d, np.linalg.solve(S, d[..., None])[..., 0])
         if (d2 < gate(Relocalization().gate)).all():
             return _refined(found, surveyed, T, sigma, f'{len(rows)} ids stand as surveyed')
+    for name, n in (('map', len(found)), ('survey', len(surveyed.points))):
+        if n < MIN_MATCHES:
+            why = f'the {name} has {n} reflectors, three are needed'
+            return Placement(None, np.zeros((0, 2), dtype=np.int64), why)
     cov = np.tile(sigma**2 * np.eye(2), (len(surveyed.points), 1, 1))
     stars = locate(found.points, found.cov, surveyed.points, cov, Relocalization())
     if stars.verdict is not Verdict.UNIQUE:

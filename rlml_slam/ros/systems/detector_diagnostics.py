@@ -21,7 +21,7 @@ class DetectorHealth:
         self._name = node.get_fully_qualified_name().lstrip('/')
         self._sensors = sensors
         self.counts: Counter[str] = Counter()
-        self._reported = 0
+        self._reported, self._fault = Counter[str](), ''
         self._stamp = 0
         self._last = 0
         self._publisher = node.create_publisher(
@@ -29,22 +29,24 @@ class DetectorHealth:
         )
         node.every(PERIOD, self.publish)
 
-    def update(self, scan: Scan, found: Found) -> None:
-        """One scan and what it held."""
+    def update(self, scan: Scan, found: Found, fault: str) -> None:
+        """One scan and what it held; ``fault`` is why its intensities show nothing, or empty."""
         self._stamp, self._last = scan.stamp, len(found)
+        self._fault = fault or self._fault
         self.counts['scans'] += 1
-        self.counts['scans without intensities'] += not len(scan.intensities)
+        self.counts['scans without intensities'] += bool(fault)
         self.counts['reflectors'] += len(found)
         self.counts.update({f'rejected: {f.name.lower()}': n for f, n in found.rejected.items()})
 
     def health(self) -> Health:
-        """OK, or DEGRADED with the reason."""
+        """OK, or DEGRADED with the reason, by the scans since the last status."""
         if not self.counts['scans']:
             return Health(Level.DEGRADED, ('no scan yet',))
-        if self.counts['scans'] == self._reported:
+        new = self.counts - self._reported
+        if not new['scans']:
             return Health(Level.DEGRADED, ('no new scan',))
-        if self.counts['scans without intensities'] == self.counts['scans']:
-            return Health(Level.DEGRADED, ('scans have no intensities',))
+        if new['scans without intensities'] == new['scans']:
+            return Health(Level.DEGRADED, (self._fault,))
         return Health()
 
     def summary(self) -> str:
@@ -61,5 +63,5 @@ class DetectorHealth:
         figures['reflectors in the last scan'] = self._last
         figures |= input_figures(self._sensors.synchronizer)
         message = encode.diagnostics(make_rclpy, self._stamp, self._name, self.health(), figures)
-        self._reported = self.counts['scans']
+        self._reported = self.counts.copy()
         self._publisher.publish(message)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -12,7 +13,12 @@ from rlml_slam import se2
 from rlml_slam.params import Detector
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.polar import polar_covariance
-from rlml_slam.sensing.reflectors.background_intensity import is_circular, levels, opened
+from rlml_slam.sensing.reflectors.background_intensity import (
+    is_circular,
+    levels,
+    opened,
+    valid_beams,
+)
 from rlml_slam.sensing.reflectors.bright_spots import (
     BEAM,
     BEARING,
@@ -36,6 +42,7 @@ from rlml_slam.types import ANONYMOUS, Detections, Scan
 # of a diameter: the mean of sqrt(R^2 - t^2) weighted by the power that comes back, 8 R / (3 pi)
 DEPTH = 4.0 / (3.0 * np.pi)
 SAME = 0.1  # [m] between two sightings of one reflector in one sweep
+MAX_LASERS = 16  # of a robot
 
 
 @dataclass(frozen=True)
@@ -121,6 +128,35 @@ def _turned_by_sweep(points: Array, T_base_laser: Array, share: Array) -> Array:
     J[:, :, :2] = np.eye(2)
     J[:, 0, 2], J[:, 1, 2] = -p[:, 1], p[:, 0]
     return share[:, None, None] * (se2.rotation(T_base_laser[2]).T @ J)
+
+
+class IntensityCheck:
+    """Whether the intensities of scans show anything, be it that no reflector is there.
+
+    A laser that marks reflectors, with two values only, has one of them where there is none.
+    """
+
+    def __init__(self) -> None:
+        self._marks: set[str] = set()  # frames of such lasers
+
+    def fault(self, scan: Scan) -> str:
+        """Why those of a scan show nothing; empty if they do."""
+        if not len(scan.intensities) or len(scan.intensities) != len(scan.ranges):
+            return 'scans have no intensities'
+        ranges, bright = valid_beams(scan)
+        seen = bright[ranges > 0.0]
+        least, most = seen.min(initial=math.inf), seen.max(initial=0.0)
+        if least < most:
+            has_two = bool(((seen == least) | (seen == most)).all())
+            if has_two and len(self._marks) < MAX_LASERS:
+                self._marks.add(scan.frame_id)
+            elif not has_two:
+                self._marks.discard(scan.frame_id)
+        elif len(seen) and scan.frame_id in self._marks:
+            return ''
+        elif not most > 0.0:
+            return 'no beam with a valid range has an intensity above 0'
+        return '' if least < most else 'all beams of a scan have the same intensity'
 
 
 def detect(scan: Scan, params: Detector, floor: Callable[[Array], Array] | None = None) -> Found:

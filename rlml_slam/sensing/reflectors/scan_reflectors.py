@@ -9,11 +9,9 @@ from rlml_slam import se2
 from rlml_slam.params import Detector
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.reflectors.reflector_calibration import Calibration, ReflectorCalibration
-from rlml_slam.sensing.reflectors.reflector_detector import detect
+from rlml_slam.sensing.reflectors.reflector_detector import MAX_LASERS, IntensityCheck, detect
 from rlml_slam.sensing.reflectors.reflector_shapes import SHARED, ReflectorShapes
 from rlml_slam.types import Detections, Scan
-
-MAX_LASERS = 16
 
 
 class ScanReflectors:
@@ -28,6 +26,7 @@ class ScanReflectors:
         self._mode = mode
         self._lasers: dict[str, ReflectorCalibration] = {}
         self._shapes = ReflectorShapes()
+        self._intensities = IntensityCheck()
         self.num_scans = self.num_found = 0
 
     def detections(
@@ -52,6 +51,10 @@ class ScanReflectors:
             if calibration is None:
                 return None
             detector, sigma_size = calibration.detector, calibration.sigma_size
+        # to a laser with a few levels of intensity, all that is diffuse has 0
+        has_levels = calibration is not None and math.isinf(calibration.ratio)
+        if self._intensities.fault(scan) and not has_levels:
+            return None
         found = detect(scan, detector, None if calibration is None else calibration.floor)
         odds, shared = found.odds, 1.0
         if T_odom_laser is not None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter, defaultdict, deque
 from dataclasses import dataclass, field
 
 
@@ -15,12 +15,13 @@ class InputCounts:
     which beams were left out that see the robot itself, and ``sweep_time`` those of which the time
     per ray cannot be. Not used are ``repeated`` ones, old scans of a robot that has moved since,
     those ``in_gap``, after a gap and before odometry, and turn rates where the gyro
-    ``contradicts`` odometry.
+    ``contradicts`` odometry. ``new_errors`` are those with their stream that the log has not yet.
     """
 
     counts: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     last_error: str = ''
     first_errors: dict[str, str] = field(default_factory=dict)
+    new_errors: deque[tuple[str, str]] = field(default_factory=lambda: deque(maxlen=100))
 
     def count(self, stream: str, what: str, error: str = '') -> None:
         """Count one input of ``stream``; ``error`` is the message for the log."""
@@ -28,6 +29,7 @@ class InputCounts:
         if error:
             self.last_error = error
             self.first_errors.setdefault(stream, error)
+            self.new_errors.append((stream, error))
 
     def totals(self) -> dict[str, dict[str, int]]:
         """Plain dictionaries, sorted, for reports."""

@@ -27,6 +27,7 @@ from rlml_slam.params import LoopClosure, Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.back_end.scan_graph import SavedSubmap, saved_submaps
+from rlml_slam.slam.back_end.trajectory import poses_of
 from rlml_slam.slam.keyframes import JUMP_SIGMA
 from rlml_slam.slam.merging.placement import Placement
 from rlml_slam.slam.merging.site_map import Session, Site, session_of
@@ -35,6 +36,17 @@ from rlml_slam.slam.store import map_file
 from rlml_slam.types import EdgeKind
 
 Arrays = dict[str, NDArray[Any]]
+SHARE = 0.5  # of a map's keyframes that are in another one of the same drive, by their stamps
+NEAR, BENT = 0.5, 0.05  # [m], share of its extent by which the paths of one drive may differ
+
+
+class Drive(NamedTuple):
+    """``stamps`` (n,) and ``points`` (n, 2) of a session's ``num_keys`` keyframes and path."""
+
+    session: Session
+    stamps: NDArray[np.int64]
+    points: Array
+    num_keys: int
 
 
 @dataclass(frozen=True)
@@ -57,15 +69,15 @@ def merge_files(
     run: Mapper = in_this_process,
 ) -> tuple[Merged, Placed]:  # fmt: skip
     """The map of many files, and which of them are in it. Raises MapError where no two fit."""
-    if len({str(path) for path in paths}) < len(paths) or len(paths) < 2:
+    if len({path.resolve() for path in paths}) < len(paths) or len(paths) < 2:
         raise MapError('two maps at least, and none twice, are needed to merge')
     read = run(read_session, paths)
-    sessions = [s for s in read if isinstance(s, Session)]
+    sessions, again = once_each([found for found in read if not isinstance(found, str)])
     broken = {
         str(path): Placement(None, why)
         for path, why in zip(paths, read, strict=True)
         if isinstance(why, str)
-    }
+    } | again
     own = survey_of_all(sessions)
     if survey is not None and own is not None and not same(survey, own):
         raise MapError('a map was made with another survey than the one given')
@@ -79,12 +91,46 @@ def merge_files(
     return assemble(placed, _loaded, params, survey), placed
 
 
-def read_session(path: Path) -> Session | str:
+def read_session(path: Path) -> Drive | str:
     """What placing needs of a map's file, or what is wrong with the file."""
     try:
-        return session_of(str(path), map_file.load(path), path)
+        content = map_file.load(path)
+        with map_file.consistent():
+            a, session = content.arrays, session_of(str(path), content, path)
+            poses = np.concatenate([a['pose'], poses_of(a['path'], a['path_motion'], a['pose'])])
+            stamps = np.concatenate([a['key_stamp'], a['path']['stamp']])
+            return Drive(session, stamps, poses[:, :2], len(a['pose']))
     except RlmlError as e:
         return str(e)
+
+
+def once_each(drives: Sequence[Drive]) -> tuple[list[Session], dict[str, Placement]]:
+    """Sessions of different drives, and why others are left out: the first largest map stays."""
+    kept: list[Drive] = []
+    again: dict[str, Placement] = {}
+    for own in sorted(drives, key=lambda d: -d.num_keys):
+        name, same_as = own.session.name, [k.session.name for k in kept if _is_same(own, k)]
+        if same_as:
+            why = f'{name} and {same_as[0]} are maps of one drive, which is used once'
+            again[name] = Placement(None, why)
+        else:
+            kept.append(own)
+    return [d.session for d in drives if d.session.name not in again], again
+
+
+def _is_same(a: Drive, b: Drive) -> bool:
+    """Whether stamps, path and reflectors are the same; simulated drives may share the stamps."""
+    stamps, i, j = np.intersect1d(a.stamps, b.stamps, return_indices=True)
+    if max(np.isin(d.stamps[: d.num_keys], stamps[stamps > 0]).mean() for d in (a, b)) < SHARE:
+        return False
+    there = b.points[j]
+    T = se2.align(a.points[i], there)
+    limit = max(NEAR, BENT * float(np.hypot(*(there - there.mean(axis=0)).T).max()))
+    if np.median(np.hypot(*(se2.transform(T, a.points[i]) - there).T)) > limit:
+        return False
+    few, many = sorted((se2.transform(T, a.session.points), b.session.points), key=len)
+    gap = np.linalg.norm(few[:, None] - many, axis=-1)
+    return not len(few) or bool((gap.min(axis=1) < limit).mean() >= SHARE)
 
 
 def _loaded(session: Session) -> Content:

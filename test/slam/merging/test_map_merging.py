@@ -4,10 +4,12 @@
 import json
 import weakref
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from made_worlds import OTHER_ROOM, ROOM, drive, errors, messages
+from numpy.testing import assert_array_equal
 
 from rlml_slam import se2
 from rlml_slam.cli.main import main
@@ -29,13 +31,14 @@ from rlml_slam.types import Detections, Odometry, Scan, Verdict
 
 PARAMS = Parameters(back_end=replace(Parameters().back_end, submap_size=10))
 CURVE = drive((0.6, 0.0, 3.0), (0.6, 0.6, 6.0), (0.5, -0.7, 4.0))
+HOUR = 3600 * 10**9
 START = np.array([2.0, -1.4, 1.2])
 AGAIN = drive((0.5, 0.5, 7.0), (0.4, -0.5, 4.0), start=START)
 
 
-def mapped(world, poses, seed, scan=True):
+def mapped(world, poses, seed, scan=True, params=PARAMS):
     """A back end that knows nothing of where in the world its first pose is."""
-    slam = Slam(PARAMS)
+    slam = Slam(params)
     slam.set_sensor_pose('laser', np.zeros(3))
     add = {Odometry: slam.add_odometry, Scan: slam.add_scan, Detections: slam.add_detections}
     for m in messages(world, poses, scan=scan, rng=np.random.default_rng(seed)):
@@ -216,6 +219,63 @@ def test_nothing_is_written_where_no_two_maps_fit(two, tmp_path, capsys):
     for names in ([name], [name, name], [name, str(tmp_path / 'broken.rlml')]):
         assert main(['map', 'merge', *names, '--out', str(tmp_path / 'c.rlml')]) != 0
         assert not (tmp_path / 'c.rlml').exists()
+
+
+def imported(path, tmp_path):
+    """The same map by way of text files."""
+    assert main(['map', 'export', str(path), str(tmp_path / 'text')]) == 0
+    out = tmp_path / 'imported.rlml'
+    assert main(['map', 'import', str(tmp_path / 'text'), str(out)]) == 0
+    return out
+
+
+def an_hour_later(content):
+    """The same session with other stamps: those of made drives are the same."""
+    a = dict(content.arrays)
+    a['path'] = a['path'].copy()
+    a['path']['stamp'] += HOUR
+    later = {name: a[name] + HOUR for name in ('key_stamp', 'key_scan_stamp')}
+    return content._replace(arrays=a | later)
+
+
+def remade(count=None, params=PARAMS):
+    """The first drive, or its beginning, with other parameters."""
+    return map_file.content_of(mapped(ROOM, CURVE[:count], 0, params=params), params, None)
+
+
+@pytest.mark.parametrize('kind', ['copy', 'imported', 'parameters', 'autosave', 'continued'])
+def test_maps_of_one_drive_count_once(two, tmp_path, kind):
+    """Merged twice, its reflectors had half the variance without new data."""
+    two = [two[0], an_hour_later(two[1])]
+    a, b = (map_container.write(tmp_path / f'{k}.rlml', c) for k, c in enumerate(two))
+    if kind == 'imported':
+        again = imported(a, tmp_path)
+    else:
+        sparse = {'minimum_travel_distance': 0.43, 'minimum_travel_heading': 0.36}
+        other = replace(PARAMS, back_end=replace(PARAMS.back_end, **sparse))
+        again = map_container.write(tmp_path / 'again.rlml', {
+            'copy': lambda: two[0], 'parameters': lambda: remade(params=other),
+            'autosave': lambda: remade(len(CURVE) // 2),
+            'continued': lambda: merge_maps(*two).content,
+        }[kind]())  # fmt: skip
+    if kind == 'continued':  # the larger one stays
+        with pytest.raises(MapError, match=f'{a} and {again} are maps of one drive') as failed:
+            merge_files([a, b, again], PARAMS)
+        assert f'{b} and {again} are maps of one drive' in str(failed.value)
+        return
+    merged, placed = merge_files([a, b, again], PARAMS)
+    assert placed.site.names == [str(a), str(b)]
+    (doubt,) = placed.left_out.values()
+    assert doubt.why == f'{again} and {a} are maps of one drive, which is used once'
+    once, _ = merge_files([a, b], PARAMS)
+    assert_array_equal(merged.back_end.reflectors().cov, once.back_end.reflectors().cov)
+
+
+def test_one_file_by_two_names_is_refused(two, tmp_path, monkeypatch):
+    map_container.write(tmp_path / 'a.rlml', two[0])
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(MapError, match='none twice'):
+        merge_files([Path('a.rlml'), tmp_path / 'x' / '..' / 'a.rlml'], PARAMS)
 
 
 def test_session_without_reflectors_is_placed_by_its_scans(two, tmp_path):
