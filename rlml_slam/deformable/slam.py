@@ -14,7 +14,7 @@ from rlml_slam.deformable.velocity import VelocityHistory
 from rlml_slam.deformable.window import CarrierVelocity, DeformableWindow, WindowEstimate
 from rlml_slam.errors import InputError, SolverError
 from rlml_slam.params import DeformableParameters
-from rlml_slam.se2 import Array, compose, compose_jacobians, rotation
+from rlml_slam.se2 import Array, compose, compose_jacobians
 from rlml_slam.types import Detections, Frame, Health, Level, Motion, Observation, Status
 
 
@@ -39,7 +39,6 @@ class DeformableSlam:
         p = self._p
         self._window = DeformableWindow(p.deformable, p.reflector, pose, cov)
         self._bias = GyroBias(p.motion)
-        self._heading = float(pose[2])
         self._stamp: int | None = None
         self._wheels: Array | None = None  # raw odometry of the last observation
         self._last_seen: int | None = None  # stamp with a detection of a known feature
@@ -47,37 +46,46 @@ class DeformableSlam:
         self.velocity = CarrierVelocity(np.zeros(2))
 
     def announce(self, stamp: int, velocity: CarrierVelocity, in_base: bool = False) -> None:
-        """The carrier's velocity from ``stamp`` on, in the map's axes or the robot's newest."""
+        """The velocity from ``stamp`` on, in the map's axes or the robot's, which turn with it."""
         if in_base:
-            velocity = replace(velocity, linear=rotation(self._heading) @ velocity.linear)
+            velocity = replace(velocity, linear=np.zeros(2), base_linear=velocity.linear)
         self._velocities.add(stamp, velocity)
 
     def process(self, observation: Observation) -> Frame:
         """One observation with detections, or none, later than the one before."""
         started = time.perf_counter()
-        stamp, trouble = observation.stamp, []
+        stamp, trouble = observation.stamp, list[str]()
         motion = self._motion(observation)
+        velocity = CarrierVelocity(np.zeros(2))
         if self._stamp is not None:
-            self.velocity = self._velocities.mean(self._stamp, stamp)
+            velocity = self._velocities.mean(self._stamp, stamp)
         seen = observation.detections
         detections = _nothing(stamp) if seen is None else seen
-        try:
-            estimate = self._window.update(stamp, motion, detections, self.velocity)
-        except InputError as e:  # the robot has moved all the same
-            trouble.append(str(e))
-            estimate = self._window.update(stamp, motion, _nothing(stamp), self.velocity)
-        except SolverError as e:
-            trouble.append(f'{e}: restarted')
-            self._begin_after(motion)
-            estimate = self._window.update(stamp, motion, detections, self.velocity)
+        estimate = self._update(stamp, motion, detections, velocity, trouble)
         first, self._stamp = self._stamp is None, stamp
-        self._heading, self.estimate = float(estimate.pose[2]), estimate
+        self.estimate, self.velocity = estimate, velocity.in_map(float(estimate.pose[2]))
         health = self._health(estimate, first or motion.known, trouble)
         return Frame(
             stamp, observation, estimate.pose, estimate.cov, estimate.pose, estimate.cov,
             estimate.keys, estimate.statuses, health, chi2=estimate.chi2,
             iterations=estimate.iterations, wall_ms=1e3 * (time.perf_counter() - started),
         )  # fmt: skip
+
+    def _update(
+        self, stamp: int, motion: Motion, detections: Detections, velocity: CarrierVelocity,
+        trouble: list[str],
+    ) -> WindowEstimate:  # fmt: skip
+        """The window's next step; without the detections where they make it impossible."""
+        try:
+            return self._window.update(stamp, motion, detections, velocity)
+        except InputError as e:
+            if len(detections) == 0:
+                raise
+            trouble.append(str(e))  # the robot has moved all the same
+        except SolverError as e:
+            trouble.append(f'{e}: restarted')
+            self._begin_after(motion)
+        return self._update(stamp, motion, _nothing(stamp), velocity, trouble)
 
     def _motion(self, observation: Observation) -> Motion:
         """Motion since the last observation without the gyro's bias, its covariance regular."""
@@ -102,9 +110,11 @@ class DeformableSlam:
         p, known = self._p, len(estimate.features.keys)
         if not moved:
             reasons.append('odometry does not cover the motion')
-        age = self._velocities.age(estimate.stamp)
+        age, lead = self._velocities.age(estimate.stamp), self._velocities.lead(estimate.stamp)
         if age is None:
             reasons.append('no carrier_velocity yet: the carrier is taken to stand still')
+        elif lead > p.deformable.velocity_timeout:
+            reasons.append(f'carrier_velocity is stamped {lead:.1f} s ahead')
         elif age > p.deformable.velocity_timeout:
             reasons.append(f'carrier_velocity is {age:.1f} s old')
         if np.any(estimate.statuses == Status.USED) or self._last_seen is None:

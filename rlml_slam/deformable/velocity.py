@@ -15,17 +15,19 @@ MAX_KEPT = 10_000  # announcements: more than a minute of silence of everything 
 class VelocityHistory:
     """Each velocity holds from its stamp to the next one's; the first one held before it as well.
 
-    Announcements may come in any order. What no later ``mean`` can ask for is forgotten. One that
-    has held for more than ``timeout`` seconds is not relied upon.
+    Announcements may come in any order. What no later ``mean`` can ask for is forgotten. One is
+    not relied upon more than ``timeout`` seconds after its stamp or before it.
     """
 
     def __init__(self, timeout: float) -> None:
         self._timeout = int(timeout * 1e9)
         self._stamps: list[int] = []
         self._velocities: list[CarrierVelocity] = []
+        self._latest: int | None = None  # stamp of the one that came last
 
     def add(self, stamp: int, velocity: CarrierVelocity) -> None:
         """The velocity from ``stamp`` [ns] on; another one for the same stamp replaces it."""
+        self._latest = stamp
         k = bisect_left(self._stamps, stamp)
         if k < len(self._stamps) and self._stamps[k] == stamp:
             self._velocities[k] = velocity
@@ -40,10 +42,14 @@ class VelocityHistory:
             return None
         return max(stamp - self._stamps[self._at(stamp)], 0) * 1e-9
 
+    def lead(self, stamp: int) -> float:
+        """By how much the velocity that came last is stamped after ``stamp`` [s], 0 without."""
+        return 0.0 if self._latest is None else (self._latest - stamp) * 1e-9
+
     def mean(self, start: int, end: int) -> CarrierVelocity:
         """Mean velocity from ``start`` to ``end`` > start [ns]; 0 where none was announced.
 
-        Its sigma is the speed itself for the share of the time after the timeout: the carrier may
+        Its sigma is the speed itself for the share of the time beyond the timeout: the carrier may
         have stopped, or go another way. Times before ``start`` must not be asked for afterwards.
         """
         if not self._stamps:
@@ -53,12 +59,15 @@ class VelocityHistory:
         share = np.diff(cuts) / (end - start)
         held = self._velocities[first : last + 1]
         linear = share @ np.stack([v.linear for v in held])
+        base_linear = share @ np.stack([v.base_linear for v in held])
         angular = float(share @ np.array([v.angular for v in held]))
-        trusted_to = np.array(self._stamps[first : last + 1]) + self._timeout
-        late = np.maximum(cuts[1:] - np.maximum(cuts[:-1], trusted_to), 0) / (end - start)
-        sigma = float(late @ np.array([np.hypot(*v.linear) for v in held]))
+        stamps = np.array(self._stamps[first : last + 1])
+        late = np.maximum(cuts[1:] - np.maximum(cuts[:-1], stamps + self._timeout), 0)
+        early = np.maximum(np.minimum(cuts[1:], stamps - self._timeout) - cuts[:-1], 0)
+        speed = np.array([np.hypot(*(v.linear + v.base_linear)) for v in held])
+        sigma = float((late + early) / (end - start) @ speed)
         self._forget(first)
-        return CarrierVelocity(linear, angular, sigma)
+        return CarrierVelocity(linear, angular, sigma, base_linear)
 
     def _at(self, stamp: int) -> int:
         return max(bisect_right(self._stamps, stamp) - 1, 0)

@@ -8,7 +8,7 @@ marginalised. Features appear and disappear; they are identified by id, or by as
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +24,13 @@ from rlml_slam.deformable.window_equations import (
 from rlml_slam.errors import InputError, SolverError
 from rlml_slam.matching.reflectors.association import Associator, Believed
 from rlml_slam.params import Deformable, Reflector
-from rlml_slam.se2 import Array, transform, wrap
+from rlml_slam.se2 import Array, rotation, transform, wrap
 from rlml_slam.types import ANONYMOUS, Detections, Motion, Status
 
 SLOTS = 4  # features are given room in steps of this many
 # candidates at one time; each takes room in every step of the window, and ghosts are many
 MAX_CANDIDATES = 8
+SMALLEST_SIGMA = 1e-4  # [m] of a detection along any axis
 
 
 @dataclass(frozen=True)
@@ -38,11 +39,18 @@ class CarrierVelocity:
 
     The linear part is that of the centroid of its features. ``sigma`` [m/s] is by how much a
     feature's velocity may differ from it all the time, 0 where the velocity is as announced.
+    ``base_linear`` (2,) is the part that is known in the robot's axes; it is added.
     """
 
     linear: Array  # (2,)
     angular: float = 0.0
     sigma: float = 0.0
+    base_linear: Array = field(default_factory=lambda: np.zeros(2))
+
+    def in_map(self, heading: float) -> CarrierVelocity:
+        """The same velocity in the axes of the map, for this heading of the robot."""
+        linear = self.linear + rotation(heading) @ self.base_linear
+        return CarrierVelocity(linear, self.angular, self.sigma)
 
 
 @dataclass(frozen=True)
@@ -123,6 +131,7 @@ class DeformableWindow:
         InputError for a stamp that does not advance or a measurement that is no number.
         """
         self._check(stamp, motion, detections, velocity)
+        detections = replace(detections, cov=_with_floor(detections.cov))
         if self._stamp is None:
             self._length = 1
         else:
@@ -141,7 +150,8 @@ class DeformableWindow:
             raise InputError(f'deformable window: stamp {stamp} is not after {self._stamp}')
         for what, value in (
             ('motion', motion.delta), ('motion covariance', motion.cov),
-            ('carrier velocity', velocity.linear), ('carrier turn rate', velocity.angular),
+            ('carrier velocity', velocity.linear + velocity.base_linear),
+            ('carrier turn rate', velocity.angular),
             ('detections', detections.points), ('detection covariances', detections.cov),
         ):  # fmt: skip
             if not np.all(np.isfinite(value)):
@@ -157,9 +167,9 @@ class DeformableWindow:
         self._w = Steps(
             mean=np.zeros((K, n)), active=np.zeros((K, slots), np.bool_),
             leads=np.zeros((K, slots), np.bool_), delta=np.zeros((K, 3)),
-            motion_info=np.zeros((K, 3, 3)), translation=np.zeros((K, 2)), turn=np.zeros(K),
-            own=np.ones(K), common=np.zeros(K), z=np.full((K, slots, 2), np.nan),
-            z_info=np.zeros((K, slots, 2, 2)),
+            motion_info=np.zeros((K, 3, 3)), translation=np.zeros((K, 2)),
+            shift=np.zeros((K, 3)), turn=np.zeros(K), own=np.ones(K), common=np.zeros(K),
+            z=np.full((K, slots, 2), np.nan), z_info=np.zeros((K, slots, 2, 2)),
         )  # fmt: skip
         self._prior = Prior(np.zeros(n), np.zeros((n, n)), np.zeros(n))
         self._cov = np.zeros((n, n))
@@ -183,13 +193,14 @@ class DeformableWindow:
         k = self._length - 1
         w.delta[k], w.motion_info[k] = motion.delta, _inverse(motion.cov)
         w.translation[k], w.turn[k] = velocity.linear * dt, velocity.angular * dt
+        w.shift[k, :2] = velocity.base_linear * dt
         lasting = (velocity.sigma * dt) ** 2  # not a random walk: it grows with the time squared
         w.own[k] = self._p.drift**2 * dt + lasting
         w.common[k] = self._p.common_drift**2 * dt + lasting
         lives, F = w.active[k], np.empty_like(self._cov)
         carry(
-            w.mean[k], lives, w.leads[k], w.delta[k], w.translation[k], w.turn[k],
-            w.mean[k + 1], F,
+            w.mean[k], lives, w.leads[k], w.delta[k], w.translation[k], w.shift[k],
+            w.turn[k], w.mean[k + 1], F,
         )  # fmt: skip
         Q = motion_covariance(w.mean[k, 2], motion.cov, lives, w.own[k], w.common[k])
         self._cov = F @ self._cov @ F.T + Q
@@ -324,6 +335,13 @@ def _are_covariances(cov: Array) -> bool:
     except np.linalg.LinAlgError:
         return False
     return bool(np.allclose(cov, cov.swapaxes(-1, -2)))
+
+
+def _with_floor(cov: Array) -> Array:
+    """Covariances (n, 2, 2), those larger by SMALLEST_SIGMA^2 I that are smaller along an axis."""
+    small = np.linalg.eigvalsh(cov)[:, 0] < SMALLEST_SIGMA**2
+    floored: Array = cov + small[:, None, None] * (SMALLEST_SIGMA**2 * np.eye(2))
+    return floored
 
 
 def _inverse(cov: Array) -> Array:

@@ -38,6 +38,7 @@ class Steps(NamedTuple):
     delta: Array  # (K, 3) odometry, in the robot's frame
     motion_info: Array  # (K, 3, 3) information of it, in the same frame
     translation: Array  # (K, 2) of the carrier
+    shift: Array  # (K, 3) of the carrier too, in the robot's frame, (x, y, 0)
     turn: Array  # (K,) of the carrier
     own: Array  # (K,) variance of each feature's own motion [m^2]
     common: Array  # (K,) variance of the motion that all features share [m^2]
@@ -55,14 +56,15 @@ class Prior(NamedTuple):
 
 @kernel
 def carry(
-    state: Array, lives: Flags, leads: Flags, delta: Array, translation: Array, turn: float,
-    after: Array, F: Array,
+    state: Array, lives: Flags, leads: Flags, delta: Array, translation: Array,
+    shift: Array, turn: float, after: Array, F: Array,
 ) -> None:  # fmt: skip
     """The state one step on into ``after`` (n,), and its Jacobian ``F`` (n, n).
 
     The robot moves by odometry ``delta`` (3,) in its own frame; the features that live on move
-    with the carrier, f' = f + t + (R(turn) - I)(f - c), c the centroid of those of them that
-    lead (a ghost does not), or of all where none does. Dead slots are 0.
+    with the carrier, f' = f + t + R(theta) b + (R(turn) - I)(f - c), b the ``shift`` (3,) and c
+    the centroid of those of them that lead (a ghost does not), or of all where none does. Dead
+    slots are 0.
     """
     F[:] = 0.0
     after[:] = 0.0
@@ -80,15 +82,17 @@ def carry(
     if num == 0:
         return
     center /= num
+    tx, ty, _, a, b = motion(translation[0], translation[1], state[2], shift)
     c, s = math.cos(turn) - 1.0, math.sin(turn)
     for j in range(len(lives)):
         if not lives[j]:
             continue
         k = 3 + 2 * j
         dx, dy = state[k] - center[0], state[k + 1] - center[1]
-        after[k] = state[k] + translation[0] + c * dx - s * dy
-        after[k + 1] = state[k + 1] + translation[1] + s * dx + c * dy
+        after[k] = state[k] + tx + c * dx - s * dy
+        after[k + 1] = state[k + 1] + ty + s * dx + c * dy
         F[k, k] = F[k + 1, k + 1] = 1.0
+        F[k, 2], F[k + 1, 2] = a, b
         if turn == 0.0:
             continue
         for i in range(len(lives)):
@@ -137,7 +141,7 @@ def _add_step(w: Steps, k: int, A: Array, B: Array, C: Array, g: Array, h: Array
     n = w.mean.shape[1]
     e, F, W = np.empty(n), np.empty((n, n)), np.empty((n, n))
     lives = w.active[k] & w.active[k + 1]
-    carry(w.mean[k], lives, w.leads[k], w.delta[k], w.translation[k], w.turn[k], e, F)
+    carry(w.mean[k], lives, w.leads[k], w.delta[k], w.translation[k], w.shift[k], w.turn[k], e, F)
     motion_information(w.mean[k, 2], w.motion_info[k], lives, w.own[k], w.common[k], W)
     for i in range(n):
         e[i] = w.mean[k + 1, i] - e[i]

@@ -50,7 +50,7 @@ class Deformable(Group):
         1.0,
     )
     velocity_timeout: float = param(
-        1.0, 'DEGRADED when the velocity of the carrier is older; it is still used', 's', 0.01, 1e4
+        1.0, 'DEGRADED if carrier_velocity is older or further ahead; still used', 's', 0.01, 1e4
     )
     suggest: str = param(
         'off',

@@ -30,6 +30,10 @@ from rlml_slam.types import Level, Motion, Observation, Odometry
 
 SECOND = 1_000_000_000
 STILL = CarrierVelocity(np.zeros(2))
+NOISE_OF_THE_DRIVE = MotionNoise(
+    speed_noise=0.0, speed_noise_floor=0.01 / np.sqrt(0.1),
+    turn_noise=0.0, turn_noise_floor=0.004 / np.sqrt(0.1), lateral_noise=0.01 / np.sqrt(0.1),
+)  # fmt: skip
 
 
 def steps(count, seed=0, **settings):
@@ -70,10 +74,22 @@ def test_first_velocity_held_before_it_and_none_is_standing_still():
     assert history.age(5) is None
     np.testing.assert_array_equal(history.mean(0, 5).linear, [0.0, 0.0])
     history.add(10 * SECOND, CarrierVelocity(np.array([1.0, 0.0])))
-    before = history.mean(SECOND, 2 * SECOND)
-    np.testing.assert_allclose(before.linear, [1.0, 0.0])
+    early = history.mean(SECOND, 2 * SECOND)
+    before = history.mean(9 * SECOND, 10 * SECOND)
+    for mean in (early, before):
+        np.testing.assert_allclose(mean.linear, [1.0, 0.0])
     assert before.sigma == 0.0
     assert history.age(SECOND) == 0.0
+
+
+def test_first_velocity_is_unknown_by_its_own_size_long_before_its_stamp():
+    history = VelocityHistory(1.0)
+    history.add(10 * SECOND, CarrierVelocity(np.array([3.0, 4.0])))
+    history.add(11 * SECOND, CarrierVelocity(np.array([1.0, 0.0])))
+    assert history.mean(SECOND, 2 * SECOND).sigma == pytest.approx(5.0)
+    # 6 of these 8 s are more than a second before the first stamp; the second one is no first
+    assert history.mean(3 * SECOND, 11 * SECOND).sigma == pytest.approx(5.0 * 6 / 8)
+    assert history.lead(5 * SECOND) == pytest.approx(6.0)
 
 
 def test_velocity_is_unknown_by_its_own_size_after_the_timeout():
@@ -196,6 +212,110 @@ def test_unusable_covariance_costs_the_detections_but_not_the_motion():
     assert moved == pytest.approx(np.linalg.norm(run[-1].motion.delta[:2]), abs=0.02)
 
 
+@pytest.mark.parametrize(('ahead', 'level'), [(0.3, Level.OK), (5.0, Level.DEGRADED)])
+def test_velocity_stamped_ahead_of_the_clock_is_named(ahead, level):
+    """At once and for good: once its stamps are reached, each velocity is used too late."""
+    slam, run = DeformableSlam(DeformableParameters()), steps(80)
+    lead = round(ahead * SECOND)
+    for before, step in pairwise(run):
+        slam.announce(before.stamp + lead, CarrierVelocity(step.linear, step.angular))
+        frame = slam.process(observe(step))
+        if before.stamp > SECOND // 2:
+            assert frame.health.level is level
+        if level is Level.DEGRADED:
+            assert f'carrier_velocity is stamped {ahead - 0.1:.1f} s ahead' in frame.health.reasons
+
+
+def test_velocity_of_an_hour_ahead_is_as_unknown_as_one_of_an_hour_ago():
+    run, ends = steps(60), []
+    for lead in (-3600 * SECOND, 3600 * SECOND, 0):
+        slam = DeformableSlam(DeformableParameters(deformable=Deformable(velocity_timeout=30.0)))
+        slam.announce(lead, CarrierVelocity(run[1].linear, run[1].angular))
+        ends.append([slam.process(observe(step)) for step in run][-1].cov_map)
+    np.testing.assert_array_equal(ends[0], ends[1])
+    assert np.all(np.diag(ends[0]) > np.diag(ends[2]))
+
+
+def test_velocity_in_the_robots_axes_turns_with_the_robot():
+    """Announced once, while the robot turns a quarter on the spot."""
+    slam = DeformableSlam(DeformableParameters())
+    slam.announce(0, CarrierVelocity(np.array([1.0, 0.0])), in_base=True)
+    turn = Motion(np.array([0.0, 0.0, np.pi / 2]), 1e-8 * np.eye(3))
+    for k in range(3):
+        slam.process(Observation(k * SECOND // 10, turn))
+    assert slam.velocity.sigma == 0.0
+    np.testing.assert_allclose(slam.velocity.linear, [-1.0, 0.0], atol=1e-6)
+    np.testing.assert_array_equal(slam.velocity.base_linear, [0.0, 0.0])
+
+
+def test_heading_error_spreads_a_velocity_in_the_robots_axes_across_it():
+    """The features of a robot that stands and sees none of them are moved by R(theta) (2, 0)."""
+    still, run, after = Motion(np.zeros(3), 1e-8 * np.eye(3)), steps(20), []
+    for in_base in (False, True):
+        slam = DeformableSlam(DeformableParameters())
+        slam.begin_at(np.zeros(3), np.diag([0.0, 0.0, 0.01]))
+        for step in run:
+            slam.process(Observation(step.stamp, still, detections=run[0].detections))
+        before = slam.estimate
+        slam.announce(run[-1].stamp, CarrierVelocity(np.array([20.0, 0.0])), in_base)
+        slam.process(Observation(run[-1].stamp + SECOND // 10, still))
+        after.append(slam.estimate.joint_cov)
+    F = np.eye(len(before.joint_cov))
+    F[4::2, 2] = 2.0
+    grown = F @ before.joint_cov @ F.T - before.joint_cov
+    assert np.all(grown[3::2, 2] == 0.0)  # along it, nothing
+    np.testing.assert_allclose(after[1] - after[0], grown, rtol=1e-3, atol=1e-4)
+
+
+def test_velocities_in_the_robots_axes_leave_the_estimate_consistent():
+    """12 drives of 30 s: independent samples."""
+    errors = []
+    for seed in range(12):
+        slam = DeformableSlam(DeformableParameters(motion=NOISE_OF_THE_DRIVE))
+        run = steps(300, seed, kind='conveyor')
+        for before, step in pairwise(run):
+            c, s = np.cos(before.pose[2]), np.sin(before.pose[2])
+            linear = np.array([[c, s], [-s, c]]) @ step.linear
+            slam.announce(before.stamp, CarrierVelocity(linear, step.angular), in_base=True)
+            slam.process(observe(before))
+        frame = slam.process(observe(run[-1]))
+        error = frame.T_map_base - run[-1].pose
+        error[2] = wrap(error[2])
+        errors.append(error @ np.linalg.solve(frame.cov_map, error))
+    low, high = chi2_bounds(3, 12)
+    assert low < np.mean(errors) < high
+
+
+def test_detections_of_very_small_sigma_are_used():
+    """1e-12 of the covariance: 10^-8 m, which no arithmetic of the equations stands."""
+    run = steps(330, seed=1)
+    slam = DeformableSlam(DeformableParameters())
+    announce(slam, run)
+    for k, s in enumerate(run):
+        small = replace(s.detections, cov=1e-12 * s.detections.cov)
+        frame = slam.process(replace(observe(s), detections=small))
+        assert not any('restarted' in r for r in frame.health.reasons), k
+    assert frame.health.level is Level.OK
+    assert np.linalg.norm(frame.T_map_base[:2] - run[-1].pose[:2]) < 0.5
+
+
+def test_update_after_a_restart_does_not_raise(monkeypatch):
+    """Where detections make the window unsolvable, twice as well."""
+    run, update = steps(30), DeformableWindow.update
+
+    def fail(window, stamp, motion, detections, velocity):
+        if len(detections):
+            raise SolverError('singular')
+        return update(window, stamp, motion, detections, velocity)
+
+    _, slam = drive(run[:-2])
+    monkeypatch.setattr(DeformableWindow, 'update', fail)
+    for step in run[-2:]:
+        frame = slam.process(observe(step))
+        assert 'singular: restarted' in frame.health.reasons
+        assert np.linalg.norm(frame.T_map_base[:2] - step.pose[:2]) < 0.5
+
+
 def test_unsolvable_window_begins_anew_where_the_robot_is(monkeypatch):
     run = steps(30)
     answers, slam = drive(run[:-1])
@@ -213,10 +333,7 @@ def test_unsolvable_window_begins_anew_where_the_robot_is(monkeypatch):
 
 def with_gap(kind, seed, gap, ids=True):
     """A drive of 10 s and a ``gap`` of the data at 4 s, as a node hears it; NEES per update."""
-    noise = MotionNoise(
-        speed_noise=0.0, speed_noise_floor=0.01 / np.sqrt(0.1),
-        turn_noise=0.0, turn_noise_floor=0.004 / np.sqrt(0.1), lateral_noise=0.01 / np.sqrt(0.1),
-    )  # fmt: skip
+    noise = NOISE_OF_THE_DRIVE
     params = DeformableParameters(motion=noise)
     synchronizer = Synchronizer(Parameters(motion=noise, node=params.node))
     slam, wheels, errors = DeformableSlam(params), np.zeros(3), []

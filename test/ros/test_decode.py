@@ -342,6 +342,13 @@ def test_polar_covariance_turns_with_the_bearing():
         np.testing.assert_allclose(cov[0], R @ np.diag([0.01, 0.0064]) @ R.T, atol=1e-15)
 
 
+def test_sigmas_of_a_detection_have_a_floor():
+    cov = decode.detection_covariance(
+        np.array([[20.0, 0.0]]), np.full(1, 1e-9), np.full(1, 1e-9), 1
+    )
+    np.testing.assert_allclose(cov[0], np.diag([1e-4**2, (20.0 * 1e-5) ** 2]))
+
+
 def test_detection_at_the_sensor_has_a_regular_covariance():
     cov = decode.detection_covariance(np.zeros((1, 2)), np.ones(1), np.ones(1), 0.025)
     np.testing.assert_array_equal(cov[0], 0.025**2 * np.eye(2))

@@ -32,6 +32,7 @@ _ROUNDING = 1e-9  # of the largest variance
 LARGEST_VARIANCE = 1e15  # [m^2], [rad^2] of what another node of this package sends
 DETECTED = ('x', 'y', 'id', 'diameter', 'sigma_range', 'sigma_bearing')  # fields
 LARGEST_SIGMA = 100.0  # [m], [rad] of a detection
+MIN_SIGMA_R, MIN_SIGMA_B = 1e-4, 1e-5  # [m], [rad] of range and bearing of a detection
 # [ns] seconds are 32 bits in a message; transforms are published some seconds ahead
 LAST_STAMP = ((1 << 31) - 60) * SECOND
 FASTEST = 1e3  # [m/s], [rad/s]
@@ -241,6 +242,7 @@ def detection_covariance(points: Array, sigma_r: Array, sigma_b: Array, fallback
     r = np.hypot(points[:, 0], points[:, 1])
     near = r < _NEAR
     u = points / np.where(near, 1.0, r)[:, None]
+    sigma_r, sigma_b = np.maximum(sigma_r, MIN_SIGMA_R), np.maximum(sigma_b, MIN_SIGMA_B)
     cov = polar_covariance(u, sigma_r**2, (r * sigma_b) ** 2)
     cov[near] = fallback**2 * np.eye(2)
     return cov
