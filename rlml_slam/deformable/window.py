@@ -167,8 +167,8 @@ class DeformableWindow:
         self._w = Steps(
             mean=np.zeros((K, n)), active=np.zeros((K, slots), np.bool_),
             leads=np.zeros((K, slots), np.bool_), delta=np.zeros((K, 3)),
-            motion_info=np.zeros((K, 3, 3)), translation=np.zeros((K, 2)),
-            shift=np.zeros((K, 3)), turn=np.zeros(K), own=np.ones(K), common=np.zeros(K),
+            motion_info=np.zeros((K, 3, 3)), carrier=np.zeros((K, 3)),
+            shift=np.zeros((K, 3)), own=np.ones(K), common=np.zeros(K),
             z=np.full((K, slots, 2), np.nan), z_info=np.zeros((K, slots, 2, 2)),
         )  # fmt: skip
         self._prior = Prior(np.zeros(n), np.zeros((n, n)), np.zeros(n))
@@ -192,15 +192,15 @@ class DeformableWindow:
             self._length -= 1
         k = self._length - 1
         w.delta[k], w.motion_info[k] = motion.delta, _inverse(motion.cov)
-        w.translation[k], w.turn[k] = velocity.linear * dt, velocity.angular * dt
+        w.carrier[k] = np.array([*velocity.linear, velocity.angular]) * dt
         w.shift[k, :2] = velocity.base_linear * dt
         lasting = (velocity.sigma * dt) ** 2  # not a random walk: it grows with the time squared
         w.own[k] = self._p.drift**2 * dt + lasting
         w.common[k] = self._p.common_drift**2 * dt + lasting
         lives, F = w.active[k], np.empty_like(self._cov)
         carry(
-            w.mean[k], lives, w.leads[k], w.delta[k], w.translation[k], w.shift[k],
-            w.turn[k], w.mean[k + 1], F,
+            w.mean[k], lives, w.leads[k], w.delta[k], w.carrier[k], w.shift[k],
+            w.mean[k + 1], F,
         )  # fmt: skip
         Q = motion_covariance(w.mean[k, 2], motion.cov, lives, w.own[k], w.common[k])
         self._cov = F @ self._cov @ F.T + Q

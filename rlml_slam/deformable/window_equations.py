@@ -37,9 +37,8 @@ class Steps(NamedTuple):
     leads: Flags  # (K, M) features that the carrier turns about
     delta: Array  # (K, 3) odometry, in the robot's frame
     motion_info: Array  # (K, 3, 3) information of it, in the same frame
-    translation: Array  # (K, 2) of the carrier
+    carrier: Array  # (K, 3) its motion x, y [m], and turn [rad]
     shift: Array  # (K, 3) of the carrier too, in the robot's frame, (x, y, 0)
-    turn: Array  # (K,) of the carrier
     own: Array  # (K,) variance of each feature's own motion [m^2]
     common: Array  # (K,) variance of the motion that all features share [m^2]
     z: Array  # (K, M, 2) sightings in the robot's frame, NaN where unseen
@@ -56,15 +55,15 @@ class Prior(NamedTuple):
 
 @kernel
 def carry(
-    state: Array, lives: Flags, leads: Flags, delta: Array, translation: Array,
-    shift: Array, turn: float, after: Array, F: Array,
+    state: Array, lives: Flags, leads: Flags, delta: Array, carrier: Array, shift: Array,
+    after: Array, F: Array,
 ) -> None:  # fmt: skip
     """The state one step on into ``after`` (n,), and its Jacobian ``F`` (n, n).
 
     The robot moves by odometry ``delta`` (3,) in its own frame; the features that live on move
-    with the carrier, f' = f + t + R(theta) b + (R(turn) - I)(f - c), b the ``shift`` (3,) and c
-    the centroid of those of them that lead (a ghost does not), or of all where none does. Dead
-    slots are 0.
+    with the ``carrier`` (t, turn), f' = f + t + R(theta) b + (R(turn) - I)(f - c), b the ``shift``
+    (3,) and c the centroid of those of them that lead (a ghost does not), or of all where none
+    does. Dead slots are 0.
     """
     F[:] = 0.0
     after[:] = 0.0
@@ -82,7 +81,8 @@ def carry(
     if num == 0:
         return
     center /= num
-    tx, ty, _, a, b = motion(translation[0], translation[1], state[2], shift)
+    tx, ty, _, a, b = motion(carrier[0], carrier[1], state[2], shift)
+    turn = carrier[2]
     c, s = math.cos(turn) - 1.0, math.sin(turn)
     for j in range(len(lives)):
         if not lives[j]:
@@ -141,7 +141,7 @@ def _add_step(w: Steps, k: int, A: Array, B: Array, C: Array, g: Array, h: Array
     n = w.mean.shape[1]
     e, F, W = np.empty(n), np.empty((n, n)), np.empty((n, n))
     lives = w.active[k] & w.active[k + 1]
-    carry(w.mean[k], lives, w.leads[k], w.delta[k], w.translation[k], w.shift[k], w.turn[k], e, F)
+    carry(w.mean[k], lives, w.leads[k], w.delta[k], w.carrier[k], w.shift[k], e, F)
     motion_information(w.mean[k, 2], w.motion_info[k], lives, w.own[k], w.common[k], W)
     for i in range(n):
         e[i] = w.mean[k + 1, i] - e[i]

@@ -56,24 +56,24 @@ def state_error(estimate, step, owner):
 def test_jacobian_of_the_carriers_motion_is_the_difference_quotient(turn, leads):
     lives = np.array([True, True, True, False])
     at = np.random.default_rng(0).standard_normal(11)
-    delta, shift = np.array([0.3, 0.1, 0.2]), np.array([0.5, -0.2])
+    delta, carrier = np.array([0.3, 0.1, 0.2]), np.array([0.5, -0.2, turn])
     ahead = np.array([0.4, 0.3, 0.0])
 
     def move(state):
         after = np.empty(11)
-        carry(state, lives, np.array(leads), delta, shift, ahead, turn, after, np.empty((11, 11)))
+        carry(state, lives, np.array(leads), delta, carrier, ahead, after, np.empty((11, 11)))
         return after
 
     F = np.empty((11, 11))
-    carry(at, lives, np.array(leads), delta, shift, ahead, turn, np.empty(11), F)
+    carry(at, lives, np.array(leads), delta, carrier, ahead, np.empty(11), F)
     np.testing.assert_allclose(central_differences(move, at), F, atol=1e-8)
 
 
 def test_features_keep_their_shape_when_the_carrier_turns():
     at, after = np.random.default_rng(0).standard_normal(9), np.empty(9)
     everyone = np.ones(3, dtype=bool)
-    shift, F = np.array([2.0, 1.0]), np.empty((9, 9))
-    carry(at, everyone, everyone, np.zeros(3), shift, np.zeros(3), 0.7, after, F)
+    carrier, F = np.array([2.0, 1.0, 0.7]), np.empty((9, 9))
+    carry(at, everyone, everyone, np.zeros(3), carrier, np.zeros(3), after, F)
     old, new = at[3:].reshape(-1, 2), after[3:].reshape(-1, 2)
     np.testing.assert_allclose(new.mean(0), old.mean(0) + np.array([2.0, 1.0]), atol=1e-12)
     gaps = [np.linalg.norm(p[:, None] - p[None], axis=-1) for p in (old, new)]
