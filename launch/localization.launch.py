@@ -16,7 +16,7 @@ ARGUMENTS = {
     'map': (
         None,
         'the map: a .rlml file, a .yaml file of nav2, or the path without suffix; '
-        'a name without a folder is one of map_directory',
+        'a name without folder and suffix is one of map_directory',
     ),
     'map_directory': ('maps', 'folder of a map that is given by its name'),
     'params_file': ('', 'parameter file, such as a copy of config/default.yaml'),
@@ -33,7 +33,8 @@ def nodes(context):
     sim_time = {'use_sim_time': given['use_sim_time'].lower() == 'true'}
     common = {'package': 'rlml_slam', 'namespace': given['namespace'], 'output': 'screen'}
     file = Path(given['map']).expanduser()
-    folder = given['map_directory'] if given['map'] == file.stem else str(file.absolute().parent)
+    is_name = '/' not in given['map'] and file.suffix not in ('.rlml', '.yaml', '.csv')
+    folder = given['map_directory'] if is_name else str(file.absolute().parent)
     own = {
         'mode': 'localization',
         'map_directory': folder,

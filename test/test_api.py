@@ -209,6 +209,15 @@ WRONG = {
     'Detections.points': Detections(1, 'laser', np.ones(2), ONE, [1], [0.1]),
     'Detections.cov': Detections(1, 'laser', np.ones((1, 2)), np.eye(2), [1], [0.1]),
     'Detections.ids': Detections(1, 'laser', np.ones((1, 2)), ONE, [1, 2], [0.1]),
+    'Imu.stamp': Imu(10**30, 0.1),
+    'Scan.angle_min': Scan(1, 'laser', 'a', 0.1, 0.0, 0.1, 9.0, np.ones(9), np.zeros(0)),
+    'Scan.range_max': Scan(1, 'laser', 0.0, 0.1, 0.0, 0.1, None, np.ones(9), np.zeros(0)),
+    'Scan.frame_id': Scan(1, None, 0.0, 0.1, 0.0, 0.1, 9.0, np.ones(9), np.zeros(0)),
+    'Odometry.pose: ': Odometry(1, np.ones(3) * 1j),
+    'Detections.ids: [1.7]': Detections(1, 'laser', np.ones((1, 2)), ONE, [1.7], [0.1]),
+    'Detections.ids: [1000': Detections(1, 'laser', np.ones((1, 2)), ONE, [10**30], [0.1]),
+    'Detections.ids: [nan]': Detections(1, 'laser', np.ones((1, 2)), ONE, [np.nan], [0.1]),
+    'Detections.ids: its': Detections(1, 'laser', np.ones((0, 2)), ONE[:0], [1], [0.1]),
     'Detections.diameters': Detections(1, 'laser', np.ones((1, 2)), ONE, [1], 0.1),
 }
 

@@ -98,6 +98,8 @@ def test_map_by_its_name_is_where_mapping_saved_it(launched):
     (node,) = launched(ROOT / 'launch' / 'localization.launch.py', map='warehouse')
     for name in ('map_directory', 'map_file_name'):
         assert given_to(node)[name] == given_to(mapping)[name]
+    (node,) = launched(ROOT / 'launch' / 'localization.launch.py', map='site.v2')
+    assert given_to(node)['map_directory'] == 'maps'
     (node,) = launched(ROOT / 'launch' / 'localization.launch.py', map='maps/warehouse')
     assert given_to(node)['map_directory'] == str(Path('maps').absolute())
     (node,) = launched(ROOT / 'launch' / 'localization.launch.py', map='warehouse.yaml')

@@ -83,6 +83,8 @@ class DeformableSlam:
                 raise
             trouble.append(str(e))  # the robot has moved all the same
         except SolverError as e:
+            if trouble and len(detections) == 0:
+                raise
             trouble.append(f'{e}: restarted')
             self._begin_after(motion)
         return self._update(stamp, motion, _nothing(stamp), velocity, trouble)

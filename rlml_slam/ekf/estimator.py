@@ -162,9 +162,10 @@ class Estimator:
         agree = agree_with_map(n, used)
         in_map.check(observation.stamp, travel, n, used, agree, GridMatch(math.nan))
         elsewhere = self.contradiction
-        if seen is not None and not in_map.is_pending:
-            known = keys[statuses == Status.USED]
-            elsewhere.check(observation.stamp, n, known, self._next_key, self._mapping)
+        if self.model is POINT and not in_map.is_pending:
+            near = se2.transform(se2.inverse(pose), self.filter.points)
+            known, z = keys[statuses == Status.USED], np.zeros((0, 2)) if seen is None else seen.z
+            elsewhere.check(observation.stamp, z, known, near, self._next_key, self._mapping)
         health = self.health.evaluate(
             observation.stamp,
             HealthInputs(

@@ -8,10 +8,12 @@ from dataclasses import fields, replace
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlml_slam.errors import InputError
 from rlml_slam.types import Detections, Imu, Odometry, Scan
 
+LAST_STAMP = 2**63 - 1  # [ns]
 Measurement: TypeAlias = Odometry | Imu | Scan | Detections
 
 # kind and shape of each field that is an array; n is the length of the first one
@@ -42,18 +44,36 @@ def checked(measurement: Measurement) -> Measurement:
         changes: dict[str, Any] = {'stamp': operator.index(measurement.stamp)}
     except TypeError:
         raise InputError(f'{name}.stamp: {measurement.stamp!r} is no whole number of ns') from None
-    n = -1
+    if abs(changes['stamp']) > LAST_STAMP:
+        raise InputError(f'{name}.stamp: {measurement.stamp} ns is no time')
+    n: int | None = None
     for field, (kind, shape) in ARRAYS[type(measurement)].items():
-        value = getattr(measurement, field)
-        try:
-            array = np.asarray(value, dtype=kind)
-        except (TypeError, ValueError):
-            raise InputError(f'{name}.{field}: {value!r:.60} is not of numbers') from None
-        n = len(array) if n < 0 and array.ndim else n
-        wanted = tuple(n if s == 'n' else array.size if s == 'any' else s for s in shape)
+        array = _array(f'{name}.{field}', getattr(measurement, field), kind)
+        if n is None and array.ndim:
+            n = len(array)
+        wanted = tuple({'n': n or 0, 'any': array.size}.get(str(s), s) for s in shape)
         if array.shape != wanted:
             raise InputError(f'{name}.{field}: its shape is {array.shape} instead of {wanted}')
         changes[field] = array if shape else float(array)
-    same = all(changes.get(f.name) is getattr(measurement, f.name) for f in fields(measurement)
-               if f.name in changes)  # fmt: skip
-    return measurement if same else replace(measurement, **changes)
+    for f in fields(measurement):
+        if f.type == 'float' and f.name not in changes:
+            changes[f.name] = float(_array(f'{name}.{f.name}', getattr(measurement, f.name)))
+        elif f.type == 'str' and not isinstance(getattr(measurement, f.name), str):
+            raise InputError(f'{name}.{f.name}: {getattr(measurement, f.name)!r} is no text')
+    return replace(measurement, **changes)
+
+
+def _array(name: str, value: Any, kind: Any = np.float64) -> NDArray[Any]:
+    """The value as an array of a kind; InputError where that would change it."""
+    try:
+        given = np.asarray(value)
+        if given.dtype.kind not in 'biuf':
+            raise ValueError
+        with np.errstate(invalid='ignore', over='ignore'):
+            array = given.astype(kind)
+        if kind is np.int64 and not (array == given).all():
+            raise ValueError
+    except (TypeError, ValueError, OverflowError):
+        text = 'whole numbers' if kind is np.int64 else 'numbers'
+        raise InputError(f'{name}: {value!r:.60} is not of {text}') from None
+    return np.asarray(array)

@@ -118,10 +118,10 @@ def spoiled(msg, kind):
     ('kind', 'reason'),
     [
         ('none', 'scans have no intensities'),
-        ('0', 'no beam with a valid range has an intensity above 0'),
-        ('nan', 'no beam with a valid range has an intensity above 0'),
-        ('no range', 'no beam with a valid range has an intensity above 0'),
-        ('one value', 'all beams of a scan have the same intensity'),
+        ('0', 'all beams of a scan have the intensity 0'),
+        ('nan', 'no beam has a valid range and intensity'),
+        ('no range', 'no beam has a valid range and intensity'),
+        ('one value', 'all beams of a scan have the intensity 47'),
     ],
 )
 def test_intensities_that_vanish_are_named_and_get_no_cloud(live, node, kind, reason):

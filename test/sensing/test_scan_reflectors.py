@@ -123,21 +123,34 @@ def test_laser_with_levels_has_looked_where_all_is_0():
     assert len(found) == 0
 
 
-@pytest.mark.parametrize('values', [(0.0, 1.0), (100.0, 255.0)])
+@pytest.mark.parametrize('values', [(0.0, 1.0), (100.0, 255.0), (-5.0, 3.0), (0.0, 3.0, 7.0)])
 def test_laser_that_marks_reflectors_has_looked_where_no_beam_is_marked(values):
     check, frames = IntensityCheck(), list(scans())
-    marked = [
-        replace(s, intensities=np.where(s.intensities > 2000.0, values[1], values[0]).astype('f4'))
-        for s in frames
-    ]
-    none = [replace(s, intensities=np.full_like(s.intensities, values[0])) for s in frames]
-    assert check.fault(none[0])  # it may as well measure none
-    assert not check.fault(marked[1])
-    assert not check.fault(none[2])
-    assert check.fault(replace(none[3], frame_id='other'))
-    assert check.fault(replace(none[4], ranges=np.full_like(none[4].ranges, np.nan)))
-    assert not check.fault(frames[5])  # it has levels
-    assert check.fault(none[6])
+
+    def with_values(s, marks):
+        bright = np.full(len(s.ranges), values[0], np.float32)
+        bright[s.intensities > 2000.0] = values[1] if marks else values[0]
+        if marks and len(values) > 2:
+            bright[np.flatnonzero(bright > values[0])[:2]] = values[2]
+        return replace(s, intensities=bright)
+
+    assert check.fault(with_values(frames[0], False))  # it may as well measure none
+    assert not check.fault(with_values(frames[1], True))
+    assert not check.fault(with_values(frames[2], False))
+    assert check.fault(replace(with_values(frames[3], False), frame_id='other'))
+    nothing = np.full_like(frames[4].ranges, np.nan)
+    assert check.fault(replace(with_values(frames[4], False), ranges=nothing))
+    assert not check.fault(frames[5])  # it has all values
+    assert check.fault(with_values(frames[6], False))
+
+
+def test_an_odd_scan_is_none_of_a_laser_that_marks_reflectors():
+    check, (first, *_) = IntensityCheck(), scans()
+    half = np.where(np.arange(len(first.ranges)) % 2, 47.0, 0.0).astype('f4')
+    two = np.where(np.arange(len(first.ranges)) < 2, first.ranges, np.float32(np.nan))
+    check.fault(replace(first, intensities=half))
+    check.fault(replace(first, ranges=two))
+    assert check.fault(replace(first, intensities=np.zeros_like(first.intensities)))
 
 
 @pytest.mark.parametrize('gloss', [0.0, 4000.0])

@@ -220,6 +220,8 @@ def test_scan_in_millimetres_is_named_and_codes_for_no_return_are_not():
     in_mm = replace(scan(t, (400.0, 2100.0, 9000.0, 30000.0)), range_max=30000.0)
     assert add(synchronizer, in_mm) == []
     assert 'are they in millimetres?' in synchronizer.inputs.last_error
+    assert add(synchronizer, replace(in_mm, ranges=np.array([0, 0, 0, 4e3, 9e3], 'f4'))) == []
+    assert synchronizer.inputs.counts['scan']['invalid'] == 2
     coded = replace(scan(t, (4.0, 65535.0, 65535.0, 65535.0)), range_max=65535.0)
     assert len(feed(synchronizer, [coded, odometry(t + 20 * MS)])) == 1
 

@@ -17,7 +17,7 @@ from rlml_slam.se2 import Array
 
 # [m] before an end point, along its beam, and [m] the size of the cells that this is meant for
 FRONT, CELL = np.array([0.2, 0.3, 0.4]), 0.05
-MOST = 2  # of these places: in as many at least the submap knows something
+MOST = 2  # of these places: at as many at least the submap knows something
 WEAK = 1e-2 * np.eye(2)  # [1/m²] of what nothing holds
 
 
@@ -29,15 +29,25 @@ def of_seen_sides(submap: Submap, points: Array, origin: Array, pose: Array) -> 
     laser = se2.transform(pose, origin[None])[0]
     ends = se2.transform(pose, points)
     back = laser - ends
-    back /= np.maximum(np.hypot(back[:, 0], back[:, 1]), CELL)[:, None]
-    before = FRONT * max(1.0, submap.resolution / CELL)
-    places = ends[:, None] + before[:, None] * back[:, None]
+    far = np.maximum(np.hypot(back[:, 0], back[:, 1]), CELL)
+    # no place is behind the laser
+    before = np.minimum(FRONT * max(1.0, submap.resolution / CELL), far[:, None])
+    places = ends[:, None] + (before / far[:, None])[..., None] * back[:, None]
     cells = np.floor(places / submap.resolution).astype(np.int64) - submap.corner
-    size = np.array(submap.values.shape[::-1])
-    inside = ((cells >= 0) & (cells < size)).all(-1)
+    # far from the laser, its beams leave cells out between them
+    reach = int(CELL / submap.resolution)
+    around = np.arange(-reach, reach + 1)
+    offsets = np.stack(np.meshgrid(around, around), -1).reshape(-1, 2)
+    return np.asarray(_is_known(submap, cells[:, :, None] + offsets).any(-1).sum(-1) >= MOST)
+
+
+def _is_known(submap: Submap, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether something is known of cells (..., 2), column and row of the values."""
+    inside = np.asarray(((cells >= 0) & (cells < submap.values.shape[::-1])).all(-1))
+    if not inside.any():
+        return inside
     column, row = np.moveaxis(np.where(inside[..., None], cells, 0), -1, 0)
-    known = inside & (submap.values[row, column] != 0) if inside.any() else inside
-    return np.asarray(known.sum(-1) >= MOST)
+    return np.asarray(inside & (submap.values[row, column] != 0))
 
 
 def least_share(part: Array, whole: Array) -> float:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -43,6 +42,7 @@ from rlml_slam.types import ANONYMOUS, Detections, Scan
 DEPTH = 4.0 / (3.0 * np.pi)
 SAME = 0.1  # [m] between two sightings of one reflector in one sweep
 MAX_LASERS = 16  # of a robot
+FEWEST, MOST = 30, 0.8  # beams of a scan, share of them with the least intensity where it marks
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,8 @@ def _turned_by_sweep(points: Array, T_base_laser: Array, share: Array) -> Array:
 class IntensityCheck:
     """Whether the intensities of scans show anything, be it that no reflector is there.
 
-    A laser that marks reflectors, with two values only, has one of them where there is none.
+    To a laser that marks reflectors, or has a few levels of intensity, most of what it sees has
+    the least one; so have all beams where there is no reflector.
     """
 
     def __init__(self) -> None:
@@ -145,18 +146,19 @@ class IntensityCheck:
             return 'scans have no intensities'
         ranges, bright = valid_beams(scan)
         seen = bright[ranges > 0.0]
-        least, most = seen.min(initial=math.inf), seen.max(initial=0.0)
-        if least < most:
-            has_two = bool(((seen == least) | (seen == most)).all())
-            if has_two and len(self._marks) < MAX_LASERS:
-                self._marks.add(scan.frame_id)
-            elif not has_two:
-                self._marks.discard(scan.frame_id)
-        elif len(seen) and scan.frame_id in self._marks:
-            return ''
-        elif not most > 0.0:
-            return 'no beam with a valid range has an intensity above 0'
-        return '' if least < most else 'all beams of a scan have the same intensity'
+        if not len(seen):
+            return 'no beam has a valid range and intensity'
+        least, most = seen.min(), seen.max()
+        if least == most:
+            if scan.frame_id in self._marks:
+                return ''
+            return f'all beams of a scan have the intensity {least:g}'
+        marks = len(seen) >= FEWEST and np.mean(seen == least) >= MOST
+        if marks and len(self._marks) < MAX_LASERS:
+            self._marks.add(scan.frame_id)
+        elif not marks and len(seen) >= FEWEST:
+            self._marks.discard(scan.frame_id)
+        return ''
 
 
 def detect(scan: Scan, params: Detector, floor: Callable[[Array], Array] | None = None) -> Found:

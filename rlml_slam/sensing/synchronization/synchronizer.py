@@ -305,7 +305,7 @@ def invalid_geometry(scan: Scan) -> str:
     if abs(scan.angle_min) > LARGEST_VIEW:
         return f'angle_min is {scan.angle_min:g} rad, more than a turn'
     if scan.range_max > FARTHEST:
-        seen = scan.ranges[scan.ranges < scan.range_max]
+        seen = scan.ranges[(scan.ranges > scan.range_min) & (scan.ranges < scan.range_max)]
         if len(seen) and (middle := float(np.median(seen))) > FARTHEST:
-            return f'half of its ranges are above {middle:.0f} m: are they in millimetres?'
+            return f'half of its ranges are {middle:.0f} m or more: are they in millimetres?'
     return ''

@@ -36,7 +36,8 @@ from rlml_slam.slam.store import map_file
 from rlml_slam.types import EdgeKind
 
 Arrays = dict[str, NDArray[Any]]
-SHARE = 0.5  # of a map's keyframes that are in another one of the same drive, by their stamps
+SHARE = 0.9  # of a map's keyframes whose stamps are in another one that has all of its drive
+ALIKE = 0.5  # of its reflectors that are where the other one has some
 NEAR, BENT = 0.5, 0.05  # [m], share of its extent by which the paths of one drive may differ
 
 
@@ -119,9 +120,9 @@ def once_each(drives: Sequence[Drive]) -> tuple[list[Session], dict[str, Placeme
 
 
 def _is_same(a: Drive, b: Drive) -> bool:
-    """Whether stamps, path and reflectors are the same; simulated drives may share the stamps."""
+    """Whether b has stamps, path and reflectors of a; simulated drives may share the stamps."""
     stamps, i, j = np.intersect1d(a.stamps, b.stamps, return_indices=True)
-    if max(np.isin(d.stamps[: d.num_keys], stamps[stamps > 0]).mean() for d in (a, b)) < SHARE:
+    if np.isin(a.stamps[: a.num_keys], stamps[stamps > 0]).mean() < SHARE:
         return False
     there = b.points[j]
     T = se2.align(a.points[i], there)
@@ -130,7 +131,7 @@ def _is_same(a: Drive, b: Drive) -> bool:
         return False
     few, many = sorted((se2.transform(T, a.session.points), b.session.points), key=len)
     gap = np.linalg.norm(few[:, None] - many, axis=-1)
-    return not len(few) or bool((gap.min(axis=1) < limit).mean() >= SHARE)
+    return not len(few) or bool((gap.min(axis=1) < limit).mean() >= ALIKE)
 
 
 def _loaded(session: Session) -> Content:

@@ -5,6 +5,7 @@ import json
 import weakref
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +22,14 @@ from rlml_slam.matching.scans.packed_submap import Unpacked
 from rlml_slam.params import Parameters, Relocalization
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.back_end.trajectory import poses_of
-from rlml_slam.slam.merging.map_merging import _packed, assemble, merge_files, survey_of_all
+from rlml_slam.slam.merging.map_merging import (
+    Drive,
+    _packed,
+    assemble,
+    merge_files,
+    once_each,
+    survey_of_all,
+)
 from rlml_slam.slam.merging.placement import UNMATCHED_SHARE
 from rlml_slam.slam.merging.site_map import session_of, site_of
 from rlml_slam.slam.merging.site_tree import Placed, place_sessions
@@ -269,6 +277,24 @@ def test_maps_of_one_drive_count_once(two, tmp_path, kind):
     assert doubt.why == f'{again} and {a} are maps of one drive, which is used once'
     once, _ = merge_files([a, b], PARAMS)
     assert_array_equal(merged.back_end.reflectors().cov, once.back_end.reflectors().cov)
+
+
+@pytest.mark.parametrize(('own', 'used'), [(40, 2), (5, 1)])
+def test_maps_that_continue_a_third_one_are_both_used(own, used):
+    """Both have data of their own, if it is more than a tenth of it."""
+    rng = np.random.default_rng(2)
+    shared = rng.uniform(0.0, 20.0, (60, 2))
+    posts = rng.uniform(0.0, 20.0, (8, 2))
+
+    def continued(name, first, number):
+        stamps = np.concatenate([np.arange(1, 61), np.arange(first, first + number)]) * 10**9
+        points = np.vstack([shared, rng.uniform(0.0, 20.0, (number, 2))])
+        session = SimpleNamespace(name=name, points=posts)
+        return Drive(session, stamps, points, len(stamps))
+
+    kept, again = once_each([continued('a', 1000, 41), continued('b', 2000, own)])
+    assert len(kept) == used
+    assert list(again) == ['b'][used - 1 :]
 
 
 def test_one_file_by_two_names_is_refused(two, tmp_path, monkeypatch):
