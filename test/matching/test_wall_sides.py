@@ -20,34 +20,35 @@ CROSSING = (
     *((x, a, x, b) for x in (0.0, WIDTH) for a, b in ((-8.0, 0.0), (WIDTH, WIDTH + 8.0))),
 )  # fmt: skip
 VIEW = np.radians(np.arange(-90.0, 90.5, 1.0))
+AROUND = np.radians(np.arange(-180.0, 180.0, 1.0))
 ORIGIN = np.array([0.1, 0.0])  # of the laser in base
 BACK = np.array([6.0, 0.5 * WIDTH, np.pi])
 
 
-def scan(pose):
-    """End points (n, 2) in base, of a laser that looks ahead."""
+def scan(pose, view=VIEW):
+    """End points (n, 2) in base, of a laser that looks ahead, or around."""
     segments = np.hstack([np.array(CROSSING), np.zeros((len(CROSSING), 2))])
     geometry = Geometry(segments, np.zeros((0, 5)), np.zeros((len(CROSSING), 4)))
     x, y, heading = se2.compose(pose, np.array([*ORIGIN, 0.0]))
-    n = len(VIEW)
-    r, _, _ = cast(np.tile((x, y), (n, 1)), heading + VIEW, np.zeros(n), geometry, 20.0)
+    n = len(view)
+    r, _, _ = cast(np.tile((x, y), (n, 1)), heading + view, np.zeros(n), geometry, 20.0)
     hit = np.isfinite(r)
-    return ORIGIN + r[hit, None] * np.stack([np.cos(VIEW[hit]), np.sin(VIEW[hit])], -1)
+    return ORIGIN + r[hit, None] * np.stack([np.cos(view[hit]), np.sin(view[hit])], -1)
 
 
-def mapped(heading=0.0, resolution=0.05):
+def mapped(heading=0.0, resolution=0.05, view=VIEW):
     """Submap of a drive through the crossing with one heading."""
     submap = Submap(SubmapParameters(resolution=resolution))
     for x in np.arange(-6.0, 6.0, 0.4):
         pose = np.array([x, 0.5 * WIDTH, heading])
-        at = se2.transform(pose, np.vstack([scan(pose), ORIGIN]))
+        at = se2.transform(pose, np.vstack([scan(pose, view), ORIGIN]))
         submap.insert(at[:-1], at[-1])
     return submap
 
 
-def share(submap, true, pose):
+def share(submap, true, pose, view=VIEW):
     """Least share of seen sides in the information at ``pose`` of a scan from ``true``."""
-    points = scan(true)
+    points = scan(true, view)
     facing = points[of_seen_sides(submap, points, ORIGIN, pose)]
     whole, part = (
         scan_information.information(submap, p, pose, ScanMatch()) for p in (points, facing)
@@ -55,18 +56,20 @@ def share(submap, true, pose):
     return least_share(part, whole)
 
 
-@pytest.mark.parametrize('resolution', [0.025, 0.05, 0.1])
+@pytest.mark.parametrize('view', [VIEW, AROUND], ids=['ahead', 'around'])
+@pytest.mark.parametrize('resolution', [0.025, 0.05, 0.1, 0.2])
 @pytest.mark.parametrize('x', [-5.0, -2.5, -1.0])
 @pytest.mark.parametrize('aside', [-0.6, 0.0, 0.6])
-def test_scan_of_the_same_direction_is_of_seen_sides(x, aside, resolution):
+def test_scan_of_the_same_direction_is_of_seen_sides(x, aside, resolution, view):
     pose = np.array([x, 0.5 * WIDTH + aside, 0.1])
-    assert share(mapped(resolution=resolution), pose, pose) > 0.6
+    assert share(mapped(resolution=resolution, view=view), pose, pose, view) > 0.6
 
 
-def test_walls_across_are_not_those_of_the_way_there():
+@pytest.mark.parametrize('resolution', [0.025, 0.05, 0.1, 0.2])
+def test_walls_across_are_not_those_of_the_way_there(resolution):
     """Displaced by the width of the crossing, the scan of the way back fits, and is found out."""
     displaced = BACK + np.array([WIDTH, 0.0, 0.0])
-    assert share(mapped(), BACK, displaced) < 0.05
+    assert share(mapped(resolution=resolution), BACK, displaced) < 0.05
 
 
 def test_submap_of_the_way_back_has_seen_them():
