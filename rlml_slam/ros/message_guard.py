@@ -66,7 +66,7 @@ class MessageGuard:
     def is_new(self, topic: str, reason: str, most: int = MAX_LOGGED) -> bool:
         """Whether a reason is to be logged: once for a topic or stream, whatever its numbers."""
         before, kind = len(self._logged), (topic, NUMBERS.sub('#', reason))
-        if before < most or all(of != topic for of, _ in self._logged):
+        if before < most:
             self._logged.add(kind)
         return len(self._logged) > before
 
