@@ -122,8 +122,7 @@ class Estimator:
             self._since = np.zeros(2)
         keys = itertools.count(self._next_key)
         key_of = cache(lambda i: next(keys))
-        mapping = self._mapping and not self.contradiction.holds
-        frame = MeasuredFrame(seen, stamp, weight, mapping, key_of)
+        frame = MeasuredFrame(seen, stamp, weight, self._mapping, key_of)
         self.branches = _best(
             [child for b in self.branches for child in b.update(frame)],
             len(seen.z),
@@ -162,10 +161,10 @@ class Estimator:
         agree = agree_with_map(n, used)
         in_map.check(observation.stamp, travel, n, used, agree, GridMatch(math.nan))
         elsewhere = self.contradiction
-        if self.model is POINT and not in_map.is_pending:
+        if self.model is POINT and not (self._mapping or in_map.is_pending):
             near = se2.transform(se2.inverse(pose), self.filter.points)
-            known, z = keys[statuses == Status.USED], np.zeros((0, 2)) if seen is None else seen.z
-            elsewhere.check(observation.stamp, z, known, near, self._next_key, self._mapping)
+            z = np.zeros((0, 2)) if seen is None else seen.z
+            elsewhere.check(observation.stamp, z, used, near)
         health = self.health.evaluate(
             observation.stamp,
             HealthInputs(
