@@ -3,12 +3,11 @@
 
 import numpy as np
 import pytest
+from made_scans import end_points
 
 from rlml_slam import se2
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.matching.scans.visibility import ASIDE, BEHIND, hidden_share
-from rlml_slam.simulation.ray_cast import cast
-from rlml_slam.simulation.world import Geometry
 
 WIDTH = 2.4  # [m] of the corridor
 CORRIDOR = ((-15.0, 0.0, 15.0, 0.0), (-15.0, WIDTH, 15.0, WIDTH), (15.0, 0.0, 15.0, WIDTH))
@@ -18,13 +17,7 @@ ORIGIN = np.array([0.2, 0.0])  # of the laser in base
 
 def scan(pose, walls=CORRIDOR):
     """End points (n, 2) in base."""
-    segments = np.hstack([np.array(walls), np.zeros((len(walls), 2))])
-    geometry = Geometry(segments, np.zeros((0, 5)), np.zeros((len(walls), 4)))
-    x, y, heading = se2.compose(pose, np.array([*ORIGIN, 0.0]))
-    n = len(VIEW)
-    r, _, _ = cast(np.tile((x, y), (n, 1)), heading + VIEW, np.zeros(n), geometry, 30.0)
-    hit = np.isfinite(r)
-    return ORIGIN + r[hit, None] * np.stack([np.cos(VIEW[hit]), np.sin(VIEW[hit])], -1)
+    return end_points(pose, walls, VIEW, 30.0, ORIGIN)
 
 
 def mapped(walls=CORRIDOR):

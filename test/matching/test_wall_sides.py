@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from made_scans import end_points
 
 from rlml_slam import se2
 from rlml_slam.matching.scans import scan_information
@@ -10,8 +11,6 @@ from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.matching.scans.wall_sides import least_share, of_seen_sides
 from rlml_slam.params import ScanMatch
 from rlml_slam.params import Submap as SubmapParameters
-from rlml_slam.simulation.ray_cast import cast
-from rlml_slam.simulation.world import Geometry
 
 WIDTH = 2.4  # [m] of both corridors
 # along x from -15 to 15, crossed by one from x = 0 to x = WIDTH
@@ -27,13 +26,7 @@ BACK = np.array([6.0, 0.5 * WIDTH, np.pi])
 
 def scan(pose, view=VIEW):
     """End points (n, 2) in base, of a laser that looks ahead, or around."""
-    segments = np.hstack([np.array(CROSSING), np.zeros((len(CROSSING), 2))])
-    geometry = Geometry(segments, np.zeros((0, 5)), np.zeros((len(CROSSING), 4)))
-    x, y, heading = se2.compose(pose, np.array([*ORIGIN, 0.0]))
-    n = len(view)
-    r, _, _ = cast(np.tile((x, y), (n, 1)), heading + view, np.zeros(n), geometry, 20.0)
-    hit = np.isfinite(r)
-    return ORIGIN + r[hit, None] * np.stack([np.cos(view[hit]), np.sin(view[hit])], -1)
+    return end_points(pose, CROSSING, view, 20.0, ORIGIN)
 
 
 def mapped(heading=0.0, resolution=0.05, view=VIEW):

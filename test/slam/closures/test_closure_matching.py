@@ -3,12 +3,11 @@
 
 import numpy as np
 import pytest
+from made_scans import end_points
 
 from rlml_slam import se2
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.params import Parameters
-from rlml_slam.simulation.ray_cast import cast
-from rlml_slam.simulation.world import Geometry
 from rlml_slam.slam.closures.closure_candidates import Candidate
 from rlml_slam.slam.closures.closure_matching import HIDDEN, OTHER_SIDE, ClosureMatcher, Match
 from rlml_slam.slam.closures.keyframe_submap import KeyframeSubmap
@@ -26,12 +25,7 @@ VIEW = np.radians(np.arange(-90.0, 90.5, 1.0))
 
 def scan(pose, walls):
     """End points (n, 2) in base, where the laser is."""
-    segments = np.hstack([np.array(walls), np.zeros((len(walls), 2))])
-    geometry = Geometry(segments, np.zeros((0, 5)), np.zeros((len(walls), 4)))
-    n = len(VIEW)
-    r, _, _ = cast(np.tile(pose[:2], (n, 1)), pose[2] + VIEW, np.zeros(n), geometry, 20.0)
-    hit = np.isfinite(r)
-    return r[hit, None] * np.stack([np.cos(VIEW[hit]), np.sin(VIEW[hit])], -1)
+    return end_points(pose, walls, VIEW, 20.0)
 
 
 def keyframe(index):
