@@ -247,6 +247,16 @@ def test_belief_that_contradicts_itself_is_refused():
         read_correction(msg)
 
 
+@pytest.mark.parametrize('name', ['session', 'kind', 'key', 'value', 'cov'])
+def test_correction_whose_fields_have_other_types_is_refused(name):
+    """A session that is declared as a float may be NaN, which is no number of a session."""
+    msg = build_correction(make_bag, Correct(1, 1, np.zeros(3), np.eye(3), (4,)), 'map')
+    field = next(f for f in msg.fields if f.name == name)
+    field.datatype = 7 if field.datatype != 7 else 6
+    with pytest.raises(InputError, match=f'rlml/graph_correction: .*missing fields: .*{name}'):
+        read_correction(msg)
+
+
 @pytest.mark.parametrize('kind', [StartSession, Relocate])
 def test_request_travels_exactly(kind):
     rng = np.random.default_rng(0)

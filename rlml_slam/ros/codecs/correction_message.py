@@ -17,12 +17,25 @@ from rlml_slam.errors import InputError
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.decode import covariances, stamp
 from rlml_slam.ros.codecs.message_types import Make
-from rlml_slam.ros.codecs.point_cloud import bounded, build_cloud, read_cloud
+from rlml_slam.ros.codecs.point_cloud import bounded, build_cloud, check_fields, read_cloud
 from rlml_slam.slam.conversation import Correct
 from rlml_slam.types import Belief
 
 # `kind`; an alias maps `key` to `value`, NOTHING is the only row where there is nothing else
 POSE, LANDMARK, CORRECTION, ALIAS, BELIEF_REMOVED, REMOVED, NOTHING = range(7)
+
+
+def _layout(width: int) -> np.dtype[np.void]:
+    """One value, with ``width`` columns of covariances."""
+    return np.dtype(
+        [
+            ('session', '<u4'),
+            ('kind', 'u1'),
+            ('key', '<i4'),
+            ('value', '<f8'),
+            ('cov', '<f8', (width,)),
+        ]
+    )
 
 
 def build_correction(make: Make, command: Correct, map_frame: str) -> Any:
@@ -44,10 +57,7 @@ def build_correction(make: Make, command: Correct, map_frame: str) -> Any:
         rows += [(ALIAS, key, float(other), none) for key, other in b.aliases.items()]
         rows += [(BELIEF_REMOVED, key, 0.0, none) for key in b.removed]
     rows = rows or [(NOTHING, -1, 0.0, none)]
-    layout = [
-        ('session', '<u4'), ('kind', 'u1'), ('key', '<i4'), ('value', '<f8'), ('cov', '<f8', (n,))
-    ]  # fmt: skip
-    cloud = np.zeros(len(rows), dtype=layout)
+    cloud = np.zeros(len(rows), dtype=_layout(n))
     cloud['session'] = command.session
     for name, column in zip(('kind', 'key', 'value', 'cov'), zip(*rows, strict=True), strict=True):
         cloud[name] = column
@@ -57,13 +67,16 @@ def build_correction(make: Make, command: Correct, map_frame: str) -> Any:
 def read_correction(msg: Any, topic: str = 'rlml/graph_correction') -> Correct:
     """The inverse of build_correction; InputError if it is another kind of cloud."""
     rows = read_cloud(msg, topic)
-    missing = {'session', 'kind', 'key', 'value', 'cov'} - set(rows.dtype.names or ())
-    if missing or not len(rows) or any(rows[n].ndim > 1 for n in ('session', 'kind', 'key')):
-        raise InputError(f'{topic}: not a correction')
+    width = (
+        rows['cov'].shape[1] if 'cov' in (rows.dtype.names or ()) and rows['cov'].ndim == 2 else 3
+    )
+    check_fields(rows, _layout(width), topic)
+    if not len(rows):
+        raise InputError(f'{topic}: a correction without rows')
     bounded(rows['value'], f'{topic}: a value')
     kind, value, cov = rows['kind'], rows['value'].astype(np.float64), rows['cov']
     own = kind == CORRECTION
-    if own.sum() not in (0, 3) or cov.ndim != 2 or cov.shape[1] < 3:
+    if own.sum() not in (0, 3) or width < 3:
         raise InputError(f'{topic}: {own.sum()} values are no correction')
     T_map_local = value[own] if own.any() else None
     cov_map = np.array(cov[own][:, :3], dtype=np.float64) if own.any() else None

@@ -49,13 +49,18 @@ def read_table(
     Raises InputError if it has others, or where it should have ``one`` point and has not.
     """
     cloud = read_cloud(msg, topic)
+    check_fields(cloud, dtype, topic)
+    if one and len(cloud) != 1:
+        raise InputError(f'{topic}: {len(cloud)} points, not one')
+    return cloud
+
+
+def check_fields(cloud: NDArray[np.void], dtype: np.dtype[np.void], topic: str) -> None:
+    """Raise InputError where a cloud has not all fields of ``dtype``, or of other types."""
     names = cloud.dtype.names or ()
     missing = [n for n in dtype.names or () if n not in names or cloud.dtype[n] != dtype[n]]
-    if missing or (one and len(cloud) != 1):
-        raise InputError(
-            f'{topic}: {len(cloud)} points; missing fields: {", ".join(missing) or "none"}'
-        )
-    return cloud
+    if missing:
+        raise InputError(f'{topic}: {len(cloud)} points; missing fields: {", ".join(missing)}')
 
 
 def bounded(values: ArrayLike, where: str, largest: float = LARGEST) -> None:
