@@ -30,18 +30,19 @@ FILES: dict[str, tuple[type[Any], str]] = {
 # what a node declares, because it shares the group, but does not read: names and groups
 UNREAD: dict[str, tuple[str, ...]] = {
     'ekf_slam.yaml': (
-        'motion.scale_error_sigma_without_lidar', 'motion.drift_sigma', 'continue_map',
+        'motion.scale_error_sigma_without_lidar', 'motion.drift_sigma', 'motion.pivot_sigma',
+        'continue_map',
         'restore_pose', 'estimate_odometry_delay', 'scan_match', 'loop_closure',
         'relocalization', 'solver', 'incident',
     ),
     'deformable_slam.yaml': (
         'motion.scale_error_sigma', 'motion.scale_error_sigma_without_lidar',
-        'motion.scale_error_time', 'motion.drift_sigma',
+        'motion.scale_error_time', 'motion.drift_sigma', 'motion.pivot_sigma',
         'estimate_odometry_delay', 'trust_ids',
     ),
     'reflector_detector.yaml': (
         'motion.scale_error_sigma', 'motion.scale_error_sigma_without_lidar',
-        'motion.scale_error_time', 'motion.drift_sigma',
+        'motion.scale_error_time', 'motion.drift_sigma', 'motion.pivot_sigma',
         'local_frame', 'use_scan', 'use_reflectors', 'estimate_odometry_delay', 'trust_ids',
         # the topics of all streams but those that it reads, and reflectors, which it publishes
         *(row[0] for s, row in STREAMS.items() if s not in ('scan', 'odom', 'imu', 'reflectors')),

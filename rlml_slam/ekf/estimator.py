@@ -124,8 +124,7 @@ class Estimator:
         key_of = cache(lambda i: next(keys))
         frame = MeasuredFrame(seen, stamp, weight, self._mapping, key_of)
         self.branches = _best(
-            [child for b in self.branches for child in b.update(frame)],
-            len(seen.z),
+            [child for b in self.branches for child in b.update(frame)], len(seen.z)
         )
         self._next_key = next(keys)
         if (self.branches[0].associations.statuses == Status.USED).any():

@@ -28,8 +28,7 @@ def from_mapping(values: Mapping[str, Any], of: type[Any] = Parameters) -> Any:
         groups.setdefault(known[name].group, {})[known[name].field] = value
     default = of()
     return dataclasses.replace(
-        default,
-        **{g: dataclasses.replace(getattr(default, g), **v) for g, v in groups.items()},
+        default, **{g: dataclasses.replace(getattr(default, g), **v) for g, v in groups.items()}
     )
 
 

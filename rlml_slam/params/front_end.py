@@ -35,21 +35,16 @@ class MotionNoise(Group, prefix='motion.'):
         2e-4, 'random walk of the bias of the IMU', 'rad/s/sqrt(s)', 0.0, 1.0
     )
     scale_error_sigma: tuple[float, ...] = param(
-        (0.03, 0.05),
-        'slowly varying scale error of speed and turn rate, 1 sigma; 0: not modelled',
-        '',
-        0.0,
-        1.0,
+        (0.03, 0.05), 'scale error of speed and turn rate, 1 sigma; 0: not modelled', '', 0.0, 1.0
     )
     scale_error_sigma_without_lidar: tuple[float, ...] = param(
         (0.03, 0.1), 'the same until the first scan; the larger of both holds', '', 0.0, 1.0
     )
     drift_sigma: float = param(
-        0.03,
-        'turn per distance that the wheels do not measure, 1 sigma; 0: not modelled',
-        'rad/m',
-        0.0,
-        1.0,
+        0.03, 'turn per distance not measured, 1 sigma; 0: not modelled', 'rad/m', 0.0, 1.0
+    )
+    pivot_sigma: float = param(
+        0.1, 'from where the robot turns to base_frame, 1 sigma; 0: not modelled', 'm', 0.0, 10.0
     )
     scale_error_time: float = param(
         600.0, 'correlation time of these errors: load, floor, tyres', 's', 1.0, 1e6

@@ -59,10 +59,7 @@ def _truth_rows(f: Mapping[str, Any]) -> list[tuple[str, str]]:
         return []
     aligned = '' if f['alignment'] == 'none' else ', aligned'
     live = f'{f["live_ate_rmse_m"]:.3f} m RMSE, max {f["live_ate_max_m"]:.3f}{aligned}'
-    rows = [
-        ('error, live', live),
-        ('error, optimised', f'{f["ate_rmse_m"]:.3f} m RMSE{aligned}'),
-    ]
+    rows = [('error, live', live), ('error, optimised', f'{f["ate_rmse_m"]:.3f} m RMSE{aligned}')]
     if 'heading_rmse_deg' in f:
         live = f'{f["live_heading_rmse_deg"]:.3f}° live'
         rows.append(('heading error', f'{live}, {f["heading_rmse_deg"]:.3f}° optimised'))

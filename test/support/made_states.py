@@ -9,10 +9,10 @@ from rlml_slam.slam.front_end.joint_state import ANCHORS, BIAS, LANDMARKS, WHEEL
 def made(seed=0, landmarks=3, theta=0.4, spread=2.0):
     """A state with every correlation there can be."""
     rng = np.random.default_rng(seed)
-    state = JointState(np.zeros(3), np.zeros((3, 3)), 0.02, wheels=(0.03, 0.05, 0.03))
+    state = JointState(np.zeros(3), np.zeros((3, 3)), 0.02, wheels=(0.03, 0.05, 0.03, 0.1))
     n = LANDMARKS + 2 * landmarks
     state.x = rng.normal(0.0, spread, n)
-    state.x[2], state.x[BIAS], state.x[WHEELS] = theta, 0.01, (0.04, -0.03, 0.02)
+    state.x[2], state.x[BIAS], state.x[WHEELS] = theta, 0.01, (0.04, -0.03, 0.02, 0.05)
     for a in ANCHORS:
         state.x[a + 2] = rng.uniform(-3.0, 3.0)
     A = 0.05 * rng.standard_normal((n, n))

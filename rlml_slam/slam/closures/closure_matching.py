@@ -27,11 +27,7 @@ from rlml_slam.params import LoopClosure, Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.slam.closures.closure_candidates import Candidate
 from rlml_slam.slam.closures.closure_consistency import REPEATED_WRONG
-from rlml_slam.slam.closures.keyframe_submap import (
-    WEAK_INFORMATION,
-    KeyframeSubmap,
-    edge_of_match,
-)
+from rlml_slam.slam.closures.keyframe_submap import WEAK_INFORMATION, KeyframeSubmap, edge_of_match
 from rlml_slam.slam.closures.local_map import Surroundings, local_map
 from rlml_slam.slam.closures.loop_closure import Closure
 from rlml_slam.slam.keyframes import Keyframe

@@ -22,12 +22,12 @@ from rlml_slam.se2 import Array, wrapped
 from rlml_slam.types import Motion
 
 BIAS = 3
-SPEED, TURN, DRIFT = 4, 5, 6
-VELOCITY = 7
-ANCHORS = (10, 13)
-LANDMARKS = 16
-WHEELS = slice(SPEED, DRIFT + 1)
-SYSTEMATIC = slice(BIAS, DRIFT + 1)
+SPEED, TURN, DRIFT, PIVOT = 4, 5, 6, 7
+VELOCITY = 8
+ANCHORS = (11, 14)
+LANDMARKS = 17
+WHEELS = slice(SPEED, PIVOT + 1)
+SYSTEMATIC = slice(BIAS, PIVOT + 1)
 STANDING = np.zeros(2)
 GATE = 16.0  # squared sigmas of a bias beyond which the wheels slip
 MOVING = slice(VELOCITY, VELOCITY + 3)
@@ -35,13 +35,13 @@ REGULAR = 1e-12  # [m², rad²] smallest eigenvalue of the covariance of a pose 
 
 
 class JointState:
-    """Mean ``x`` (16 + 2m,) and covariance ``P`` of all that is estimated together.
+    """Mean ``x`` (17 + 2m,) and covariance ``P`` of all that is estimated together.
 
-    In this order: the pose, the gyro's bias, the shares by which the robot's speed and turn
-    exceed those that its wheels measure, the turn per distance [rad/m] that they do not measure,
-    the velocity (forward, left, turn) of the base, or with odometry its error in the newest sweep
-    (:func:`begin_sweep`), two anchors, the reflectors; and ``extra`` rows, zero but while
-    reflectors are left out (:mod:`inactive_landmarks`). Those depend on the rows ``tied``.
+    In this order: the pose, the gyro's bias, the shares by which speed and turn exceed those that
+    the wheels measure, the turn per distance [rad/m] that they do not measure, how far the base is
+    ahead of the point about which it turns (eq. 67), its velocity, or with odometry the error of
+    that in the newest sweep (:func:`begin_sweep`), two anchors, the reflectors; and ``extra``
+    rows, zero but while reflectors are left out, which depend on the rows ``tied``.
     """
 
     def __init__(
@@ -50,9 +50,9 @@ class JointState:
         cov: Array,
         bias_sigma: float,
         speeds: Sequence[float] = (0.0, 0.0, 0.0),
-        wheels: Sequence[float] = (0.0, 0.0, 0.0),
+        wheels: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
     ) -> None:
-        """Sigmas: ``speeds`` (3,) [m/s, m/s, rad/s] of an unknown velocity, ``wheels`` (3,)."""
+        """Sigmas: ``speeds`` (3,) [m/s, m/s, rad/s] of an unknown velocity, ``wheels`` (4,)."""
         self.x = np.zeros(LANDMARKS)
         self.P = np.zeros((LANDMARKS, LANDMARKS))
         self.x[:3] = pose
@@ -116,10 +116,9 @@ class JointState:
         """Move the pose by a relative motion with its covariance (eq. 5), as wheels and gyro err.
 
         Meanwhile the gyro's bias gained the variance ``walk``, and of what the wheels err by, a
-        share of ``kept`` is left; the rest is new (an Ornstein-Uhlenbeck process).
-
-        ``went`` (2,) [m, rad] is how far the robot came and turned by what was known before, which
-        takes the place of odometry in the derivatives by these shares (:mod:`wheels`).
+        share of ``kept`` is left; the rest is new (an Ornstein-Uhlenbeck process). ``went`` (2,)
+        [m, rad] is how far the robot came and turned by what was known before, which takes the
+        place of odometry in the derivatives by these errors.
         """
         if math.isfinite(motion.bias_var):
             measure_bias(
@@ -132,10 +131,11 @@ class JointState:
 
     def corrected(self, motion: Motion) -> Motion:
         """A motion as it is by what is known now of how wheels and gyro err."""
-        bias, speed, turn, drift = self.x[SYSTEMATIC].tolist()
+        bias, speed, turn, drift, ahead = self.x[SYSTEMATIC].tolist()
         delta = motion.delta + bias * motion.bias_gain + turn * motion.turn_gain
         delta += drift * motion.drift_gain
         delta[:2] *= 1.0 + speed
+        delta += ahead * pivot_gain(delta[2])
         delta[2] = se2.wrapped(delta[2])
         return Motion(delta, motion.cov, motion.known)
 
@@ -304,43 +304,55 @@ def predict(
     c, s = math.cos(x[2]), math.sin(x[2])
     moved = delta + bias_gain * x[BIAS] + turn_gain * x[TURN] + drift_gain * x[DRIFT]
     faster = 1.0 + x[SPEED]
-    D = np.zeros((3, 5))  # of the pose by the heading, bias, shares of speed and turn, drift
+    D = np.zeros((3, 6))  # by the heading, bias, shares of speed and turn, drift, pivot
     gx, gy = faster * (c * moved[0] - s * moved[1]), faster * (s * moved[0] + c * moved[1])
-    D[0, 0], D[1, 0] = -gy, gx
-    D[0, 1] = faster * (c * bias_gain[0] - s * bias_gain[1])
-    D[1, 1] = faster * (s * bias_gain[0] + c * bias_gain[1])
+    # about the point where it turns, and by an error of the turn
+    px, py = -x[PIVOT] * math.sin(x[2] + moved[2]), x[PIVOT] * math.cos(x[2] + moved[2])
+    ax, ay = py - x[PIVOT] * c, -px - x[PIVOT] * s
+    D[0, 0], D[1, 0] = -gy - ay, gx + ax
+    D[0, 1] = faster * (c * bias_gain[0] - s * bias_gain[1]) + px * bias_gain[2]
+    D[1, 1] = faster * (s * bias_gain[0] + c * bias_gain[1]) + py * bias_gain[2]
     D[2, 1] = bias_gain[2]
     # on an arc, a share of the way is along its chord, and one of the turn turns that by half
     middle = x[2] + 0.5 * moved[2]
     D[0, 2], D[1, 2] = math.cos(middle) * went[0], math.sin(middle) * went[0]
+    chord = 2.0 * math.sin(0.5 * went[1])
+    D[0, 5], D[1, 5] = -math.sin(middle) * chord, math.cos(middle) * chord
     if turn_gain.any():
-        D[0, 3], D[1, 3], D[2, 3] = -0.5 * gy * went[1], 0.5 * gx * went[1], went[1]
+        D[0, 3], D[1, 3], D[2, 3] = (px - 0.5 * gy) * went[1], (py + 0.5 * gx) * went[1], went[1]
     if drift_gain.any():
-        D[0, 4], D[1, 4], D[2, 4] = -0.5 * gy * went[0], 0.5 * gx * went[0], went[0]
-    x[0] += gx
-    x[1] += gy
+        D[0, 4], D[1, 4], D[2, 4] = (px - 0.5 * gy) * went[0], (py + 0.5 * gx) * went[0], went[0]
+    x[0] += gx + ax
+    x[1] += gy + ay
     turn = x[2] + moved[2]
     x[2] = wrapped(turn)
     for k in range(len(x)):
         heading, bias, speed, share, drift = P[2, k], P[3, k], P[4, k], P[5, k], P[6, k]
+        pivot = P[7, k]
         for r in range(3):
             P[r, k] += D[r, 0] * heading + D[r, 1] * bias + D[r, 2] * speed
-            P[r, k] += D[r, 3] * share + D[r, 4] * drift
+            P[r, k] += D[r, 3] * share + D[r, 4] * drift + D[r, 5] * pivot
     for k in range(len(x)):
         heading, bias, speed, share, drift = P[k, 2], P[k, 3], P[k, 4], P[k, 5], P[k, 6]
+        pivot = P[k, 7]
         for r in range(3):
             P[k, r] += D[r, 0] * heading + D[r, 1] * bias + D[r, 2] * speed
-            P[k, r] += D[r, 3] * share + D[r, 4] * drift
-    G = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+            P[k, r] += D[r, 3] * share + D[r, 4] * drift + D[r, 5] * pivot
+    G = np.array([[c, -s, px], [s, c, py], [0.0, 0.0, 1.0]])
     P[:3, :3] += np.dot(np.dot(G, cov), G.T.copy())
     P[BIAS, BIAS] += walk
     if kept < 1.0:
-        for k in range(3):
+        for k in range(4):
             e = SPEED + k
             x[e] *= kept
             P[e] *= kept
             P[:, e] *= kept
             P[e, e] += (1.0 - kept * kept) * wheels2[k]
+
+
+def pivot_gain(turn: float) -> Array:
+    """Derivative (3,) of a motion with a turn [rad] by how far the base is ahead (eq. 67)."""
+    return np.array([math.cos(turn) - 1.0, math.sin(turn), 0.0])
 
 
 def narrow_scale_errors(state: JointState, sigmas: Sequence[float]) -> None:
@@ -359,14 +371,15 @@ def predict_unseen(state: JointState, motion: Motion, walk: float, kept: float) 
     """:meth:`JointState.predict` over a long way on which nothing was seen (eq. 64).
 
     The odometry says how far the robot went: its noise is small beside the way. All of the way has
-    the scale errors and the drift of its end, so they vary first.
+    the errors of the wheels of its end, so they vary first.
     """
     state.x[WHEELS] *= kept
     state.P[WHEELS, :] *= kept
     state.P[:, WHEELS] *= kept
     state.P[WHEELS, WHEELS] += np.diag((1.0 - kept**2) * state.wheels2)
     speed = np.array([*motion.delta[:2], 0.0])
-    J = np.stack([speed, motion.turn_gain, motion.drift_gain], axis=-1)
+    pivot = pivot_gain(motion.delta[2])
+    J = np.stack([speed, motion.turn_gain, motion.drift_gain, pivot], axis=-1)
     J = se2.rotation3(state.x[2]) @ J
     state.predict(motion, walk)
     state.P[:3, :] += J @ state.P[WHEELS, :]
@@ -465,7 +478,7 @@ def warm_up() -> None:
     """Compile the kernels with the signatures that are used at run time."""
     state = JointState(np.zeros(3), np.eye(3), 0.1)
     zero = np.zeros(3)
-    predict(state.x, state.P, zero, np.eye(3), zero, zero, zero, STANDING, 0.0, 1.0, zero)
+    predict(state.x, state.P, zero, np.eye(3), zero, zero, zero, STANDING, 0.0, 1.0, np.zeros(4))
     measure_bias(state.x, state.P, 0.0, 1.0, 0.0, 0.0)
     state.apply(np.arange(3), np.eye(3), np.eye(3), np.zeros(3))
     state.turn_with_anchor(state.x)

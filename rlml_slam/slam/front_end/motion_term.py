@@ -30,6 +30,7 @@ from rlml_slam.slam.front_end.joint_state import (
     BIAS,
     DRIFT,
     GATE,
+    PIVOT,
     SPEED,
     STANDING,
     TURN,
@@ -37,6 +38,7 @@ from rlml_slam.slam.front_end.joint_state import (
     begin_sweep,
     end_sweep,
     narrow_scale_errors,
+    pivot_gain,
     predict_unseen,
 )
 from rlml_slam.slam.front_end.motion_hypotheses import FRESH, Fit, MotionHypotheses
@@ -191,6 +193,7 @@ class MotionTerm:
         moved = (
             motion.delta + state.x[BIAS] * motion.bias_gain + state.x[DRIFT] * motion.drift_gain
         )
+        moved += state.x[PIVOT] * pivot_gain(moved[2])
         went, cov = se2.between(before, state.pose), se2.rotate_cov(now[1], -now[0][2])
         if motion.bias_gain[2] != 0.0:  # a gyro turned it: of the wheels, nothing is known
             self._scale_errors[TURN].forget()

@@ -45,7 +45,7 @@ def keyframe(index, pose, cov):
 
 def chain(steps):
     """Keyframes at the poses and with the covariances that the front end's state has."""
-    state = JointState(np.zeros(3), np.zeros((3, 3)), 0.0, wheels=(*SHARES, 0.0))
+    state = JointState(np.zeros(3), np.zeros((3, 3)), 0.0, wheels=(*SHARES, 0.0, 0.0))
     keys = [keyframe(0, state.pose, state.pose_cov)]
     for k, step in enumerate(np.array(steps), 1):
         motion = Motion(step, NOISE, turn_gain=np.array([0.0, 0.5 * step[0], 1.0]) * step[2])

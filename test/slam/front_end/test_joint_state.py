@@ -13,6 +13,7 @@ from rlml_slam.slam.front_end.joint_state import (
     BIAS,
     DRIFT,
     LANDMARKS,
+    PIVOT,
     SPEED,
     TURN,
     WHEELS,
@@ -36,7 +37,9 @@ def moved(m, x):
     """Motion corrected by the errors of wheels and gyro in the state ``x`` (n,)."""
     delta = m.delta + m.bias_gain * x[BIAS] + m.turn_gain * x[TURN]
     delta = delta + m.drift_gain * x[DRIFT]
-    return delta * [1.0 + x[SPEED], 1.0 + x[SPEED], 1.0]
+    delta = delta * [1.0 + x[SPEED], 1.0 + x[SPEED], 1.0]
+    about = [np.cos(delta[2]) - 1.0, np.sin(delta[2]), 0.0]
+    return delta + x[PIVOT] * np.array(about)
 
 
 @pytest.mark.parametrize('theta', [0.0, 0.4, 3.1, -3.1])
@@ -57,11 +60,17 @@ def test_prediction_is_that_of_a_dense_ekf(theta):
         return out
 
     F = central_differences(f, x, angles=(2,))
-    _, G = se2.compose_jacobians(x[:3], moved(m, x))
+    # noise is that of the motion as measured, whatever the scale of the speed
+    as_measured = np.where(np.arange(len(x)) == SPEED, 0.0, x)
+
+    def moved_by(delta):
+        return se2.compose(x[:3], moved(replace(m, delta=delta), as_measured))
+
+    G = central_differences(moved_by, m.delta, angles=(2,))
     Q = np.zeros_like(P)
     Q[:3, :3] = G @ m.cov @ G.T
     Q[BIAS, BIAS] = 1e-6
-    Q[WHEELS, WHEELS] = (1.0 - 0.9**2) * np.diag([0.03, 0.05, 0.03]) ** 2
+    Q[WHEELS, WHEELS] = (1.0 - 0.9**2) * np.diag([0.03, 0.05, 0.03, 0.1]) ** 2
     state.predict(m, 1e-6, 0.9, np.array([way, turn]))
     np.testing.assert_allclose(state.x, f(x), atol=1e-12)
     np.testing.assert_allclose(state.P, F @ P @ F.T + Q, atol=1e-8)

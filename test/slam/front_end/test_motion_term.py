@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from differences import central_differences
 from made_worlds import SECOND, STEP
 
 from rlml_slam import se2
@@ -10,6 +11,7 @@ from rlml_slam.motion import STILL, compose_motion
 from rlml_slam.params import MotionNoise, Parameters, from_mapping
 from rlml_slam.slam.front_end.front_end import FrontEnd
 from rlml_slam.slam.front_end.joint_state import (
+    PIVOT,
     SPEED,
     WHEELS,
     JointState,
@@ -20,8 +22,9 @@ from rlml_slam.slam.front_end.motion_term import MotionTerm, expected_motion
 from rlml_slam.types import Motion, Observation, Reflectors
 
 NOISE = MotionNoise()
-ERRORS = (*NOISE.scale_error_sigma, NOISE.drift_sigma)
-WITHOUT_LIDAR = (*NOISE.first_scale_errors, NOISE.drift_sigma)
+OTHERS = (NOISE.drift_sigma, NOISE.pivot_sigma)
+ERRORS = (*NOISE.scale_error_sigma, *OTHERS)
+WITHOUT_LIDAR = (*NOISE.first_scale_errors, *OTHERS)
 SIGMA = np.array([0.01, 0.01, 0.001])  # of a pose that is measured
 DT = STEP / SECOND
 
@@ -40,9 +43,16 @@ def measured(rng, shares, v, w):
     return Motion(delta, cov, turn_gain=turn * by_heading, drift_gain=way * by_heading)
 
 
+def moved(shares, v, w, dt=DT):
+    """How the base moves (3,) in a step; it is ahead of the middle of the axle."""
+    ahead = np.array([shares[3], 0.0, 0.0])
+    axle = se2.exp(np.array([v, 0.0, w]) * dt)
+    return se2.compose(se2.compose(-ahead, axle), ahead)
+
+
 def varied(rng, shares, kept, sigmas=ERRORS):
     """The shares some time later."""
-    return kept * shares + np.sqrt(1.0 - kept**2) * np.array(sigmas) * rng.standard_normal(3)
+    return kept * shares + np.sqrt(1.0 - kept**2) * np.array(sigmas) * rng.standard_normal(4)
 
 
 def drive(rng, shares, steps, turning=0.6):
@@ -55,8 +65,7 @@ def drive(rng, shares, steps, turning=0.6):
     shares = np.array(shares)
     for k in range(steps):
         v, w = 1.0, turning * (-1.0) ** (k // 100)
-        true = se2.exp(np.array([v, 0.0, w]) * DT)
-        pose = se2.compose(pose, true)
+        pose = se2.compose(pose, moved(shares, v, w))
         motion = measured(rng, shares, v, w)
         before = state.pose
         state.predict(motion, 0.0, kept, expected_motion(velocity, DT, NOISE))
@@ -71,7 +80,7 @@ def drive(rng, shares, steps, turning=0.6):
 
 def test_worn_wheels_are_found_out():
     rng = np.random.default_rng(0)
-    drives = [drive(rng, (0.04, -0.05, 0.04), 800) for _ in range(8)]
+    drives = [drive(rng, (0.04, -0.05, 0.04, 0.15), 800) for _ in range(8)]
     error = np.mean([x - true for x, _, true in drives], axis=0)
     sigma = np.sqrt(np.mean([np.diag(P) for _, P, _ in drives], axis=0))
     assert (sigma < 0.5 * np.array(ERRORS)).all()
@@ -87,19 +96,19 @@ def test_shares_are_as_sure_as_they_are_said_to_be():
         x, P, true = drive(rng, rng.normal(0.0, ERRORS), 300)
         e = x - true
         nees.append(e @ np.linalg.solve(P, e))
-    # chi-square of 3 degrees of freedom: a mean of 3, the sigma of which is sqrt(6 / runs)
-    assert np.mean(nees) == pytest.approx(3.0, abs=4.0 * np.sqrt(6.0 / runs))
+    # chi-square of 4 degrees of freedom: a mean of 4, the sigma of which is sqrt(8 / runs)
+    assert np.mean(nees) == pytest.approx(4.0, abs=4.0 * np.sqrt(8.0 / runs))
 
 
 def test_noise_of_the_wheels_is_not_taken_for_a_share():
     # with the measured motion as the derivative, the share of turn comes to -0.4 here
-    x, P, _ = drive(np.random.default_rng(2), (0.0, 0.0, 0.0), 2000, turning=0.0)
+    x, P, _ = drive(np.random.default_rng(2), (0.0, 0.0, 0.0, 0.0), 2000, turning=0.0)
     assert abs(x[1]) < 0.01
     assert P[1, 1] == pytest.approx(NOISE.scale_error_sigma[1] ** 2, rel=0.02)
 
 
 def with_lidar(rng, shares, speeds, late=0.0, dt=0.2, sigma=SIGMA, new_submap=0, bridged=0):
-    """Errors (3,) of scale errors and drift and their sigmas, of a robot with a lidar.
+    """Errors (4,) of what the wheels err by and their sigmas, of a robot with a lidar.
 
     ``speeds`` (n, 2) [m/s, rad/s] are those of each second; its odometry is ``late`` [s] and errs
     by ``shares``. ``sigma`` (3,) is that of a pose, in whose direction nothing is seen where it is
@@ -118,7 +127,7 @@ def with_lidar(rng, shares, speeds, late=0.0, dt=0.2, sigma=SIGMA, new_submap=0,
     for k in range(int((len(speeds) - 2) / dt)):
         t = 1.0 + k * dt
         v, w = (until(t + dt) - until(t)) / dt
-        pose = se2.compose(pose, se2.exp(np.array([v, 0.0, w]) * dt))
+        pose = se2.compose(pose, moved(shares, v, w, dt))
         noise = np.array([NOISE.speed_noise * v, NOISE.turn_noise * abs(w)])
         noise += NOISE.speed_noise_floor, NOISE.turn_noise_floor
         noise *= np.sqrt(NOISE.noise_interval * dt)
@@ -156,7 +165,9 @@ def stop_and_go(rng, steps=200):
 def test_odometry_that_is_late_has_no_scale_error(late):
     """Taken from single steps, the error of the turn is .15 with a sigma of .015."""
     generators = [np.random.default_rng(k) for k in range(5)]
-    drives = [with_lidar(rng, (0.02, -0.05, 0.0), stop_and_go(rng), late) for rng in generators]
+    drives = [
+        with_lidar(rng, (0.02, -0.05, 0.0, 0.05), stop_and_go(rng), late) for rng in generators
+    ]
     error, sigma = (np.array(part)[:, :2] for part in zip(*drives, strict=True))
     assert (sigma < [0.012, 0.03]).all()
     assert (np.abs(error).mean(axis=0) < sigma.mean(axis=0)).all()
@@ -168,7 +179,7 @@ def test_scale_error_and_drift_of_one_curve_are_not_separated(turning):
     speeds, errors = np.tile([0.8, turning], (32, 1)), []
     for k in range(40):
         rng = np.random.default_rng(k)
-        error, sigma = with_lidar(rng, ERRORS * rng.standard_normal(3), speeds)
+        error, sigma = with_lidar(rng, ERRORS * rng.standard_normal(4), speeds)
         errors.append(error / sigma)
     assert (np.mean(np.square(errors), axis=0) < 1.6).all()  # p = .01 each
 
@@ -177,13 +188,13 @@ def test_a_new_submap_measures_no_scale_error():
     """Along a corridor without an end, the pose in a submap that begins there is sure at once."""
     sigma = np.array([np.inf, 0.01, 0.001])
     rng, speeds = np.random.default_rng(0), np.tile([0.8, 0.0], (102, 1))
-    _, found = with_lidar(rng, (0.04, 0.0, 0.0), speeds, sigma=sigma, new_submap=25)
+    _, found = with_lidar(rng, (0.04, 0.0, 0.0, 0.0), speeds, sigma=sigma, new_submap=25)
     assert found[0] > 0.95 * ERRORS[0]
 
 
 def test_a_stall_that_is_bridged_measures_no_scale_error():
     rng, speeds = np.random.default_rng(0), np.tile([0.8, 0.2], (102, 1))
-    _, found = with_lidar(rng, (0.04, 0.0, 0.0), speeds, bridged=10)
+    _, found = with_lidar(rng, (0.04, 0.0, 0.0, 0.0), speeds, bridged=10)
     np.testing.assert_allclose(found[:2], ERRORS[:2], rtol=1e-9)
 
 
@@ -206,7 +217,7 @@ def test_from_the_first_scan_on_the_wheels_err_less():
 def test_larger_errors_with_a_lidar_hold_without_one_too():
     p = from_mapping({'motion.scale_error_sigma': (0.2, 0.3)}, Parameters)
     assert p.motion.first_scale_errors == (0.2, 0.3)
-    np.testing.assert_allclose(np.sqrt(FrontEnd(p).state.wheels2), (0.2, 0.3, NOISE.drift_sigma))
+    np.testing.assert_allclose(np.sqrt(FrontEnd(p).state.wheels2), (0.2, 0.3, *OTHERS))
 
 
 def test_a_front_end_that_begins_again_has_not_seen_its_lidar():
@@ -238,7 +249,7 @@ def test_relocation_in_a_saved_map_keeps_what_is_known_of_the_wheels(turn):
     front_end.relocate(np.array([1.0, 1.0, 0.0]), 1e-2 * np.eye(3))
     for value, expected in zip(scan(2), before, strict=True):
         np.testing.assert_allclose(value, expected, rtol=0.01, atol=1e-9)
-    np.testing.assert_allclose(np.sqrt(front_end.state.wheels2), (0.03, turn, NOISE.drift_sigma))
+    np.testing.assert_allclose(np.sqrt(front_end.state.wheels2), (0.03, turn, *OTHERS))
 
 
 @pytest.mark.parametrize('sigmas', [NOISE.scale_error_sigma, (0.01, 0.02), (0.0, 0.0), (0.3, 0.4)])
@@ -249,7 +260,7 @@ def test_a_narrower_prior_is_as_if_it_had_been_there_from_the_start(sigmas):
     H, measured = rng.normal(size=(5, 2)), 0.02 * rng.normal(size=5)
     states = []
     for prior in (wide, np.minimum(wide, sigmas)):
-        state = JointState(np.zeros(3), 0.01 * np.eye(3), 0.0, wheels=(*prior, 0.03))
+        state = JointState(np.zeros(3), 0.01 * np.eye(3), 0.0, wheels=(*prior, 0.03, 0.1))
         columns = np.array([0, 1, SPEED, SPEED + 1])
         J = np.hstack([np.ones((5, 2)), H])
         state.apply(columns, J, 1e-3 * np.eye(5), measured)
@@ -259,6 +270,42 @@ def test_a_narrower_prior_is_as_if_it_had_been_there_from_the_start(sigmas):
     np.testing.assert_allclose(states[0].x, states[1].x, atol=1e-12)
     np.testing.assert_allclose(states[0].P, states[1].P, atol=1e-12)
     np.testing.assert_allclose(states[0].wheels2, states[1].wheels2)
+
+
+def test_where_the_robot_turns_moves_the_pose_as_a_linear_map():
+    """Of base, turn and heading, by central differences; the way back is of the same size."""
+    motion = Motion(np.array([0.3, 0.02, 0.7]), 1e-6 * np.eye(3))
+
+    def after(ahead, heading=0.4):
+        state = JointState(np.array([1.0, -2.0, heading]), np.diag([0.0, 0.0, 1e-4]), 0.0)
+        state.x[PIVOT], state.P[PIVOT, PIVOT] = ahead, 0.01
+        state.predict(motion, 0.0, 1.0, motion.delta[[0, 2]])
+        return state
+
+    def pose(v):
+        return after(v[0], v[1]).pose
+
+    at = np.array([0.2, 0.4])
+    expected = se2.compose(np.array([1.0, -2.0, 0.4]), se2.compose(motion.delta, [0.2, 0.0, 0.0]))
+    expected -= [0.2 * np.cos(0.4), 0.2 * np.sin(0.4), 0.0]
+    state = after(*at)
+    np.testing.assert_allclose(state.pose, expected, atol=1e-12)
+    J = central_differences(pose, at)
+    np.testing.assert_allclose(state.P[:3, PIVOT], 0.01 * J[:, 0], atol=1e-9)
+    turned = 1e-4 * np.outer(J[:, 1], J[:, 1]) + 0.01 * np.outer(J[:, 0], J[:, 0])
+    np.testing.assert_allclose(state.pose_cov, turned, atol=2e-6)
+    back = state.corrected(motion).delta
+    there = se2.between(np.array([1.0, -2.0, 0.4]), state.pose)
+    np.testing.assert_allclose(back, there, atol=1e-12)
+
+
+def test_base_that_is_not_where_the_robot_turns_is_found_while_it_turns():
+    """As is a laser that is mounted elsewhere than the robot's description says."""
+    speeds = np.tile([0.0, 0.6], (60, 1))
+    for ahead in (0.2, -0.1, 0.0):
+        rng = np.random.default_rng(1)
+        error, sigma = with_lidar(rng, (0.0, 0.0, 0.0, ahead), speeds)
+        assert abs(error[3]) < 3.0 * sigma[3] < 0.05
 
 
 def test_what_may_be_no_way_at_all_tells_nothing():
@@ -282,7 +329,7 @@ def test_way_unseen_is_as_uncertain_as_scale_errors_make_it(v, turning, steps):
         term, pose, motion = MotionTerm(Parameters()), np.zeros(3), STILL
         term.predict(state, Observation(0, STILL, odom_pose=np.zeros(3)))
         for _ in range(steps):
-            pose = se2.compose(pose, se2.exp(np.array([v, 0.0, turning]) * DT))
+            pose = se2.compose(pose, moved(shares, v, turning))
             motion = compose_motion(motion, measured(rng, shares, v, turning))
             shares = varied(rng, shares, kept, WITHOUT_LIDAR)
         term.predict(state, Observation(steps * STEP, motion, odom_pose=motion.delta))
@@ -299,7 +346,8 @@ def test_what_the_wheels_err_by_stays_tied_to_where_they_led():
     state = JointState(np.zeros(3), 1e-8 * np.eye(3), 0.0, wheels=WITHOUT_LIDAR)
     arc = Motion(np.array([2.0, 1.0, 1.5]), 1e-6 * np.eye(3), turn_gain=np.array([-0.7, 1.0, 1.5]))
     predict_unseen(state, arc, 0.0, 1.0)
-    J = np.array([[2.0, -0.7, 0.0], [1.0, 1.0, 0.0], [0.0, 1.5, 0.0]])
+    ahead = [np.cos(1.5) - 1.0, np.sin(1.5), 0.0]
+    J = np.array([[2.0, 1.0, 0.0], [-0.7, 1.0, 1.5], [0.0, 0.0, 0.0], ahead]).T
     wheels = np.diag(np.square(WITHOUT_LIDAR))
     np.testing.assert_allclose(state.P[:3, WHEELS], J @ wheels, atol=1e-9)
     np.testing.assert_allclose(state.P[:3, :3], J @ wheels @ J.T, atol=2e-6)

@@ -19,7 +19,7 @@ def made(sigma: float) -> JointState:
     """Four reflectors around a pose that is uncertain by ``sigma``, correlated with all."""
     rng = np.random.default_rng(4)
     pose = np.array([0.3, -0.5, 2.9])
-    state = JointState(pose, sigma**2 * np.eye(3), 0.01, (1.0, 1.0, 1.0), (0.03, 0.05, 0.03))
+    state = JointState(pose, sigma**2 * np.eye(3), 0.01, (1.0, 1.0, 1.0), (0.03, 0.05, 0.03, 0.1))
     for slot in range(2):
         state.clone_pose(slot, 0.5, 1e-6 * np.eye(3))
     for z in 5.0 * rng.normal(size=(4, 2)):
