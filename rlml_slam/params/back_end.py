@@ -125,7 +125,7 @@ class LoopClosure(Group):
         0.5, 'smallest half width of the search in heading', 'rad', 0.01, 3.2
     )
     max_search_window: float = param(
-        30.0,
+        20.0,
         'largest half width of the search in position, which grows with the pose uncertainty',
         'm',
         0.1,

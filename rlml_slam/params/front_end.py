@@ -44,7 +44,7 @@ class MotionNoise(Group, prefix='motion.'):
         0.03, 'turn per distance not measured, 1 sigma; 0: not modelled', 'rad/m', 0.0, 1.0
     )
     pivot_sigma: float = param(
-        0.1, 'from where the robot turns to base_frame, 1 sigma; 0: not modelled', 'm', 0.0, 10.0
+        0.05, 'of a lidar: base_frame ahead of where the robot turns, 1 sigma', 'm', 0.0, 10.0
     )
     scale_error_time: float = param(
         600.0, 'correlation time of these errors: load, floor, tyres', 's', 1.0, 1e6

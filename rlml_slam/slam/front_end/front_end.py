@@ -47,7 +47,7 @@ class FrontEnd:
     def reset(self, pose: Array, cov: Array) -> None:
         """Drop all state and start at a pose (3,) of the map with covariance (3, 3)."""
         m = self._p.motion
-        wheels = (*m.first_scale_errors, m.drift_sigma, m.pivot_sigma)
+        wheels = (*m.first_scale_errors, m.drift_sigma, 0.0)
         self.state = JointState(pose, cov, m.imu_bias_sigma, m.constant_velocity_sigma, wheels)
         self._motion, self._laser = MotionTerm(self._p), LaserCheck()
         self._reflectors = ReflectorTerm(self._p, self.state)

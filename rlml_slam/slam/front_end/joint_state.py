@@ -367,6 +367,13 @@ def narrow_scale_errors(state: JointState, sigmas: Sequence[float]) -> None:
             state.wheels2[k] = new
 
 
+def expect_pivot(state: JointState, sigma: float) -> None:
+    """Let where the robot turns be unknown by at least ``sigma`` [m] (eq. 67)."""
+    if (more := sigma**2 - state.wheels2[-1]) > 0.0:
+        state.P[PIVOT, PIVOT] += more
+        state.wheels2[-1] += more
+
+
 def predict_unseen(state: JointState, motion: Motion, walk: float, kept: float) -> None:
     """:meth:`JointState.predict` over a long way on which nothing was seen (eq. 64).
 

@@ -37,6 +37,7 @@ from rlml_slam.slam.front_end.joint_state import (
     JointState,
     begin_sweep,
     end_sweep,
+    expect_pivot,
     narrow_scale_errors,
     pivot_gain,
     predict_unseen,
@@ -55,10 +56,9 @@ WHOLE = 0.9  # share of a sweep from which on the next stamp counts as its end, 
 class MotionTerm:
     """Moves the joint state from one observation to the next; has the newest velocity.
 
-    ``stamp`` [ns] is that of the newest observation, None before the first, and ``interval`` [s]
-    the time between it and the one before. ``has_odometry``: at
-    least one observation had odometry. ``is_constant_velocity``: the last prediction was made
-    by the constant-velocity model. ``velocity`` (3,) [m/s, m/s, rad/s] is that of the base.
+    ``stamp`` [ns] is that of the newest observation, None before the first, ``interval`` [s] the
+    time since the one before. ``has_odometry``: one at least had odometry. ``is_constant_velocity``:
+    the last prediction had none. ``velocity`` (3,) [m/s, m/s, rad/s] is that of the base.
     """
 
     def __init__(self, params: Parameters) -> None:
@@ -102,6 +102,7 @@ class MotionTerm:
         last, self.stamp = self.stamp, observation.stamp
         if observation.points is not None:
             narrow_scale_errors(state, self._p.scale_error_sigma)
+            expect_pivot(state, self._p.pivot_sigma)
             self.has_lidar = True
         self.has_odometry |= observation.odom_pose is not None
         self.is_constant_velocity = not self.has_odometry and last is not None
