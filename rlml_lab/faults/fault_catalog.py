@@ -233,6 +233,48 @@ def dirt(share: float) -> Fault:
     return apply
 
 
+def _beams(messages: Messages, part: Callable[[Scan], tuple[int, int, int]]) -> Messages:
+    """Scans with the beams first, first + step, … before the end alone, as ``part`` gives them."""
+    out: Messages = []
+    for m in messages:
+        if isinstance(m, Scan):
+            first, end, step = part(m)
+            m = replace(
+                m,
+                stamp=m.stamp + round(first * m.time_increment * SECOND),
+                angle_min=m.angle_min + first * m.angle_increment,
+                angle_increment=m.angle_increment * step,
+                time_increment=m.time_increment * step,
+                ranges=m.ranges[first:end:step],
+                intensities=m.intensities[first:end:step],
+            )
+        out.append(m)
+    return out
+
+
+def view(width: float) -> Fault:
+    """The laser sees ``width`` [rad] ahead of it, no more."""
+
+    def part(scan: Scan) -> tuple[int, int, int]:
+        angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
+        seen = np.flatnonzero(np.abs(angles) <= 0.5 * width)
+        return (int(seen[0]), int(seen[-1]) + 1, 1) if len(seen) else (0, 0, 1)
+
+    return lambda messages, _: _beams(messages, part)
+
+
+def every(step: int) -> Fault:
+    """The laser has the beams 0, ``step``, … alone."""
+    return lambda messages, _: _beams(messages, lambda scan: (0, len(scan.ranges), step))
+
+
+def reach(most: float) -> Fault:
+    """What is more than ``most`` [m] away has no return."""
+    return lambda messages, _: _scans(
+        messages, lambda scan: np.where(scan.ranges <= most, scan.ranges, np.inf)
+    )
+
+
 def blocked(width: float, distance: float) -> Fault:
     """Something sticks to the robot: a sector of ``width`` [rad] sees it at ``distance`` [m]."""
 
@@ -356,6 +398,10 @@ FAULTS: Mapping[str, Fault] = {
     'frozen scans for 3 s': frozen(3.0),
     **{f'{100 * s:g} % of the beams lost': dirt(s) for s in (0.1, 0.3, 0.6)},
     'sector of 60° blocked': blocked(math.radians(60.0), 0.4),
+    **{f'view of {d}°': view(math.radians(d)) for d in (120, 90)},
+    'every second beam': every(2),
+    'every fourth beam': every(4),
+    'reach of 4 m': reach(4.0),
     'three people walk along': people(3),
     'range +5 cm': bias(0.05, 1.0),
     'range +1 %': bias(0.0, 1.01),

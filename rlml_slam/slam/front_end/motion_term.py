@@ -57,8 +57,8 @@ class MotionTerm:
     """Moves the joint state from one observation to the next; has the newest velocity.
 
     ``stamp`` [ns] is that of the newest observation, None before the first, ``interval`` [s] the
-    time since the one before. ``has_odometry``: one at least had odometry. ``is_constant_velocity``:
-    the last prediction had none. ``velocity`` (3,) [m/s, m/s, rad/s] is that of the base.
+    time since the one before. ``has_odometry``: one had odometry. ``is_constant_velocity``: the
+    last prediction had none. ``velocity`` (3,) [m/s, m/s, rad/s] is that of the base.
     """
 
     def __init__(self, params: Parameters) -> None:
