@@ -233,45 +233,40 @@ def dirt(share: float) -> Fault:
     return apply
 
 
-def _beams(messages: Messages, part: Callable[[Scan], tuple[int, int, int]]) -> Messages:
-    """Scans with the beams first, first + step, … before the end alone, as ``part`` gives them."""
-    out: Messages = []
-    for m in messages:
-        if isinstance(m, Scan):
-            first, end, step = part(m)
-            m = replace(
-                m,
-                stamp=m.stamp + round(first * m.time_increment * SECOND),
-                angle_min=m.angle_min + first * m.angle_increment,
-                angle_increment=m.angle_increment * step,
-                time_increment=m.time_increment * step,
-                ranges=m.ranges[first:end:step],
-                intensities=m.intensities[first:end:step],
-            )
-        out.append(m)
-    return out
-
-
 def view(width: float) -> Fault:
-    """The laser sees ``width`` [rad] ahead of it, no more."""
+    """The laser sees ``width`` [rad] ahead of it; all other beams have no return."""
 
-    def part(scan: Scan) -> tuple[int, int, int]:
+    def changed(scan: Scan) -> NDArray[Any]:
         angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
-        seen = np.flatnonzero(np.abs(angles) <= 0.5 * width)
-        return (int(seen[0]), int(seen[-1]) + 1, 1) if len(seen) else (0, 0, 1)
+        return np.where(np.abs(se2.wrap(angles)) <= 0.5 * width, scan.ranges, np.nan)
 
-    return lambda messages, _: _beams(messages, part)
+    return lambda messages, _: _scans(messages, changed)
 
 
 def every(step: int) -> Fault:
     """The laser has the beams 0, ``step``, … alone."""
-    return lambda messages, _: _beams(messages, lambda scan: (0, len(scan.ranges), step))
+
+    def apply(messages: Messages, _: np.random.Generator) -> Messages:
+        return [
+            replace(
+                m,
+                angle_increment=m.angle_increment * step,
+                time_increment=m.time_increment * step,
+                ranges=m.ranges[::step],
+                intensities=m.intensities[::step],
+            )
+            if isinstance(m, Scan)
+            else m
+            for m in messages
+        ]
+
+    return apply
 
 
 def reach(most: float) -> Fault:
     """What is more than ``most`` [m] away has no return."""
     return lambda messages, _: _scans(
-        messages, lambda scan: np.where(scan.ranges <= most, scan.ranges, np.inf)
+        messages, lambda scan: np.where(scan.ranges > most, np.inf, scan.ranges)
     )
 
 

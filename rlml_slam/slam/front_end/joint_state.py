@@ -129,15 +129,15 @@ class JointState:
             motion.drift_gain, went, walk, kept, self.wheels2,
         )  # fmt: skip
 
-    def corrected(self, motion: Motion) -> Motion:
+    def corrected(self, m: Motion) -> Motion:
         """A motion as it is by what is known now of how wheels and gyro err."""
         bias, speed, turn, drift, ahead = self.x[SYSTEMATIC].tolist()
-        delta = motion.delta + bias * motion.bias_gain + turn * motion.turn_gain
-        delta += drift * motion.drift_gain
+        delta = m.delta + bias * m.bias_gain + turn * m.turn_gain + drift * m.drift_gain
         delta[:2] *= 1.0 + speed
-        delta += ahead * pivot_gain(delta[2])
+        if m.turn_gain.any() or m.bias_gain.any():  # wheels or a gyro measured the turn
+            delta += ahead * pivot_gain(delta[2])
         delta[2] = se2.wrapped(delta[2])
-        return Motion(delta, motion.cov, motion.known)
+        return Motion(delta, m.cov, m.known)
 
     def place(self, pose: Array, cov: Array) -> None:
         """Put the pose (3,) elsewhere, with an error of covariance (3, 3) of its own."""
@@ -306,9 +306,11 @@ def predict(
     faster = 1.0 + x[SPEED]
     D = np.zeros((3, 6))  # by the heading, bias, shares of speed and turn, drift, pivot
     gx, gy = faster * (c * moved[0] - s * moved[1]), faster * (s * moved[0] + c * moved[1])
-    # about the point where it turns, and by an error of the turn
-    px, py = -x[PIVOT] * math.sin(x[2] + moved[2]), x[PIVOT] * math.cos(x[2] + moved[2])
-    ax, ay = py - x[PIVOT] * c, -px - x[PIVOT] * s
+    # about the point where it turns, and by an error of the turn; what nobody measured is a motion
+    # of the base itself
+    ahead = x[PIVOT] if turn_gain.any() or bias_gain.any() else 0.0
+    px, py = -ahead * math.sin(x[2] + moved[2]), ahead * math.cos(x[2] + moved[2])
+    ax, ay = py - ahead * c, -px - ahead * s
     D[0, 0], D[1, 0] = -gy - ay, gx + ax
     D[0, 1] = faster * (c * bias_gain[0] - s * bias_gain[1]) + px * bias_gain[2]
     D[1, 1] = faster * (s * bias_gain[0] + c * bias_gain[1]) + py * bias_gain[2]
@@ -316,8 +318,9 @@ def predict(
     # on an arc, a share of the way is along its chord, and one of the turn turns that by half
     middle = x[2] + 0.5 * moved[2]
     D[0, 2], D[1, 2] = math.cos(middle) * went[0], math.sin(middle) * went[0]
-    chord = 2.0 * math.sin(0.5 * went[1])
-    D[0, 5], D[1, 5] = -math.sin(middle) * chord, math.cos(middle) * chord
+    if turn_gain.any() or bias_gain.any():
+        chord = 2.0 * math.sin(0.5 * went[1])
+        D[0, 5], D[1, 5] = -math.sin(middle) * chord, math.cos(middle) * chord
     if turn_gain.any():
         D[0, 3], D[1, 3], D[2, 3] = (px - 0.5 * gy) * went[1], (py + 0.5 * gx) * went[1], went[1]
     if drift_gain.any():
@@ -385,12 +388,12 @@ def predict_unseen(state: JointState, motion: Motion, walk: float, kept: float) 
     state.P[:, WHEELS] *= kept
     state.P[WHEELS, WHEELS] += np.diag((1.0 - kept**2) * state.wheels2)
     speed = np.array([*motion.delta[:2], 0.0])
-    pivot = pivot_gain(motion.delta[2])
-    J = np.stack([speed, motion.turn_gain, motion.drift_gain, pivot], axis=-1)
+    J = np.stack([speed, motion.turn_gain, motion.drift_gain], axis=-1)
     J = se2.rotation3(state.x[2]) @ J
     state.predict(motion, walk)
-    state.P[:3, :] += J @ state.P[WHEELS, :]
-    state.P[:, :3] += state.P[:, WHEELS] @ J.T
+    rows = slice(SPEED, DRIFT + 1)  # where the robot turns is not modelled without a lidar
+    state.P[:3, :] += J @ state.P[rows, :]
+    state.P[:, :3] += state.P[:, rows] @ J.T
 
 
 def begin_sweep(state: JointState, cov: Array) -> None:

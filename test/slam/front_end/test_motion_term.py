@@ -27,6 +27,7 @@ ERRORS = (*NOISE.scale_error_sigma, *OTHERS)
 WITHOUT_LIDAR = (*NOISE.first_scale_errors, NOISE.drift_sigma, 0.0)
 SIGMA = np.array([0.01, 0.01, 0.001])  # of a pose that is measured
 DT = STEP / SECOND
+SCAN = np.array([[1.0, 0.0], [-1.0, 0.0]])  # points all around
 
 
 def measured(rng, shares, v, w):
@@ -139,9 +140,7 @@ def with_lidar(rng, shares, speeds, late=0.0, dt=0.2, sigma=SIGMA, new_submap=0,
         cov = np.diag([noise[0], 0.01, 0.0]) ** 2
         cov += noise[1] ** 2 * np.outer(by_heading, by_heading)
         motion = Motion(delta, cov, turn_gain=turn * by_heading, drift_gain=way * by_heading)
-        o = Observation(
-            int(k * dt * SECOND), motion, np.eye(2), np.zeros(2), odom_pose=np.zeros(3)
-        )
+        o = Observation(int(k * dt * SECOND), motion, SCAN, np.zeros(2), odom_pose=np.zeros(3))
         o = term.likeliest(o, lambda _: None)
         if bridged and k % bridged == 0:
             o = replace(o, motion=replace(o.motion, delta=delta.copy()))
@@ -206,8 +205,7 @@ def test_from_the_first_scan_on_the_wheels_err_less():
     term.predict(state, Observation(0, standing, odom_pose=np.zeros(3)))
     np.testing.assert_allclose(np.sqrt(np.diag(state.P)[WHEELS]), WITHOUT_LIDAR)
 
-    scan = np.array([[1.0, 0.0], [0.0, 1.0]])
-    term.predict(state, Observation(STEP, standing, scan, np.zeros(2), odom_pose=np.zeros(3)))
+    term.predict(state, Observation(STEP, standing, SCAN, np.zeros(2), odom_pose=np.zeros(3)))
     np.testing.assert_allclose(np.sqrt(np.diag(state.P)[WHEELS]), ERRORS)
     for k in range(2, 100):  # as wide as it becomes
         term.predict(state, Observation(k * 60 * SECOND, standing, odom_pose=np.zeros(3)))
@@ -223,7 +221,7 @@ def test_larger_errors_with_a_lidar_hold_without_one_too():
 def test_a_front_end_that_begins_again_has_not_seen_its_lidar():
     front_end = FrontEnd(Parameters())
     np.testing.assert_allclose(np.sqrt(front_end.state.wheels2), WITHOUT_LIDAR)
-    front_end.process(Observation(0, STILL, np.eye(2), np.zeros(2), odom_pose=np.zeros(3)))
+    front_end.process(Observation(0, STILL, SCAN, np.zeros(2), odom_pose=np.zeros(3)))
     np.testing.assert_allclose(np.sqrt(front_end.state.wheels2), ERRORS)
     front_end.reset(np.zeros(3), np.zeros((3, 3)))
     np.testing.assert_allclose(np.sqrt(front_end.state.wheels2), WITHOUT_LIDAR)
@@ -239,7 +237,7 @@ def test_relocation_in_a_saved_map_keeps_what_is_known_of_the_wheels(turn):
     front_end.use_map(Reflectors(seen, np.array([[3.0, 1.0]]), cov, seen, seen, np.zeros(1)))
 
     def scan(k):
-        still = Observation(k * STEP, STILL, np.eye(2), np.zeros(2), odom_pose=np.zeros(3))
+        still = Observation(k * STEP, STILL, SCAN, np.zeros(2), odom_pose=np.zeros(3))
         front_end.process(still)
         return front_end.state.x[WHEELS].copy(), front_end.state.P[WHEELS, WHEELS].copy()
 
@@ -274,7 +272,8 @@ def test_a_narrower_prior_is_as_if_it_had_been_there_from_the_start(sigmas):
 
 def test_where_the_robot_turns_moves_the_pose_as_a_linear_map():
     """Of base, turn and heading, by central differences; the way back is of the same size."""
-    motion = Motion(np.array([0.3, 0.02, 0.7]), 1e-6 * np.eye(3))
+    measured = np.array([0.0, 0.0, 0.7])
+    motion = Motion(np.array([0.3, 0.02, 0.7]), 1e-6 * np.eye(3), turn_gain=measured)
 
     def after(ahead, heading=0.4):
         state = JointState(np.array([1.0, -2.0, heading]), np.diag([0.0, 0.0, 1e-4]), 0.0)
@@ -297,6 +296,29 @@ def test_where_the_robot_turns_moves_the_pose_as_a_linear_map():
     back = state.corrected(motion).delta
     there = se2.between(np.array([1.0, -2.0, 0.4]), state.pose)
     np.testing.assert_allclose(back, there, atol=1e-12)
+
+
+def test_motion_that_nobody_measured_is_that_of_the_base_itself():
+    """As it goes on, or by what scans have shown: no gain says that wheels or a gyro turned."""
+    state = JointState(np.zeros(3), np.zeros((3, 3)), 0.0)
+    state.x[PIVOT], state.P[PIVOT, PIVOT] = 0.2, 0.01
+    motion = Motion(np.array([0.0, 0.02, 0.1]), 1e-6 * np.eye(3), known=False)
+    np.testing.assert_allclose(state.corrected(motion).delta, motion.delta, atol=1e-15)
+    state.predict(motion, 0.0, 1.0, motion.delta[[0, 2]])
+    np.testing.assert_allclose(state.pose, motion.delta, atol=1e-15)
+    assert not state.P[:3, PIVOT].any()
+
+
+@pytest.mark.parametrize(('view', 'is_wide'), [(90.0, False), (110.0, False), (120.0, True)])
+@pytest.mark.parametrize('ahead', [0.0, 3.1])
+def test_where_the_robot_turns_is_modelled_for_a_wide_view(view, is_wide, ahead):
+    front_end = FrontEnd(Parameters())
+    angles = ahead + np.radians(np.linspace(-0.5 * view, 0.5 * view, 90))
+    points = [0.3, 0.1] + 4.0 * np.stack([np.cos(angles), np.sin(angles)], -1)
+    o = Observation(0, STILL, points, np.array([0.3, 0.1]), odom_pose=np.zeros(3))
+    front_end.process(o)
+    sigma = NOISE.pivot_sigma if is_wide else 0.0
+    assert front_end.state.P[PIVOT, PIVOT] == pytest.approx(sigma**2)
 
 
 def test_base_that_is_not_where_the_robot_turns_is_found_while_it_turns():
@@ -362,6 +384,6 @@ def test_a_robot_with_a_lidar_has_it_after_a_relocation_in_a_saved_map():
     cov = 1e-4 * np.eye(2)[None]
     saved = Reflectors(seen, np.array([[3.0, 1.0]]), cov, seen, seen, np.zeros(1))
     front_end.use_map(saved)
-    front_end.process(Observation(0, STILL, np.eye(2), np.zeros(2), odom_pose=np.zeros(3)))
+    front_end.process(Observation(0, STILL, SCAN, np.zeros(2), odom_pose=np.zeros(3)))
     front_end.relocate(np.array([1.0, 1.0, 0.0]), 1e-2 * np.eye(3))
     assert front_end._motion.has_lidar
