@@ -104,7 +104,7 @@ class MotionTerm:
         last, self.stamp = self.stamp, observation.stamp
         if observation.points is not None:
             narrow_scale_errors(state, self._p.scale_error_sigma)
-            if sees_widely(observation):
+            if state.wheels2[-1] < self._p.pivot_sigma**2 and sees_widely(observation):
                 expect_pivot(state, self._p.pivot_sigma)
             self.has_lidar = True
         self.has_odometry |= observation.odom_pose is not None
