@@ -3,8 +3,8 @@
 
 After each kill of the back end its journal must give a map, which may end at most 10 s before the
 kill, and which the next back end must recover; the front end must go on with poses while there is
-no back end. After each kill of the front end, the back end must have kept the map until then. A
-map so young that it is in no file yet is lost as a whole, which counts as well.
+no back end. After each kill of the front end, the back end must go on with the map, or have put it
+aside in a file. A map so young that it is in no file yet is lost as a whole, which counts as well.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.store import journal, map_file
 
 START = 600.0  # [s] for a process to start, kernels to be compiled included
-KEPT = 5.0  # [s] in which the back end writes the map until a restart of the front end
+KEPT = 10.0  # [s] in which keyframes follow a restart of the front end, or the map is aside
 LOST, RATE = 10.0, 9.0  # [s] of mapping that a kill may cost; [Hz] of poses without a back end
 WHOM = {
     'back_end': ('back_end',), 'front_end': ('front_end',), 'both': ('front_end', 'back_end'),
@@ -50,6 +50,7 @@ class Killed:
     kills: Counter[str] = field(default_factory=Counter)
     readable: Counter[str] = field(default_factory=Counter)
     young: Counter[str] = field(default_factory=Counter)  # maps that no file had yet
+    went_on: int = 0  # maps that went on after a restart of the front end
     unreadable: list[str] = field(default_factory=list)
     lost: dict[str, list[float]] = field(default_factory=lambda: {w: [] for w in WHOM})  # [s]
     rates: list[float] = field(default_factory=list)  # [Hz] of stamps
@@ -124,6 +125,8 @@ def report(of: Killed) -> int:
         print(f'  {whom}: {of.readable[whom]} of {n - of.young[whom]} maps readable, '
               f'{of.young[whom]} too young for a file; lost mapping: '
               f'median {np.median(lost):.1f} s, worst {max(lost):.1f} s')  # fmt: skip
+    if n := of.kills['front_end']:
+        print(f'  maps that went on after a restart of the front end: {of.went_on} of {n}')
     print(*of.unreadable, sep='\n')
     if of.bytes_per_second:
         per_hour = np.median(of.bytes_per_second) * 3600 / 1e6
@@ -182,8 +185,9 @@ class _Drive:
             self._start(name)
         self._until(lambda: len(self._ear.stamps) > count + 20, 'no pose came')
         if whom == 'front_end':
-            self._read_kept(whom, newest)
-        self._began = self._ear.stamps[count]
+            self._read_kept(newest)
+        else:
+            self._began = self._ear.stamps[count]
         if 'back_end' in names:
             self._until(lambda: not any(f.exists() for f in self._left), 'no map was recovered')
             self._read_recovered()
@@ -200,8 +204,7 @@ class _Drive:
             try:
                 back_end, params = journal.recover(path)
                 map_file.content_of(back_end, params, back_end.occupancy_grid())
-                pieces = [*map_container.read_pieces(path)][1:]
-                stamps = [int(p.arrays['frames']['stamp'][k]) for p in pieces for k in (0, -1)]
+                stamps = _stamps(path)
             except (RlmlError, LookupError) as e:
                 self._killed.unreadable.append(f'{path.name}: {e}')
                 continue
@@ -210,23 +213,31 @@ class _Drive:
             self._killed.bytes_per_second.append(path.stat().st_size / driven)
         self._left |= set(journals)
 
-    def _read_kept(self, whom: str, newest: int) -> None:
-        """The map until a restart of the front end; one of less than ten keyframes is not kept."""
+    def _read_kept(self, newest: int) -> None:
+        """The map after a restart of the front end alone: the back end's own, or one put aside."""
         end = time.monotonic() + KEPT
-        while not (kept := [*self._maps.glob('map.lost-*.rlml')]) and time.monotonic() < end:
+        while not (aside := [*self._maps.glob('map.lost-*.rlml')]) and time.monotonic() < end:
+            if any(stamp > newest for path in self._journals() for stamp in _stamps(path)):
+                break
             self._spin(0.1)
-        if not kept:
-            self._killed.add_young(whom, (newest - self._began) / SECOND)
-            return
-        last = 0
         try:
-            for path in kept:
-                last = max(last, _last_stamp(path))
-                path.unlink()
+            kept = [_last_stamp(path) for path in aside]
         except (RlmlError, LookupError) as e:
-            self._killed.unreadable.append(f'{path.name}: {e}')
+            self._killed.unreadable.append(f'a map put aside: {e}')
             return
-        self._killed.add(whom, (newest - last) / SECOND)
+        for path in aside:
+            path.unlink()
+        now = [stamp for path in self._journals() for stamp in _stamps(path)]
+        kept += [stamp for stamp in now if stamp <= newest]
+        if not kept:
+            self._killed.add_young('front_end', (newest - self._began) / SECOND)
+        else:
+            self._killed.add('front_end', (newest - max(kept)) / SECOND)
+        later = [stamp for stamp in now if stamp > newest]
+        if aside or not kept:
+            self._began = min(later, default=newest)
+        elif later:
+            self._killed.went_on += 1
 
     def _read_recovered(self) -> None:
         """The maps that the next back end has made of the journals."""
@@ -255,6 +266,12 @@ class _Drive:
                 raise RlmlError(otherwise)
             self._spin(0.2)
             self._nodes.check()
+
+
+def _stamps(path: Path) -> list[int]:
+    """Stamps of the frames in a journal."""
+    pieces = [p for p in map_container.read_pieces(path) if 'frames' in p.arrays]
+    return [int(stamp) for p in pieces for stamp in p.arrays['frames']['stamp']]
 
 
 def _last_stamp(path: Path) -> int:
