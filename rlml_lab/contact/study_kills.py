@@ -27,7 +27,7 @@ from rclpy.qos import QoSProfile
 from rlml_lab.contact.forked_nodes import ForkedNodes
 from rlml_slam.cli.support.live_session import node, own_domain
 from rlml_slam.cli.support.processes import Processes, free_domain
-from rlml_slam.errors import RlmlError
+from rlml_slam.errors import MapError, RlmlError
 from rlml_slam.maps import map_container
 from rlml_slam.params import Simulator
 from rlml_slam.ros.codecs import decode
@@ -217,7 +217,7 @@ class _Drive:
         """The map after a restart of the front end alone: the back end's own, or one put aside."""
         end = time.monotonic() + KEPT
         while not (aside := [*self._maps.glob('map.lost-*.rlml')]) and time.monotonic() < end:
-            if any(stamp > newest for path in self._journals() for stamp in _stamps(path)):
+            if any(stamp > newest for stamp in self._running_stamps()):
                 break
             self._spin(0.1)
         try:
@@ -227,7 +227,7 @@ class _Drive:
             return
         for path in aside:
             path.unlink()
-        now = [stamp for path in self._journals() for stamp in _stamps(path)]
+        now = self._running_stamps()
         kept += [stamp for stamp in now if stamp <= newest]
         if not kept:
             self._killed.add_young('front_end', (newest - self._began) / SECOND)
@@ -238,6 +238,13 @@ class _Drive:
             self._began = min(later, default=newest)
         elif later:
             self._killed.went_on += 1
+
+    def _running_stamps(self) -> list[int]:
+        """Stamps in the journal of the back end that runs; it may end one meanwhile."""
+        try:
+            return [stamp for path in self._journals() for stamp in _stamps(path)]
+        except (OSError, MapError):
+            return []
 
     def _read_recovered(self) -> None:
         """The maps that the next back end has made of the journals."""
