@@ -7,7 +7,15 @@ from made_rooms import ROOM, scan
 
 from rlml_slam import params
 from rlml_slam.errors import InputError
-from rlml_slam.matching.scans.submap import P_MAX, P_MIN, STEP, Submap, probability_of, value_of
+from rlml_slam.matching.scans.submap import (
+    FREE,
+    P_MAX,
+    P_MIN,
+    STEP,
+    Submap,
+    probability_of,
+    value_of,
+)
 from rlml_slam.matching.scans.surfaces import fill
 
 P = params.Submap(resolution=0.1, p_hit=0.7, p_miss=0.4)
@@ -25,6 +33,11 @@ def odds(p: float) -> float:
     return p / (1.0 - p)
 
 
+def never_hit(p: float) -> float:
+    """What a cell reads that was only missed (eq. 68)."""
+    return P_MIN + (FREE - P_MIN) / (0.5 - P_MIN) * (p - P_MIN)
+
+
 def test_value_and_probability_are_inverse_and_clamped():
     p = np.array([0.0, P_MIN, 0.3, 0.7, P_MAX, 1.0])
     back = probability_of(value_of(p))
@@ -37,7 +50,7 @@ def test_ray_misses_up_to_the_cell_before_the_hit_and_nothing_else_is_known():
     submap = Submap(P)
     submap.insert(np.array([[1.05, 0.05]]), ORIGIN)
     for x in np.arange(0.05, 0.9, 0.1):
-        assert at(submap, x, 0.05) == pytest.approx(P.p_miss, abs=STEP)
+        assert at(submap, x, 0.05) == pytest.approx(never_hit(P.p_miss), abs=STEP)
     assert np.isnan(at(submap, 0.95, 0.05))
     assert at(submap, 1.05, 0.05) == pytest.approx(P.p_hit, abs=STEP)
     assert int(np.isfinite(submap.probability()).sum()) == 10
@@ -64,7 +77,35 @@ def test_hits_and_misses_multiply_the_odds():
     expected = odds(P.p_hit) ** 2 / (1.0 + odds(P.p_hit) ** 2)
     assert at(submap, 1.05, 0.05) == pytest.approx(expected, abs=2 * STEP)
     expected = odds(P.p_miss) ** 2 / (1.0 + odds(P.p_miss) ** 2)
-    assert at(submap, 0.55, 0.05) == pytest.approx(expected, abs=2 * STEP)
+    assert at(submap, 0.55, 0.05) == pytest.approx(never_hit(expected), abs=2 * STEP)
+
+
+@pytest.mark.parametrize('misses', [0, 1, 3])
+def test_hit_after_misses_only_multiplies_the_odds_of_what_the_misses_left(misses):
+    submap, away = Submap(P), np.array([[3.05, 0.05]])
+    for _ in range(misses):
+        submap.insert(away, ORIGIN)
+    submap.insert(np.array([[1.05, 0.05]]), ORIGIN)
+    expected = odds(P.p_miss) ** misses * odds(P.p_hit)
+    # the scale of cells that were never hit has steps that are twenty times as long
+    assert odds(at(submap, 1.05, 0.05)) == pytest.approx(expected, rel=0.01)
+
+
+def test_cell_that_was_hit_loses_its_odds_miss_by_miss_and_is_free_in_the_end():
+    submap, away = Submap(P), np.array([[3.05, 0.05]])
+    submap.insert(np.array([[1.05, 0.05]]), ORIGIN)
+    expected, before = odds(P.p_hit), P.p_hit
+    for _ in range(12):
+        submap.insert(away, ORIGIN)
+        expected *= odds(P.p_miss)
+        now = at(submap, 1.05, 0.05)
+        assert now < before or now == pytest.approx(P_MIN, abs=STEP)
+        if expected > 1.01 * odds(FREE):
+            assert odds(now) == pytest.approx(expected, rel=0.01)
+        else:
+            assert now <= 1.01 * FREE
+        before = now
+    assert now == pytest.approx(P_MIN, abs=STEP)
 
 
 def test_probability_stays_between_its_bounds():
@@ -81,7 +122,7 @@ def test_cell_counts_once_per_insertion_and_hits_win():
     fan = [[3.05, 0.05 + 1e-3 * k] for k in range(10)]
     submap.insert(np.array([*fan, [1.05, 0.05], [1.06, 0.05], [1.04, 0.05]]), ORIGIN)
     assert at(submap, 1.05, 0.05) == pytest.approx(P.p_hit, abs=STEP)
-    assert at(submap, 0.55, 0.05) == pytest.approx(P.p_miss, abs=STEP)
+    assert at(submap, 0.55, 0.05) == pytest.approx(never_hit(P.p_miss), abs=STEP)
 
 
 def test_growing_grid_changes_none_of_its_cells():

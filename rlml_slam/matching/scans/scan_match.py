@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from rlml_slam import params
 from rlml_slam.compiled import brief, kernel, part
 from rlml_slam.matching.scans import correlative_search, surfaces
-from rlml_slam.matching.scans.submap import P_MIN, STEP, Submap
+from rlml_slam.matching.scans.submap import FREE, NEVER_HIT, P_MIN, STEP, Submap, value_of
 from rlml_slam.se2 import Array, wrapped
 
 WIDE_STRIDE = 2  # cells between the shifts of the wide search; a wall is about as thick
 UNKNOWN = P_MIN  # M of an unknown cell; like free space, so a wall is a ridge from both sides
+FREE_VALUE = int(value_of(FREE))
 INLIER = 0.5  # M from which an end point counts as explained
 ROBUST = 0.6  # e at which the Geman-McClure weight has fallen to a quarter
 
@@ -32,7 +33,8 @@ class ScanTerm:
 
     ``gradient`` (3,) = J^T W e; ``hessian`` (3, 3) = J^T W J plus the curvature of M where it is
     downward (on the ridge of a wall), so the step is -H^-1 g; ``cost`` is half the weighted sum
-    of squares. ``score`` is the mean of M over all end points (0..1), ``inliers`` the number of
+    of squares. ``score`` is the mean of M over all end points (0..1), which a cell that was missed
+    once or twice does not contradict: its probability counts there. ``inliers`` is the number of
     end points with M > INLIER, ``count`` all of them.
     """
 
@@ -136,6 +138,16 @@ def known(value: int) -> float:
     return float(max(int(value), 1))
 
 
+@part
+def doubt(values: NDArray[np.uint16], column: float, row: float) -> float:
+    """Probability of the cell of an end point if it was only missed, else 0."""
+    j, i = int(np.floor(column)), int(np.floor(row))
+    if j < 0 or i < 0 or j >= values.shape[1] or i >= values.shape[0]:
+        return 0.0
+    value = int(values[i, j])
+    return P_MIN + NEVER_HIT * STEP * (value - 1) if 0 < value <= FREE_VALUE else 0.0
+
+
 @kernel
 def accumulate(
     values: NDArray[np.uint16],
@@ -159,9 +171,8 @@ def accumulate(
     for k in range(len(points)):
         px, py = points[k, 0], points[k, 1]
         rx, ry = c * px - s * py, s * px + c * py
-        m, m_u, m_v, m_uu, m_uv, m_vv = sample_curved(
-            values, (x + rx) * scale - corner_j, (y + ry) * scale - corner_i
-        )
+        column, row = (x + rx) * scale - corner_j, (y + ry) * scale - corner_i
+        m, m_u, m_v, m_uu, m_uv, m_vv = sample_curved(values, column, row)
         e = 1.0 - m
         # Geman-McClure: rho = e^2 / (1 + e^2/k^2), weight = (1 + e^2/k^2)^-2
         q = 1.0 / (1.0 + e * e / k2)
@@ -192,7 +203,7 @@ def accumulate(
         out[7] += h_yy
         out[8] += h_yt
         out[9] += -ry * h_xt + rx * h_yt
-        out[10] += m
+        out[10] += max(m, doubt(values, column, row))
         out[11] += m > INLIER
 
 

@@ -3,7 +3,8 @@
 
 A cell holds a uint16: 0 where nothing is known, else 1..LEVELS, linear in the occupancy
 probability P_MIN..P_MAX. A hit (miss) multiplies the odds by those of p_hit (p_miss), which is
-one table look-up per cell. The lattice is fixed: cell (i, j) covers x in
+one table look-up per cell. A cell that was only missed reads as free from the first miss on
+(eq. 68). The lattice is fixed: cell (i, j) covers x in
 [j, j + 1) * resolution and y in [i, i + 1) * resolution of the submap frame, so a grid that grows
 changes none of its cells.
 """
@@ -27,6 +28,8 @@ P_MIN, P_MAX = 0.1, 0.97
 LEVELS = 32767
 STEP = (P_MAX - P_MIN) / (LEVELS - 1)
 MARGIN = 64  # cells of slack when a grid grows, and of free border that kernels may read
+FREE = 0.12  # up to which a cell reads that was only missed
+NEVER_HIT = (0.5 - P_MIN) / (FREE - P_MIN)  # its probability above P_MIN, by what it reads
 BORDER = 4
 EMPTY = np.zeros(0, dtype=np.int32)
 FIRST_LIST = 4096
@@ -46,10 +49,22 @@ def probability_of(values: NDArray[np.uint16]) -> NDArray[np.float32]:
 
 @lru_cache(maxsize=8)
 def update_table(p_update: float) -> NDArray[np.uint16]:
-    """New value (LEVELS + 1,) of every value after one observation of probability p_update."""
+    """New value (LEVELS + 1,) of every value after one observation of probability p_update.
+
+    Cells that were only missed read P_MIN to FREE, and have P_MIN to 0.5 (eq. 68): beams cross the
+    near side of a wall alone, and where its cells read more than the unknown ones behind it, the
+    wall is drawn towards the robot. The less is seen of a wall, the more; one that sees a single
+    wall, or a short part of two, would turn by tenths of a degree per metre.
+    """
     p = P_MIN + np.arange(LEVELS) * STEP
+    never_hit = p <= FREE
+    p = np.where(never_hit, P_MIN + NEVER_HIT * (p - P_MIN), p)
     odds = p / (1.0 - p) * (p_update / (1.0 - p_update))
-    return np.concatenate([value_of(np.array([p_update])), value_of(odds / (1.0 + odds))])
+    after = np.append(p_update, odds / (1.0 + odds))
+    if p_update < 0.5:
+        free = np.append(True, never_hit | (after[1:] <= FREE))
+        after = np.where(free, P_MIN + (after.clip(P_MIN) - P_MIN) / NEVER_HIT, after)
+    return value_of(after)
 
 
 class Submap:
