@@ -19,23 +19,44 @@ FEW = 2  # this many reflectors may match, or not match, by chance
 MIN_SHARE = 1.0 / 3.0  # of the detections that have to match; up to half of them are ghosts
 
 
-class KidnappingDetection:
-    """Checks every frame; ``since`` is the stamp [ns] of the first contradiction, None if none.
+class UsualScore:
+    """Running mean ``mean`` of scores; ``is_settled`` once there were a few."""
 
-    ``usual`` is the running mean of the scores of matched scans.
-    """
+    def __init__(self) -> None:
+        self.mean = 0.0
+        self._number = 0
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether a low score counts."""
+        return self._number >= SETTLED
+
+    def learn(self, score: float) -> None:
+        """Add a score."""
+        self._number += 1
+        weight = max(MEMORY, 1.0 / self._number)
+        self.mean += weight * (score - self.mean)
+
+
+class KidnappingDetection:
+    """Checks every frame; ``since`` is the stamp [ns] of the first contradiction, None if none."""
 
     def __init__(self, limits: HealthLimits) -> None:
         self._limits = limits
-        self.usual = 0.0
-        self._num_scores = 0
+        self._scores = UsualScore()
         self._last_match = -(2**62)  # stamp of the last frame whose reflectors agreed
+        self._replaced = False  # in the last frame, the known reflectors by others
         self._checked = 0  # stamp of the last frame that said anything
         self.since: int | None = None
 
+    @property
+    def usual(self) -> float:
+        """Running mean of the scores of matched scans."""
+        return self._scores.mean
+
     def is_misfit(self, score: float, insertions: int) -> bool:
         """Whether a scan fits a submap of so many scans far worse than usual."""
-        if self._num_scores < SETTLED or insertions < SETTLED:
+        if not self._scores.is_settled or insertions < SETTLED:
             return False
         return score < self._limits.contradiction_ratio * self.usual
 
@@ -58,8 +79,10 @@ class KidnappingDetection:
         if agree:
             self._last_match = stamp
         expected = surveyed or self.since is not None or stamp - self._last_match < RECENT * 1e9
-        replaced = detections > FEW and not agree and expected
-        contradicted = (misfit and not agree) or (replaced and not scan_is_complete)
+        # some of those that replaced the known ones may leave the view
+        many = detections > FEW or (self._replaced and detections > matched == 0)
+        self._replaced = many and not agree and expected and not scan_is_complete
+        contradicted = self._replaced or (misfit and not agree)
         if not contradicted:
             self.since = None
         elif self.since is None:
@@ -77,9 +100,7 @@ class KidnappingDetection:
 
     def learn(self, score: float) -> None:
         """Add the score of a matched scan to the usual score."""
-        self._num_scores += 1
-        weight = max(MEMORY, 1.0 / self._num_scores)
-        self.usual += weight * (score - self.usual)
+        self._scores.learn(score)
 
     def has_lasted(self, stamp: int, duration: float) -> bool:
         """Whether every frame that says anything has contradicted the map for this long [s]."""

@@ -28,6 +28,8 @@ from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import HealthLimits, Node, Parameters
 from rlml_slam.slam.back_end.back_end import BackEnd
 from rlml_slam.slam.front_end.front_end import FrontEnd
+from rlml_slam.slam.front_end.grid_localization import GridMatch
+from rlml_slam.slam.front_end.map_localization import MapConfirmation
 from rlml_slam.slam.offline.slam import Slam
 from rlml_slam.slam.relocalization.recovery import Recovery
 from rlml_slam.types import Level, Motion, Reflectors
@@ -301,6 +303,32 @@ def test_new_reflectors_contradict_only_where_known_ones_were_seen_just_before()
     doubt.check(FIRST, False, True, 4, 4, False)
     assert not doubt.check(FIRST + 6 * STEP, False, False, 5, 0, False)
     assert doubt.check(FIRST + 7 * STEP, False, False, 5, 0, True)
+
+
+@pytest.mark.parametrize(
+    ('few', 'fits', 'contradicts'),
+    [((2, 0), False, True), ((1, 0), False, True), ((2, 1), False, False), ((2, 0), True, False)],
+)
+def test_reflectors_that_replaced_the_known_ones_may_leave_the_view(few, fits, contradicts):
+    """Two alone say nothing, but what more of them said is not taken back by it."""
+    doubt = KidnappingDetection(HealthLimits())
+    doubt.check(FIRST, False, True, 4, 4, False)
+    assert doubt.check(FIRST + STEP, False, False, 3, 0, False)
+    assert doubt.check(FIRST + 2 * STEP, False, fits, *few, False) is contradicts
+    assert (doubt.since == FIRST + STEP) is contradicts
+
+
+@pytest.mark.parametrize(('used', 'is_lost'), [(2, True), (3, False)])
+def test_two_reflectors_do_not_confirm_a_pose_that_the_scan_contradicts(used, is_lost):
+    """They may match by chance; the robot was OK and 8 m away."""
+    confirmation = MapConfirmation(Parameters(node=Node(mode='localization')))
+    confirmation.check(FIRST, 0.0, 4, 4, True, GridMatch(0.7, used=True, is_complete=True))
+    assert not confirmation.reason
+    for k in range(1, 80):  # 8 m in 8 s
+        misfit = GridMatch(0.2, contradicts=True)
+        confirmation.check(FIRST + k * STEP, 0.1, 4, used, True, misfit)
+    assert confirmation.is_lost is is_lost
+    assert ('the scan contradicts it' in confirmation.reason) is is_lost
 
 
 def test_recovery_leaves_a_robot_alone_that_is_not_lost():

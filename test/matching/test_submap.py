@@ -9,6 +9,7 @@ from rlml_slam import params
 from rlml_slam.errors import InputError
 from rlml_slam.matching.scans.submap import (
     FREE,
+    NEVER_HIT,
     P_MAX,
     P_MIN,
     STEP,
@@ -33,9 +34,10 @@ def odds(p: float) -> float:
     return p / (1.0 - p)
 
 
-def never_hit(p: float) -> float:
-    """What a cell reads that was only missed (eq. 68)."""
-    return P_MIN + (FREE - P_MIN) / (0.5 - P_MIN) * (p - P_MIN)
+def read(submap: Submap, x: float, y: float) -> float:
+    """What a match reads of the cell at (x, y)."""
+    j, i = np.floor(np.array([x, y]) / submap.resolution).astype(int) - submap.corner
+    return float(P_MIN + STEP * (int(submap.values[i, j]) - 1.0))
 
 
 def test_value_and_probability_are_inverse_and_clamped():
@@ -50,7 +52,7 @@ def test_ray_misses_up_to_the_cell_before_the_hit_and_nothing_else_is_known():
     submap = Submap(P)
     submap.insert(np.array([[1.05, 0.05]]), ORIGIN)
     for x in np.arange(0.05, 0.9, 0.1):
-        assert at(submap, x, 0.05) == pytest.approx(never_hit(P.p_miss), abs=STEP)
+        assert at(submap, x, 0.05) == pytest.approx(P.p_miss, abs=NEVER_HIT * STEP)
     assert np.isnan(at(submap, 0.95, 0.05))
     assert at(submap, 1.05, 0.05) == pytest.approx(P.p_hit, abs=STEP)
     assert int(np.isfinite(submap.probability()).sum()) == 10
@@ -77,7 +79,18 @@ def test_hits_and_misses_multiply_the_odds():
     expected = odds(P.p_hit) ** 2 / (1.0 + odds(P.p_hit) ** 2)
     assert at(submap, 1.05, 0.05) == pytest.approx(expected, abs=2 * STEP)
     expected = odds(P.p_miss) ** 2 / (1.0 + odds(P.p_miss) ** 2)
-    assert at(submap, 0.55, 0.05) == pytest.approx(never_hit(expected), abs=2 * STEP)
+    assert at(submap, 0.55, 0.05) == pytest.approx(expected, abs=2 * NEVER_HIT * STEP)
+
+
+def test_match_reads_a_cell_that_was_only_missed_as_free():
+    """Eq. 68: from P_MIN, as an unknown cell, to FREE at a probability of a half."""
+    submap = Submap(P)
+    submap.insert(np.array([[1.05, 0.05]]), ORIGIN)
+    expected = P_MIN + (FREE - P_MIN) / (0.5 - P_MIN) * (P.p_miss - P_MIN)
+    assert read(submap, 0.55, 0.05) == pytest.approx(expected, abs=STEP)
+    assert read(submap, 1.05, 0.05) == pytest.approx(P.p_hit, abs=STEP)
+    submap.insert(np.array([[0.55, 0.05]]), ORIGIN)
+    assert read(submap, 0.55, 0.05) > 0.5
 
 
 @pytest.mark.parametrize('misses', [0, 1, 3])
@@ -98,7 +111,7 @@ def test_cell_that_was_hit_loses_its_odds_miss_by_miss_and_is_free_in_the_end():
     for _ in range(12):
         submap.insert(away, ORIGIN)
         expected *= odds(P.p_miss)
-        now = at(submap, 1.05, 0.05)
+        now = read(submap, 1.05, 0.05)
         assert now < before or now == pytest.approx(P_MIN, abs=STEP)
         if expected > 1.01 * odds(FREE):
             assert odds(now) == pytest.approx(expected, rel=0.01)
@@ -122,7 +135,7 @@ def test_cell_counts_once_per_insertion_and_hits_win():
     fan = [[3.05, 0.05 + 1e-3 * k] for k in range(10)]
     submap.insert(np.array([*fan, [1.05, 0.05], [1.06, 0.05], [1.04, 0.05]]), ORIGIN)
     assert at(submap, 1.05, 0.05) == pytest.approx(P.p_hit, abs=STEP)
-    assert at(submap, 0.55, 0.05) == pytest.approx(never_hit(P.p_miss), abs=STEP)
+    assert at(submap, 0.55, 0.05) == pytest.approx(P.p_miss, abs=NEVER_HIT * STEP)
 
 
 def test_growing_grid_changes_none_of_its_cells():

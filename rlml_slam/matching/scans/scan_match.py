@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 from rlml_slam import params
 from rlml_slam.compiled import brief, kernel, part
 from rlml_slam.matching.scans import correlative_search, surfaces
-from rlml_slam.matching.scans.submap import FREE, NEVER_HIT, P_MIN, STEP, Submap, value_of
+from rlml_slam.matching.scans.submap import FREE_VALUE, NEVER_HIT, P_MIN, STEP, Submap
 from rlml_slam.se2 import Array, wrapped
 
 WIDE_STRIDE = 2  # cells between the shifts of the wide search; a wall is about as thick
 UNKNOWN = P_MIN  # M of an unknown cell; like free space, so a wall is a ridge from both sides
-FREE_VALUE = int(value_of(FREE))
 INLIER = 0.5  # M from which an end point counts as explained
 ROBUST = 0.6  # e at which the Geman-McClure weight has fallen to a quarter
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.compiled import formula
-from rlml_slam.matching.scans.submap import Submap
+from rlml_slam.matching.scans.submap import LEVELS, Submap, probability_of, value_of
 
 Bytes = NDArray[np.uint8]
 
@@ -26,6 +26,10 @@ BEFORE, AFTER = 72, 24  # empty cells around the grid, multiples of 8: blocks ma
 LANES = 64  # blocks whose bounds are summed up at a time
 FULL = 15  # largest value of four bits
 UNIT = 17  # of the 255 values of a byte, per value of four bits
+# Bytes of cell values, by the probability of the cells; 0 and 1 (unknown, P_MIN) become 0
+BYTES = np.append(
+    0, np.minimum(value_of(probability_of(np.arange(1, LEVELS + 1, dtype=np.uint16))) >> 7, 255)
+).astype(np.uint8)
 # Sizes of the windows [cells], even: a block of side 8 has four angles, one of side 4 has two.
 EIGHT, FOUR = (8, 10, 12, 14, 18, 26, 42, 72), (4, 6, 8, 12, 20, 40)
 NEAR = 1.0  # [m] from what is known, within which a robot may stand
@@ -79,8 +83,7 @@ class Pyramid:
         height, columns = (-(-n // 8) * 8 + BEFORE + AFTER for n in (rows, width))
         grid = np.zeros((height, columns), np.uint8)
         inner = (slice(BEFORE, BEFORE + rows), slice(BEFORE, BEFORE + width))
-        # values reach LEVELS = 2^15 - 1; 0 and 1 (unknown, P_MIN) become 0
-        grid[inner] = np.minimum(submap.values >> 7, 255)
+        grid[inner] = BYTES[submap.values]
         pairs = pooled(grid // UNIT + (grid % UNIT > 0), 1)  # of 2 x 2 cells
         self.levels = Levels(
             rows, width,

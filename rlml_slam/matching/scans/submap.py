@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Probability grids built from scans by ray carving; scans are matched against them.
 
-A cell holds a uint16: 0 where nothing is known, else 1..LEVELS, linear in the occupancy
-probability P_MIN..P_MAX. A hit (miss) multiplies the odds by those of p_hit (p_miss), which is
-one table look-up per cell. A cell that was only missed reads as free from the first miss on
-(eq. 68). The lattice is fixed: cell (i, j) covers x in
+A cell holds a uint16: 0 where nothing is known, else 1..LEVELS, what a match reads of it, linear
+from P_MIN to P_MAX. That is its occupancy probability, but a cell that was only missed reads as
+free from the first miss on (eq. 68). A hit (miss) multiplies the odds by those of p_hit (p_miss),
+which is one table look-up per cell. The lattice is fixed: cell (i, j) covers x in
 [j, j + 1) * resolution and y in [i, i + 1) * resolution of the submap frame, so a grid that grows
 changes none of its cells.
 """
@@ -27,24 +27,28 @@ from rlml_slam.se2 import Array
 P_MIN, P_MAX = 0.1, 0.97
 LEVELS = 32767
 STEP = (P_MAX - P_MIN) / (LEVELS - 1)
-MARGIN = 64  # cells of slack when a grid grows, and of free border that kernels may read
 FREE = 0.12  # up to which a cell reads that was only missed
 NEVER_HIT = (0.5 - P_MIN) / (FREE - P_MIN)  # its probability above P_MIN, by what it reads
+MARGIN = 64  # cells of slack when a grid grows, and of free border that kernels may read
 BORDER = 4
 EMPTY = np.zeros(0, dtype=np.int32)
 FIRST_LIST = 4096
 
 
 def value_of(p: float | Array) -> NDArray[np.uint16]:
-    """Cell value of a probability (clamped)."""
+    """Cell value that reads as p (clamped)."""
     p = np.clip(p, P_MIN, P_MAX)
     return np.asarray(1 + np.rint((p - P_MIN) / STEP), dtype=np.uint16)
 
 
-def probability_of(values: NDArray[np.uint16]) -> NDArray[np.float32]:
+def probability_of(values: NDArray[np.uint16]) -> Array:
     """Occupancy probability of cell values, NaN where nothing is known."""
-    p = P_MIN + (values.astype(np.float32) - 1) * STEP
-    return np.where(values == 0, np.float32(np.nan), p).astype(np.float32)
+    read = P_MIN + (values.astype(np.float64) - 1.0) * STEP
+    p = np.where(values <= FREE_VALUE, P_MIN + NEVER_HIT * (read - P_MIN), read)
+    return np.where(values == 0, np.nan, p)
+
+
+FREE_VALUE = int(value_of(FREE))  # up to which a cell was only missed
 
 
 @lru_cache(maxsize=8)
@@ -56,13 +60,12 @@ def update_table(p_update: float) -> NDArray[np.uint16]:
     wall is drawn towards the robot. The less is seen of a wall, the more; one that sees a single
     wall, or a short part of two, would turn by tenths of a degree per metre.
     """
-    p = P_MIN + np.arange(LEVELS) * STEP
-    never_hit = p <= FREE
-    p = np.where(never_hit, P_MIN + NEVER_HIT * (p - P_MIN), p)
+    values = np.arange(1, LEVELS + 1, dtype=np.uint16)
+    p = probability_of(values)
     odds = p / (1.0 - p) * (p_update / (1.0 - p_update))
     after = np.append(p_update, odds / (1.0 + odds))
     if p_update < 0.5:
-        free = np.append(True, never_hit | (after[1:] <= FREE))
+        free = np.append(True, (values <= FREE_VALUE) | (after[1:] <= FREE))
         after = np.where(free, P_MIN + (after.clip(P_MIN) - P_MIN) / NEVER_HIT, after)
     return value_of(after)
 
@@ -96,7 +99,7 @@ class Submap:
         (j, i), (rows, columns) = self.corner, self.values.shape
         return np.array([j, i, j + columns, i + rows], dtype=np.float64) * self.resolution
 
-    def probability(self) -> NDArray[np.float32]:
+    def probability(self) -> Array:
         """Occupancy probability (rows, columns), NaN where nothing is known."""
         return probability_of(self.values)
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rlml_slam import se2
+from rlml_slam.estimation.kidnapping_detection import UsualScore
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.matching.reflectors.association import gate
 from rlml_slam.matching.scans import scan_information, voxel_filter
@@ -25,6 +26,7 @@ from rlml_slam.slam.front_end.joint_state import VELOCITY, JointState
 from rlml_slam.slam.relocalization.grid_submap import possible, submap_of
 
 GATE_PROBABILITY = 0.9999  # of the gate of a match against the prior
+WEAK = 0.75  # of the usual score; walls of another place may fit as well as that
 BEAM_STEP = 4  # of a scan that does not match, every n-th beam is traced through the grid
 MARGIN = 1e-4  # of a covariance that is never taken as shared
 LEAST = 1e-9  # information relative to that of the prior, below which there is none
@@ -37,22 +39,25 @@ class GridMatch:
     """Result of a match with the grid; ``score`` is NaN if there was none.
 
     ``used``: it updated the pose; ``is_complete``: in every direction. ``contradicts``: the scan
-    does not fit the known part of the grid; ``is_elsewhere``: it fits, beyond the gate.
+    does not fit the known part of the grid; ``is_weak``: it does, but worse than scans did lately;
+    ``is_elsewhere``: it fits, beyond the gate.
     """
 
     score: float
     used: bool = False
     is_complete: bool = False
     contradicts: bool = False
+    is_weak: bool = False
     is_elsewhere: bool = False
 
     @property
     def refutes(self) -> bool:
-        """Whether the scan does not fit the grid near this pose, unknown cells aside.
+        """Whether the scan does not fit the grid near this pose as it should, unknown cells aside.
 
-        Submaps of the drive learn a new place within a few scans, a saved grid does not.
+        Submaps of the drive learn a new place within a few scans, a saved grid does not. Walls of
+        other places are alike, so that a weak fit does not overrule reflectors.
         """
-        return self.contradicts or self.is_elsewhere
+        return self.contradicts or self.is_weak or self.is_elsewhere
 
 
 def map_information(submap: Submap, points: Array, pose: Array, params: Parameters) -> Array:
@@ -111,6 +116,7 @@ class GridLocalizer:
         self._floor = np.diag(params.submap.grid_bias_variance)
         self._gate = [gate(GATE_PROBABILITY, dof) for dof in (1, 2, 3)]
         self._last: Array | None = None
+        self._scores = UsualScore()
 
     def is_due(self, pose: Array) -> bool:
         """Whether the pose (3,) is at least a keyframe distance from the last match."""
@@ -138,11 +144,12 @@ class GridLocalizer:
         if found.score < p.search_threshold:
             searched = match(submap, points, prior, strength, p)
             found = searched if searched.score > found.score else found
+        traced, is_weak = points[::BEAM_STEP], False
+        if self._scores.is_settled and found.score < WEAK * (usual := self._scores.mean):
+            is_weak = possible(submap, traced, found.pose, found.score, usual) < WEAK * usual
         if found.score < p.min_score:
-            may_be = possible(
-                submap, points[::BEAM_STEP], found.pose, found.score, p.search_threshold
-            )
-            return GridMatch(found.score, contradicts=may_be < p.min_score)
+            may_be = possible(submap, traced, found.pose, found.score, p.search_threshold)
+            return GridMatch(found.score, contradicts=is_weak or may_be < p.min_score)
         information = map_information(submap, points, found.pose, self._p)
         values, axes = np.linalg.eigh(information)
         keep = values > 1e-6
@@ -154,11 +161,14 @@ class GridLocalizer:
         S = root @ (cov + self._saved.cov_cell) @ root.T + np.eye(len(v))
         d2 = float(v @ np.linalg.solve(S, v))
         if not len(v) or d2 > self._gate[len(v) - 1]:
-            return GridMatch(found.score, is_elsewhere=True)
+            return GridMatch(found.score, is_weak=is_weak, is_elsewhere=True)
         shared = at_most(self._saved.cov_cell, cov)
         if shared.any():
             root, v = relative_update(cov, shared, root, v)
         state.apply(POSE_AND_SWEEP, root @ J, np.eye(len(v)), v)
         self._last = state.pose
+        if not is_weak:
+            self._scores.learn(found.score)
         weakest = self._p.health.degeneracy_sigma**-2
-        return GridMatch(found.score, True, len(v) == 3 and float(values[0]) >= weakest)
+        is_complete = len(v) == 3 and float(values[0]) >= weakest
+        return GridMatch(found.score, True, is_complete, is_weak=is_weak)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+from rlml_slam.estimation.kidnapping_detection import FEW
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Parameters
@@ -103,8 +104,9 @@ class MapConfirmation:
             return
         if self.is_pending:
             confirmed = self._confirms_start(detections, used, grid_match)
-        else:
-            confirmed = agrees or grid_match.used
+        else:  # two reflectors may match by chance, where the scan does not
+            reflectors = agrees and (used > FEW or not grid_match.contradicts)
+            confirmed = reflectors or grid_match.used
         if confirmed:
             self.reason, self.is_pending, self.is_lost = '', False, False
             self._distance, self._since = 0.0, None

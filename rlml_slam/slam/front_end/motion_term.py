@@ -50,8 +50,6 @@ from rlml_slam.types import Motion, Observation
 # a pose error of 2 mm would be 0.4 m/s over 5 ms, and is .04 m/s over this time.
 MIN_INTERVAL = 50_000_000
 SCALES = slice(SPEED, TURN + 1)
-# [rad] of view from which on a match says where a robot turns: with 90 deg it is 1 to 2 cm off
-WIDE = 2.0
 WHOLE = 0.9  # share of a sweep from which on the next stamp counts as its end, for its jitter
 
 
@@ -104,7 +102,7 @@ class MotionTerm:
         last, self.stamp = self.stamp, observation.stamp
         if observation.points is not None:
             narrow_scale_errors(state, self._p.scale_error_sigma)
-            if state.wheels2[-1] < self._p.pivot_sigma**2 and sees_widely(observation):
+            if state.wheels2[-1] < self._p.pivot_sigma**2:
                 expect_pivot(state, self._p.pivot_sigma)
             self.has_lidar = True
         self.has_odometry |= observation.odom_pose is not None
@@ -239,16 +237,6 @@ class MotionTerm:
             return np.zeros((3, 3))
         moved = se2.rotation3(heading) @ self.velocity * sigma
         return np.outer(moved, moved)
-
-
-def sees_widely(observation: Observation) -> bool:
-    """Whether the end points surround the laser by WIDE; else a way aside looks like a turn."""
-    points, origin = observation.points, observation.origin
-    if points is None or origin is None or len(points) < 2:
-        return False
-    bearings = np.sort(np.arctan2(*(points - origin).T[::-1]))
-    gap = max(float(np.diff(bearings).max()), bearings[0] + 2.0 * math.pi - bearings[-1])
-    return bool(2.0 * math.pi - gap > WIDE)
 
 
 def measure_scale_error(state: JointState, row: int, rest: float, H: Array, R: float) -> None:

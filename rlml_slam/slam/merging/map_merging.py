@@ -38,7 +38,7 @@ from rlml_slam.types import EdgeKind
 Arrays = dict[str, NDArray[Any]]
 SHARE = 0.9  # of a map's keyframes whose stamps are in another one that has all of its drive
 ALIKE = 0.5  # of its reflectors that are where the other one has some
-NEAR, BENT = 0.5, 0.05  # [m], share of its extent by which the paths of one drive may differ
+NEAR, BENT = 0.4, 0.05  # [m], share of its extent by which the paths of one drive may differ
 
 
 class Drive(NamedTuple):

@@ -309,15 +309,15 @@ def test_motion_that_nobody_measured_is_that_of_the_base_itself():
     assert not state.P[:3, PIVOT].any()
 
 
-@pytest.mark.parametrize(('view', 'is_wide'), [(90.0, False), (110.0, False), (120.0, True)])
-@pytest.mark.parametrize('ahead', [0.0, 3.1])
-def test_where_the_robot_turns_is_modelled_for_a_wide_view(view, is_wide, ahead):
+@pytest.mark.parametrize('has_lidar', [True, False])
+def test_where_the_robot_turns_is_modelled_for_a_lidar(has_lidar):
     front_end = FrontEnd(Parameters())
-    angles = ahead + np.radians(np.linspace(-0.5 * view, 0.5 * view, 90))
+    angles = np.radians(np.linspace(-45.0, 45.0, 90))
     points = [0.3, 0.1] + 4.0 * np.stack([np.cos(angles), np.sin(angles)], -1)
-    o = Observation(0, STILL, points, np.array([0.3, 0.1]), odom_pose=np.zeros(3))
+    seen = points if has_lidar else None
+    o = Observation(0, STILL, seen, np.array([0.3, 0.1]), odom_pose=np.zeros(3))
     front_end.process(o)
-    sigma = NOISE.pivot_sigma if is_wide else 0.0
+    sigma = NOISE.pivot_sigma if has_lidar else 0.0
     assert front_end.state.P[PIVOT, PIVOT] == pytest.approx(sigma**2)
 
 
