@@ -190,12 +190,45 @@ def test_scan_touches_what_its_rays_touch_one_by_one(kind):
     whole = Submap(P)
     whole.insert(points, OFF_CENTRE)
     touched = np.zeros(whole.values.shape, dtype=bool)
-    for point in fill(points, P.resolution):
-        one = Submap(P)
-        one.insert(point[None], OFF_CENTRE)
-        (rows, columns), (j, i) = one.values.shape, np.subtract(one.corner, whole.corner)
-        touched[i : i + rows, j : j + columns] |= one.values > 0
+    filled = fill(points, P.resolution)
+    for point, kept in zip(filled, grazing(filled - OFF_CENTRE), strict=True):
+        one, ray = Submap(P), point - OFF_CENTRE
+        end = OFF_CENTRE + ray * (1.0 - kept / max(np.hypot(*ray), P.resolution))
+        one.insert(end[None], OFF_CENTRE)
+        missed, (j, i) = one.values > 0, np.subtract(one.corner, whole.corner)
+        column, row = cell_of(end) - one.corner
+        missed[row, column] = False
+        touched[i : i + missed.shape[0], j : j + missed.shape[1]] |= missed
+        column, row = cell_of(point) - whole.corner
+        touched[row, column] = True
     np.testing.assert_array_equal(whole.values > 0, touched)
+
+
+def cell_of(point):
+    return np.floor(point / P.resolution).astype(int)
+
+
+def grazing(rays):
+    """Length (n,) [m] before the end of each ray that is within a cell of a neighbour's line."""
+    out = np.zeros(len(rays))
+    for k, ray in enumerate(rays):
+        for other in rays[[m for m in (k - 1, k + 1) if 0 <= m < len(rays)]]:
+            length, (x, y) = max(np.hypot(*ray), 1e-12), ray - other
+            along, beside = ray @ (x, y) / length, abs(ray[0] * y - ray[1] * x) / length
+            if 0.0 < along < 0.5 * length:
+                out[k] = max(out[k], along * min(1.0, P.resolution / max(beside, 1e-12)))
+    return out
+
+
+def test_rays_that_graze_a_wall_do_not_wear_it_off():
+    """Far along it, end points are apart, and rays to the farther ones run within its cells."""
+    submap, at_y = Submap(P), 1.0 + 0.5 * P.resolution
+    angles = np.radians(np.arange(4.0, 91.0))
+    for x in np.arange(0.0, 3.0, 0.1):
+        points = np.stack([x + at_y / np.tan(angles), np.full(len(angles), at_y)], -1)
+        submap.insert(points, np.array([x, 0.0]))
+    for x in np.arange(4.05, 12.0, 0.1):
+        assert not at(submap, x, at_y) < 0.5
 
 
 def test_same_insertions_give_the_same_bytes():

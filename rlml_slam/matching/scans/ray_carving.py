@@ -19,6 +19,8 @@ from rlml_slam.se2 import Array
 TOUCHED = np.uint16(0x8000)  # marks a cell that the scan has changed, or will
 WHOLE_RAY = 2.0**40  # a ray's length as an integer
 CLOSE = 0.99  # [cells] between two rays, so that a cell does not fit in between
+GRAZED = 1.0  # [cells] from a ray to a surface that it does not cross yet
+STEP = 0.5  # of a ray: a neighbour that is shorter by more ends on something else
 HALF = 0.75  # [cells] from the middle of a cell to a corner, and less than that between
 LAST = 4.0 * HALF  # [cells] of the last two cells of a ray, which it does not miss
 Cells = NDArray[np.uint16]
@@ -49,7 +51,8 @@ def carve(
     for k in range(len(points)):
         rays[k, 0] = points[k, 0] * scale - corner_j - x0
         rays[k, 1] = points[k, 1] * scale - corner_i - y0
-    area, starts = covered(rays)
+    kept = unmissed(rays)
+    area, starts = covered(rays, kept)
     # upper bound on listed cells: each ray crosses |di| + |dj| + 1 cells
     bound = 0
     for k in range(len(points)):
@@ -68,9 +71,10 @@ def carve(
             n += 1
     hits = n
     for k in range(len(points)):
-        x1, y1 = points[k, 0] * scale - corner_j, points[k, 1] * scale - corner_i
-        sx, sy = x0 + starts[k] * (x1 - x0), y0 + starts[k] * (y1 - y0)
-        n = touch_ray(flat, columns, sx, sy, x1, y1, touched, n)
+        dx, dy = rays[k, 0], rays[k, 1]
+        end = max(1.0 - kept[k] / max(math.sqrt(dx * dx + dy * dy), 1.0), starts[k])
+        sx, sy = x0 + starts[k] * dx, y0 + starts[k] * dy
+        n = touch_ray(flat, columns, sx, sy, x0 + end * dx, y0 + end * dy, touched, n)
     for row, first, end in spans_of(area, x0, y0, len(values)):
         for cell in range(np.uint64(row * columns + first), np.uint64(row * columns + end)):
             v = flat[cell]
@@ -85,22 +89,46 @@ def carve(
 
 
 @part
-def covered(rays: Array) -> tuple[Array, Array]:
+def unmissed(rays: Array) -> Array:
+    """Length (n,) [cells] before the end of each ray along which it grazes a surface.
+
+    There it is less than GRAZED beside the line to the end of a neighbouring, shorter ray. It
+    would wear off the wall on which both end, where their ends are far apart, and its near side
+    where they are not.
+    """
+    n = len(rays)
+    out = np.zeros(n)
+    for k in range(n):
+        x, y = rays[k, 0], rays[k, 1]
+        length = math.sqrt(x * x + y * y)
+        for other in (k - 1, k + 1):
+            if 0 <= other < n and length > 0.0:
+                dx, dy = x - rays[other, 0], y - rays[other, 1]
+                along, beside = (x * dx + y * dy) / length, abs(x * dy - y * dx) / length
+                if 0.0 < along < STEP * length:
+                    grazed = along if beside <= GRAZED else along * GRAZED / beside
+                    out[k] = max(out[k], grazed)
+    return out
+
+
+@part
+def covered(rays: Array, kept: Array) -> tuple[Array, Array]:
     """What rays (n, 2) [cells] from one origin cover so densely that they cross every cell of it.
 
     The corners (2n, 2) of an area about the origin, two on each ray, and the share (n,) of each
     ray up to which the cells that it crosses have their middles in that area, or are crossed by
-    another ray beyond such a share of its own.
+    another ray beyond such a share of its own. Of each ray, ``kept`` (n,) [cells] are left out.
 
     A cell whose middle lies between two rays is crossed by one of them wherever they are less than
     the side of a cell apart: it would not fit in between. Rays are in the order of their angles or
     nearly so; between two that are not, there is no area.
     """
     n = len(rays)
-    length = np.empty(n)
+    length, until = np.empty(n), np.empty(n)
     turn = 0.0
     for k in range(n):
         length[k] = math.sqrt(rays[k, 0] * rays[k, 0] + rays[k, 1] * rays[k, 1])
+        until[k] = length[k] - kept[k]
         if k:
             turn += rays[k - 1, 0] * rays[k, 1] - rays[k - 1, 1] * rays[k, 0]
     area, share = np.zeros((2 * n, 2)), np.zeros(n)
@@ -111,7 +139,7 @@ def covered(rays: Array) -> tuple[Array, Array]:
             ax, ay, bx, by = rays[k, 0], rays[k, 1], rays[k + 1, 0], rays[k + 1, 1]
             dot, cross = ax * bx + ay * by, ax * by - ay * bx
             if dot > 0.0 and cross * turn >= 0.0:
-                after = min(length[k], length[k + 1]) - LAST
+                after = min(until[k], until[k + 1]) - LAST
                 if abs(cross) * after > CLOSE * dot:
                     after = CLOSE * dot / abs(cross)  # twice the tangent of half the angle is less
                 after = max(after - HALF, 0.0)

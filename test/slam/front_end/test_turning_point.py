@@ -45,13 +45,12 @@ def test_turn_is_right_however_the_laser_is_mounted(view, ahead, seed):
 
 
 @pytest.mark.parametrize('ahead', [0.07, -0.07])
-def test_narrow_view_finds_most_of_it(ahead):
-    """Of 90°, some drives say too little; of 60°, nearly all do, and none gets worse."""
+def test_narrow_view_finds_it_in_most_drives(ahead):
+    """Of 90°: one drive in ten says too little."""
     sigma = Parameters().motion.pivot_sigma
-    for view, most in ((45, 1.0), (30, 9.0)):
-        turned = [[error(ahead, view, s, seed)[1] for seed in range(3)] for s in (sigma, 0.0)]
-        assert np.median(turned[0]) < np.radians(most)
-        assert (np.array(turned[0]) < np.array(turned[1])).all()
+    turned, without = ([error(ahead, 45, s, seed)[1] for seed in range(3)] for s in (sigma, 0.0))
+    assert np.median(turned) < np.radians(1.0)
+    assert np.median(without) > 4.0 * np.median(turned)
 
 
 def test_what_is_not_modelled_becomes_a_turn():
