@@ -285,7 +285,9 @@ def test_eight_reflectors_of_a_real_laser_at_rest():
     off = np.linalg.norm(run.reflectors.points[:, None] - listed, axis=-1)
     assert off.shape == (8, 8)
     assert sorted(off.argmin(axis=1)) == list(range(8))
-    assert off.min(axis=1).max() < 0.045
+    assert off.min(axis=1).max() < 0.05
+    # the list is in another frame by 3 cm; the laser is at rest, and moved by 5 mm towards it
+    assert np.abs(run.frames.poses).max() < 0.003
 
 
 def test_doctor_finds_them_as_well(recorded, capsys):
