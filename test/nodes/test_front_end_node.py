@@ -740,3 +740,23 @@ def test_unknown_parameter_is_told_and_harmless(live, monkeypatch):
     monkeypatch.setattr(RcutilsLogger, 'warning', lambda self, text, **_: said.append(text))
     live.start(FrontEndNode, scan_topik='x')
     assert any("unknown parameter 'scan_topik'" in s and "'scan_topic'" in s for s in said)
+
+
+def test_pose_of_a_user_waits_for_no_scan_that_waits_as_well(live, node):
+    """Where the machine is too slow, all sensors have the next scans by the time it is heard."""
+    sent = feed(node, 2.0)
+    talk = live.ear.create_publisher(rclpy_class('geometry_msgs/msg/PoseWithCovarianceStamped'),
+                                     'initialpose', 10)  # fmt: skip
+    live.spin_until(lambda: talk.get_subscription_count() == 1)
+    last = stamps(sent, 'scan')[-1]
+    talk.publish(encode.pose_with_covariance(make, last, 'map', np.ones(3), 1e-4 * np.eye(3)))
+    before = node.control.session.session
+    later = (item for item in room(seconds=20.0) if decode.stamp(item[1], item[0]) > last)
+    for stream, msg in later:  # nothing is spun
+        node.sensors.add(stream, msg)
+        if stream == 'scan':
+            time.sleep(0.05)
+        if node.control.session.session != before:
+            break
+    assert node.control.session.session != before
+    assert decode.stamp(msg, stream) < last + 15 * SECOND

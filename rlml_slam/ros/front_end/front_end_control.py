@@ -77,13 +77,15 @@ class FrontEndControl:
         )
         self._entry: tuple[str, ...] = ()  # why poses are not in the back end's map
         self._absent: float | None = None if has_back_end else time.monotonic()
+        self._listeners: list[Listener] = []
         for kind, topic, use, qos, largest in (
             (POSE, 'initialpose', self.start_at, RELIABLE, SMALL),
             *(() if has_back_end else topics),
         ):
             events = SubscriptionEventCallbacks(liveliness=self._on_liveliness)
             options = {'event_callbacks': events} if qos is alive else {}
-            Listener(node, rclpy_class(kind), topic, use, qos, largest, **options)
+            listener = Listener(node, rclpy_class(kind), topic, use, qos, largest, **options)
+            self._listeners.append(listener)
 
     def _on_liveliness(self, event: Any) -> None:
         """A back end has come, or gives no sign any more."""
@@ -146,7 +148,12 @@ class FrontEndControl:
         self._arrival.trigger()
 
     def carry_out(self) -> None:
-        """Carry out the commands that have come."""
+        """Carry out the commands that have come, by topics as well.
+
+        On a machine that is too slow, the executor serves them only after all sensors.
+        """
+        for listener in self._listeners:
+            listener.drain()
         while self._inbox:
             self.execute(self._inbox.popleft())
 
