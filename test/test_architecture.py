@@ -190,8 +190,9 @@ MAX_CLASS = 250  # lines
 # intensities, ids that repeat, sensors that are placed late, closures decided at the end,
 # scans thinned alike from both sides, ids that count the rows of a message, scale errors of
 # odometry that is late, sides of walls, an EKF that is lost, checks of the Python API, maps of one
-# drive, where a robot turns
-MAX_LINES = 59_580
+# drive, where a robot turns, rays that graze walls, robots that are carried to a place like their
+# own, commands on a machine that is too slow
+MAX_LINES = 59_620
 MAX_LONG_LISTS = 11
 MAX_WORDS = 30  # in code and docs, the changelog aside
 # tests that need a study's scenes, drives or graphs; a new one belongs into test/lab

@@ -80,7 +80,7 @@ class KidnappingDetection:
             self._last_match = stamp
         expected = surveyed or self.since is not None or stamp - self._last_match < RECENT * 1e9
         # some of those that replaced the known ones may leave the view
-        many = detections > FEW or (self._replaced and detections > matched == 0)
+        many = detections > FEW or (self._replaced and matched == 0 and detections > 0)
         self._replaced = many and not agree and expected and not scan_is_complete
         contradicted = self._replaced or (misfit and not agree)
         if not contradicted:
@@ -95,7 +95,7 @@ class KidnappingDetection:
         It is as it was before, until nothing has been seen for LAPSE.
         """
         if stamp - self._checked > LAPSE * 1e9:
-            self.since = None
+            self.since, self._replaced = None, False
         return self.since is not None
 
     def learn(self, score: float) -> None:

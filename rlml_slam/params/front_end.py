@@ -181,8 +181,8 @@ class Submap(Group):
     max_points: int = param(
         500, 'largest number of end points of a scan that is inserted', '', 20, 100000
     )
-    p_hit: float = param(0.7, 'occupancy probability of a cell after one hit', '', 0.5, 0.99)
-    p_miss: float = param(0.46, 'occupancy probability of a cell after one miss', '', 0.01, 0.5)
+    p_hit: float = param(0.7, 'occupancy probability of a cell after one hit', '', 0.51, 0.99)
+    p_miss: float = param(0.46, 'occupancy probability of a cell after one miss', '', 0.01, 0.49)
     bias_variance: tuple[float, ...] = param(
         (1e-4, 1e-4, 1.6e-5),
         'variance of the error of a submap, common to all scans matched against it',

@@ -495,3 +495,11 @@ def test_contradiction_lapses_where_nothing_is_seen_any_more():
     assert kidnapping.holds(FIRST + 40 * STEP)  # a slow laser misses some
     assert not kidnapping.holds(FIRST + 60 * STEP)
     assert kidnapping.since is None
+
+
+def test_reflectors_that_replaced_others_long_ago_say_nothing_of_those_in_view():
+    kidnapping = KidnappingDetection(HealthLimits())
+    assert kidnapping.check(FIRST, False, False, 3, 0, True)
+    assert not kidnapping.holds(FIRST + 600 * STEP)
+    assert not kidnapping.check(FIRST + 601 * STEP, False, False, 1, 0, True)
+    assert kidnapping.since is None

@@ -9,12 +9,14 @@ from rlml_slam import params
 from rlml_slam.errors import InputError
 from rlml_slam.matching.scans.submap import (
     FREE,
+    LEVELS,
     NEVER_HIT,
     P_MAX,
     P_MIN,
     STEP,
     Submap,
     probability_of,
+    update_table,
     value_of,
 )
 from rlml_slam.matching.scans.surfaces import fill
@@ -102,6 +104,25 @@ def test_hit_after_misses_only_multiplies_the_odds_of_what_the_misses_left(misse
     expected = odds(P.p_miss) ** misses * odds(P.p_hit)
     # the scale of cells that were never hit has steps that are twenty times as long
     assert odds(at(submap, 1.05, 0.05)) == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize('p_miss', [0.01, 0.3, 0.45, 0.46, 0.49])
+def test_no_miss_raises_the_probability_of_any_cell(p_miss):
+    values = np.arange(1, LEVELS + 1, dtype=np.uint16)
+    before, after = probability_of(values), probability_of(update_table(p_miss)[1:])
+    assert (after <= before + 0.51 * STEP).all()
+    assert probability_of(update_table(p_miss)[:1])[0] < 0.5
+
+
+@pytest.mark.parametrize('p_hit', [0.51, 0.55, 0.7, 0.99])
+def test_cell_that_was_hit_is_none_that_was_only_missed(p_hit):
+    values = np.arange(1, LEVELS + 1, dtype=np.uint16)
+    before, after = probability_of(values), update_table(p_hit)[1:]
+    assert after.min() > value_of(FREE)
+    expected = np.clip(
+        odds(before) * odds(p_hit) / (1.0 + odds(before) * odds(p_hit)), FREE, P_MAX
+    )
+    np.testing.assert_allclose(probability_of(after), expected, atol=1.01 * STEP)
 
 
 def test_cell_that_was_hit_loses_its_odds_miss_by_miss_and_is_free_in_the_end():
@@ -229,6 +250,17 @@ def test_rays_that_graze_a_wall_do_not_wear_it_off():
         submap.insert(points, np.array([x, 0.0]))
     for x in np.arange(4.05, 12.0, 0.1):
         assert not at(submap, x, at_y) < 0.5
+
+
+def test_what_is_kept_back_of_rays_is_near_the_walls_alone():
+    """A square room from near its corner, of which walls run away from the laser."""
+    submap, laser, far = Submap(P), np.array([0.53, 0.41]), 6.0
+    angles = np.radians(np.arange(0.25, 360.0, 0.5))
+    way = np.stack([np.cos(angles), np.sin(angles)], -1)
+    reach = np.where(way > 0.0, (far - laser) / way, -laser / way).min(axis=1)
+    submap.insert(laser + reach[:, None] * way, laser)
+    for x, y in np.random.default_rng(0).uniform(0.35, far - 0.35, size=(500, 2)):
+        assert at(submap, x, y) < 0.5
 
 
 def test_same_insertions_give_the_same_bytes():

@@ -20,7 +20,7 @@ TOUCHED = np.uint16(0x8000)  # marks a cell that the scan has changed, or will
 WHOLE_RAY = 2.0**40  # a ray's length as an integer
 CLOSE = 0.99  # [cells] between two rays, so that a cell does not fit in between
 GRAZED = 1.0  # [cells] from a ray to a surface that it does not cross yet
-STEP = 0.5  # of a ray: a neighbour that is shorter by more ends on something else
+SAME = 0.5  # of a ray: a neighbour that is shorter by more ends on something else
 HALF = 0.75  # [cells] from the middle of a cell to a corner, and less than that between
 LAST = 4.0 * HALF  # [cells] of the last two cells of a ray, which it does not miss
 Cells = NDArray[np.uint16]
@@ -72,7 +72,7 @@ def carve(
     hits = n
     for k in range(len(points)):
         dx, dy = rays[k, 0], rays[k, 1]
-        end = max(1.0 - kept[k] / max(math.sqrt(dx * dx + dy * dy), 1.0), starts[k])
+        end = 1.0 - kept[k] / max(math.sqrt(dx * dx + dy * dy), 1.0)
         sx, sy = x0 + starts[k] * dx, y0 + starts[k] * dy
         n = touch_ray(flat, columns, sx, sy, x0 + end * dx, y0 + end * dy, touched, n)
     for row, first, end in spans_of(area, x0, y0, len(values)):
@@ -105,7 +105,7 @@ def unmissed(rays: Array) -> Array:
             if 0 <= other < n and length > 0.0:
                 dx, dy = x - rays[other, 0], y - rays[other, 1]
                 along, beside = (x * dx + y * dy) / length, abs(x * dy - y * dx) / length
-                if 0.0 < along < STEP * length:
+                if 0.0 < along < SAME * length:
                     grazed = along if beside <= GRAZED else along * GRAZED / beside
                     out[k] = max(out[k], grazed)
     return out

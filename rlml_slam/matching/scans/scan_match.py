@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The scan term (eq. 1, 2): e_k = 1 - M(X + p_k), and its solution.
 
-M is the submap's occupancy probability, interpolated by a uniform cubic B-spline: twice
+M is what the cells of the submap read (eq. 68), interpolated by a uniform cubic B-spline: twice
 continuously differentiable, without overshoot, and a slight blur that widens the basin. Unknown
 cells count as UNKNOWN. Poses are of the base in the submap frame; derivatives are with respect to
 the raw coordinates (x, y, theta).
@@ -125,7 +125,7 @@ def sample_curved(
         m_uu += b[r] * (f0 * p0 + f1 * p1 + f2 * p2 + f3 * p3)
         m_uv += c[r] * slope
         m_vv += g[r] * along
-    # a cell's probability is linear in its value, and the weights of a spline sum up to one
+    # what a cell reads is linear in its value, and the weights of a spline sum up to one
     return (
         P_MIN + STEP * (m - 1.0), STEP * m_u, STEP * m_v, STEP * m_uu, STEP * m_uv, STEP * m_vv,
     )  # fmt: skip
@@ -138,7 +138,7 @@ def known(value: int) -> float:
 
 
 @part
-def doubt(values: NDArray[np.uint16], column: float, row: float) -> float:
+def missed_probability(values: NDArray[np.uint16], column: float, row: float) -> float:
     """Probability of the cell of an end point if it was only missed, else 0."""
     j, i = int(np.floor(column)), int(np.floor(row))
     if j < 0 or i < 0 or j >= values.shape[1] or i >= values.shape[0]:
@@ -202,7 +202,7 @@ def accumulate(
         out[7] += h_yy
         out[8] += h_yt
         out[9] += -ry * h_xt + rx * h_yt
-        out[10] += max(m, doubt(values, column, row))
+        out[10] += max(m, missed_probability(values, column, row))
         out[11] += m > INLIER
 
 

@@ -28,7 +28,7 @@ FULL = 15  # largest value of four bits
 UNIT = 17  # of the 255 values of a byte, per value of four bits
 # Bytes of cell values, by the probability of the cells; 0 and 1 (unknown, P_MIN) become 0
 BYTES = np.append(
-    0, np.minimum(value_of(probability_of(np.arange(1, LEVELS + 1, dtype=np.uint16))) >> 7, 255)
+    0, value_of(probability_of(np.arange(1, LEVELS + 1, dtype=np.uint16))) >> 7
 ).astype(np.uint8)
 # Sizes of the windows [cells], even: a block of side 8 has four angles, one of side 4 has two.
 EIGHT, FOUR = (8, 10, 12, 14, 18, 26, 42, 72), (4, 6, 8, 12, 20, 40)

@@ -64,10 +64,11 @@ def update_table(p_update: float) -> NDArray[np.uint16]:
     p = probability_of(values)
     odds = p / (1.0 - p) * (p_update / (1.0 - p_update))
     after = np.append(p_update, odds / (1.0 + odds))
-    if p_update < 0.5:
-        free = np.append(True, (values <= FREE_VALUE) | (after[1:] <= FREE))
-        after = np.where(free, P_MIN + (after.clip(P_MIN) - P_MIN) / NEVER_HIT, after)
-    return value_of(after)
+    read = value_of(after)
+    if p_update > 0.5:  # a cell that was hit is not one that was only missed
+        return np.maximum(read, FREE_VALUE + 1)
+    free = np.append(True, values <= FREE_VALUE) | (read <= FREE_VALUE)
+    return np.where(free, value_of(P_MIN + (after - P_MIN) / NEVER_HIT), read)
 
 
 class Submap:

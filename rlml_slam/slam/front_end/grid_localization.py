@@ -23,7 +23,7 @@ from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
 from rlml_slam.sensing.velocity_deskew import Sweep
 from rlml_slam.slam.front_end.joint_state import VELOCITY, JointState
-from rlml_slam.slam.relocalization.grid_submap import possible, submap_of
+from rlml_slam.slam.relocalization.grid_submap import may_be, submap_of, unmapped_share
 
 GATE_PROBABILITY = 0.9999  # of the gate of a match against the prior
 WEAK = 0.75  # of the usual score; walls of another place may fit as well as that
@@ -38,7 +38,7 @@ POSE_AND_SWEEP = np.r_[0:3, VELOCITY : VELOCITY + 3]
 class GridMatch:
     """Result of a match with the grid; ``score`` is NaN if there was none.
 
-    ``used``: it updated the pose; ``is_complete``: in every direction. ``contradicts``: the scan
+    ``used``: it holds the pose; ``is_complete``: in every direction. ``contradicts``: the scan
     does not fit the known part of the grid; ``is_weak``: it does, but worse than scans did lately;
     ``is_elsewhere``: it fits, beyond the gate.
     """
@@ -116,10 +116,17 @@ class GridLocalizer:
         self._floor = np.diag(params.submap.grid_bias_variance)
         self._gate = [gate(GATE_PROBABILITY, dof) for dof in (1, 2, 3)]
         self._last: Array | None = None
+        self._is_refuted = False
         self._scores = UsualScore()
 
     def is_due(self, pose: Array) -> bool:
-        """Whether the pose (3,) is at least a keyframe distance from the last match."""
+        """Whether the pose (3,) is at least a keyframe distance from the last match, or refuted.
+
+        One bad scan is no verdict on a robot that stands.
+        """
+        return self._is_refuted or self._is_far(pose)
+
+    def _is_far(self, pose: Array) -> bool:
         if self._last is None:
             return True
         step, p = se2.between(self._last, pose), self._p.back_end
@@ -129,8 +136,14 @@ class GridLocalizer:
     def update(self, state: JointState, points: Array, sweep: Sweep) -> GridMatch:
         """Match end points (n, 2), base frame, and update the state if the match is accepted.
 
-        They constrain the pose at the middle of the ``sweep``, as in the scan term.
+        They constrain the pose at the middle of the ``sweep``, as in the scan term. Less than a
+        keyframe distance from the last match, the state stays as it is.
         """
+        found = self._match(state, points, sweep)
+        self._is_refuted = found.refutes
+        return found
+
+    def _match(self, state: JointState, points: Array, sweep: Sweep) -> GridMatch:
         p = self._p.scan_match
         points = voxel_filter.thin(points, p.voxel_size, p.max_points)
         submap, yaw = self._saved.submap, self._saved.yaw
@@ -144,12 +157,14 @@ class GridLocalizer:
         if found.score < p.search_threshold:
             searched = match(submap, points, prior, strength, p)
             found = searched if searched.score > found.score else found
-        traced, is_weak = points[::BEAM_STEP], False
-        if self._scores.is_settled and found.score < WEAK * (usual := self._scores.mean):
-            is_weak = possible(submap, traced, found.pose, found.score, usual) < WEAK * usual
+        usual = self._scores.mean if self._scores.is_settled else 0.0
+        is_weak = is_misfit = False
+        if found.score < max(WEAK * usual, p.min_score):
+            open_share = unmapped_share(submap, points[::BEAM_STEP], found.pose)
+            is_weak = may_be(found.score, open_share, usual) < WEAK * usual
+            is_misfit = may_be(found.score, open_share, p.search_threshold) < p.min_score
         if found.score < p.min_score:
-            may_be = possible(submap, traced, found.pose, found.score, p.search_threshold)
-            return GridMatch(found.score, contradicts=is_weak or may_be < p.min_score)
+            return GridMatch(found.score, contradicts=is_weak or is_misfit)
         information = map_information(submap, points, found.pose, self._p)
         values, axes = np.linalg.eigh(information)
         keep = values > 1e-6
@@ -162,12 +177,12 @@ class GridLocalizer:
         d2 = float(v @ np.linalg.solve(S, v))
         if not len(v) or d2 > self._gate[len(v) - 1]:
             return GridMatch(found.score, is_weak=is_weak, is_elsewhere=True)
-        shared = at_most(self._saved.cov_cell, cov)
-        if shared.any():
-            root, v = relative_update(cov, shared, root, v)
-        state.apply(POSE_AND_SWEEP, root @ J, np.eye(len(v)), v)
-        self._last = state.pose
-        if not is_weak:
+        if self._is_far(state.pose):
+            shared = at_most(self._saved.cov_cell, cov)
+            if shared.any():
+                root, v = relative_update(cov, shared, root, v)
+            state.apply(POSE_AND_SWEEP, root @ J, np.eye(len(v)), v)
+            self._last = state.pose
             self._scores.learn(found.score)
         weakest = self._p.health.degeneracy_sigma**-2
         is_complete = len(v) == 3 and float(values[0]) >= weakest

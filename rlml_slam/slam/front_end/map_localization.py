@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from rlml_slam.estimation.kidnapping_detection import FEW
+from rlml_slam.estimation.kidnapping_detection import FEW, LAPSE
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Parameters
@@ -30,6 +30,7 @@ class MapLocalization:
         self.confirmation = MapConfirmation(params)
         self.grid_match = GridMatch(math.nan)
         self._grid: GridLocalizer | None = None
+        self._seen = 0  # stamp of the newest scan
 
     def use_map(self, reflectors: Reflectors, grid: OccupancyGrid | None) -> None:
         """Localize in this map from now on; the pose needs confirmation."""
@@ -59,9 +60,14 @@ class MapLocalization:
 
     def update(self, state: JointState, observation: Observation, sweep: Sweep) -> None:
         """Match the scan with the grid and update the state, once per keyframe distance."""
-        points = observation.points
-        if self._grid is None or points is None or len(points) < self._p.scan_match.min_points:
+        points, stamp = observation.points, observation.stamp
+        if self._grid is None:
             return
+        if points is None or len(points) < self._p.scan_match.min_points:
+            if stamp - self._seen > LAPSE * 1e9:
+                self.grid_match = GridMatch(math.nan)  # what it said is no longer about this place
+            return
+        self._seen = stamp
         if self._grid.is_due(state.pose):
             self.grid_match = self._grid.update(state, points, sweep)
 

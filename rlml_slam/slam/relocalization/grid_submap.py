@@ -14,7 +14,7 @@ from rlml_slam import params, se2
 from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.matching.scans.scan_match import UNKNOWN
 from rlml_slam.matching.scans.search_pyramid import Pyramid
-from rlml_slam.matching.scans.submap import P_MAX, P_MIN, Submap, value_of
+from rlml_slam.matching.scans.submap import FREE_VALUE, P_MAX, P_MIN, Submap, value_of
 from rlml_slam.se2 import Array
 
 # A map that was saved knows occupied and free alone. The cells beside a wall, which a beam hits as
@@ -76,6 +76,7 @@ def submap_of(grid: OccupancyGrid, parameters: params.Submap) -> GridSubmap:
     # of cells from 0 on, then of the unknown ones from -1 down
     known = np.clip(np.arange(128), 0, 100) / 100.0
     levels = value_of(P_MIN + (P_MAX - P_MIN) * known)
+    levels[levels <= FREE_VALUE] = 1  # free for sure: of many beams, and not of the first misses
     submap.values = np.concatenate([levels, np.zeros(128, dtype=np.uint16)])[cells.view(np.uint8)]
     corner = se2.rotation(-grid.yaw) @ np.array(grid.origin)
     lattice = np.round(corner / grid.resolution)
@@ -108,8 +109,18 @@ def possible(submap: Submap, points: Array, pose: Array, score: float, best: flo
     """The score at a pose if end points where nothing is mapped fitted as at the best place.
 
     A map in the making has one half of a symmetric hall before the other: that the known half
-    fits better says nothing. An end point behind a wall of the map does not fit in any case.
+    fits better says nothing.
     """
+    return may_be(score, unmapped_share(submap, points, pose), best)
+
+
+def may_be(score: float, unmapped: float, best: float) -> float:
+    """A score, where the ``unmapped`` share of the end points fitted as well as ``best``."""
+    return score + unmapped * max(best - UNKNOWN, 0.0)
+
+
+def unmapped_share(submap: Submap, points: Array, pose: Array) -> float:
+    """Share of the end points (n, 2) that are where nothing is mapped, and not behind a wall."""
     ends = se2.transform(pose, points)
     reach = float(np.hypot(points[:, 0], points[:, 1]).max())
     share = np.linspace(0.0, 1.0, min(max(2, int(reach / submap.resolution)), MAX_STEPS))[:, None]
@@ -118,7 +129,7 @@ def possible(submap: Submap, points: Array, pose: Array, score: float, best: flo
         # the laser is near enough to the base for this
         way = pose[:2] + share * (ends[k] - pose[:2])
         free[k] = not (_values(submap, way) > value_of(WALL)).any()
-    return score + float(np.mean(free)) * max(best - UNKNOWN, 0.0)
+    return float(np.mean(free))
 
 
 def _values(submap: Submap, points: Array) -> NDArray[np.uint16]:
