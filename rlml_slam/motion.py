@@ -208,21 +208,8 @@ def _drive(
     that of the middle (eq. 6). Of a gap that is all between the two stamps, the odometry says
     where it led to. A part of one longer than max_gap is unknown, but for COAST at its ends.
     """
-    cuts = np.empty(len(stamps) + len(imu_stamps) + 2, np.int64)
-    cuts[0], m, i, j = start, 1, 0, 0
-    while i < len(stamps) or j < len(imu_stamps):
-        if j == len(imu_stamps) or (i < len(stamps) and stamps[i] <= imu_stamps[j]):
-            stamp = stamps[i]
-            i += 1
-        else:
-            stamp = imu_stamps[j]
-            j += 1
-            if _is_bridged(i, start, end, stamps, n.max_gap):
-                continue  # the rates say how it turned, but not where it was then
-        if cuts[m - 1] < stamp < end:
-            cuts[m] = stamp
-            m += 1
-    cuts[m] = end
+    cuts = _cuts(start, end, stamps, imu_stamps, n.max_gap)
+    m = len(cuts) - 1
     rows = np.empty((8, m))
     all_known = True
     weight = weighted = turned = drove = 0.0
@@ -231,42 +218,9 @@ def _drive(
     for k in range(m):
         dt = (cuts[k + 1] - cuts[k]) / SECOND
         middle = (cuts[k] + cuts[k + 1]) // 2
-        at = np.searchsorted(stamps, middle)
-        # a robot goes within a control interval before its first odometry as at its beginning
-        if at == 0 and len(stamps) > 1 and stamps[0] - start <= n.noise_interval * SECOND:
-            at = 1
-        known = 0 < at < len(stamps) and not math.isnan(twists[at, 0])
-        gap = (stamps[at] - stamps[at - 1]) / SECOND if known else 0.0
-        bridged = _is_bridged(at, start, end, stamps, n.max_gap)
-        whole = _within(at, start, end, stamps) if known else 0.0
-        unsure = min(whole, gap - whole) if gap > n.max_gap else 0.0
-        known = known and unsure <= COAST
-        speed = sideways = turn = 0.0
-        sigma_v, sigma_w = n.max_speed / 5.0, n.max_turn_rate / 5.0
-        if known:
-            speed, turn = twists[at, 0], twists[at, 2]
-            sideways = n.moves_sideways * twists[at, 1]
-            way = math.hypot(speed, sideways)
-            moved = _share_moved(way, abs(turn), n) if gap > n.max_gap else 1.0
-            fast, quick, long_interval_noise = way / moved, abs(turn) / moved, 0.0
-            if gap > 2.0 * n.noise_interval:
-                # when inside a long interval the motion happened is uncertain; what is left of it
-                # at the end is less than what was driven: at least as fast as before, and no arc
-                long_interval_noise = n.long_interval_noise
-                before = _speed_before(at - 1, stamps, twists, n.noise_interval, n)
-                fast, quick = max(fast, before[0]), max(quick, before[1])
-                # a constant twist leads along an arc, which is longer than its chord
-                half = 0.5 * turn * (cuts[k + 1] - cuts[k]) / SECOND
-                chord = math.sin(half) / half if abs(half) > 1e-4 else 1.0
-                speed, sideways = chord * speed, chord * twists[at, 1]
-            sigma_v = (n.speed_noise + long_interval_noise) * fast + n.speed_noise_floor
-            sigma_w = (n.turn_noise + long_interval_noise) * quick + n.turn_noise_floor
-            sigma_v, sigma_w = math.sqrt(moved) * sigma_v, math.sqrt(moved) * sigma_w
-            if gap > n.max_gap:
-                # eq. 61: it went as far as at its speed before, wherever that led
-                usual = min(fast, _speed_before(at - 1, stamps, twists, RECENT, n)[0])
-                way2 = ((moved * usual) ** 2 - speed**2 - sideways**2) * dt**2
-                beside2 += max(way2, 0.0) * sigma_w**2 * n.noise_interval * dt / 6.0
+        by_wheels = _by_wheels(cuts[k], cuts[k + 1], start, end, stamps, twists, n)
+        at, known, bridged, unsure, speed, sideways, turn, sigma_v, sigma_w, aside2 = by_wheels
+        beside2 += aside2
         # the wheels do not turn: so does the robot not, and the IMU shows its bias
         stands = known and speed == 0.0 and sideways == 0.0 and turn == 0.0
         if stands:
@@ -316,6 +270,83 @@ def _drive(
     if weight > 0.0:
         return out, all_known, weighted / weight, 1.0 / weight, turned / weight, drove / weight
     return out, all_known, 0.0, np.inf, 0.0, 0.0
+
+
+@part
+def _cuts(
+    start: int, end: int, stamps: Stamps, imu_stamps: Stamps, max_gap: float
+) -> NDArray[np.int64]:
+    """All stamps from ``start`` to ``end`` at which odometry or IMU has a sample, with both ends.
+
+    Of the IMU, none in a long gap of odometry that is all between the two.
+    """
+    cuts = np.empty(len(stamps) + len(imu_stamps) + 2, np.int64)
+    cuts[0], m, i, j = start, 1, 0, 0
+    while i < len(stamps) or j < len(imu_stamps):
+        if j == len(imu_stamps) or (i < len(stamps) and stamps[i] <= imu_stamps[j]):
+            stamp = stamps[i]
+            i += 1
+        else:
+            stamp = imu_stamps[j]
+            j += 1
+            if _is_bridged(i, start, end, stamps, max_gap):
+                continue  # the rates say how it turned, but not where it was then
+        if cuts[m - 1] < stamp < end:
+            cuts[m] = stamp
+            m += 1
+    cuts[m] = end
+    return cuts[: m + 1]
+
+
+@part
+def _by_wheels(
+    begin: int, finish: int, start: int, end: int, stamps: Stamps, twists: Array, n: _Noise
+) -> tuple[int, bool, bool, float, float, float, float, float, float, float]:
+    """What odometry says of the piece from ``begin`` to ``finish``, of all from start to end.
+
+    The number of its next sample, whether it knows the motion, whether it is in a long gap that it
+    bridges, time near the end of such a gap [s], speed, sideways speed, turn rate, sigmas of speed
+    and turn rate, and variance beside the way [m^2].
+    """
+    dt, middle = (finish - begin) / SECOND, (finish + begin) // 2
+    beside2 = 0.0
+    at = int(np.searchsorted(stamps, middle))
+    # a robot goes within a control interval before its first odometry as at its beginning
+    if at == 0 and len(stamps) > 1 and stamps[0] - start <= n.noise_interval * SECOND:
+        at = 1
+    known = bool(0 < at < len(stamps) and not math.isnan(twists[at, 0]))
+    gap = (stamps[at] - stamps[at - 1]) / SECOND if known else 0.0
+    bridged = _is_bridged(at, start, end, stamps, n.max_gap)
+    whole = _within(at, start, end, stamps) if known else 0.0
+    unsure = min(whole, gap - whole) if gap > n.max_gap else 0.0
+    known = known and unsure <= COAST
+    speed = sideways = turn = 0.0
+    sigma_v, sigma_w = n.max_speed / 5.0, n.max_turn_rate / 5.0
+    if known:
+        speed, turn = twists[at, 0], twists[at, 2]
+        sideways = n.moves_sideways * twists[at, 1]
+        way = math.hypot(speed, sideways)
+        moved = _share_moved(way, abs(turn), n) if gap > n.max_gap else 1.0
+        fast, quick, long_interval_noise = way / moved, abs(turn) / moved, 0.0
+        if gap > 2.0 * n.noise_interval:
+            # when inside a long interval the motion happened is uncertain; what is left of it
+            # at the end is less than what was driven: at least as fast as before, and no arc
+            long_interval_noise = n.long_interval_noise
+            before = _speed_before(at - 1, stamps, twists, n.noise_interval, n)
+            fast, quick = max(fast, before[0]), max(quick, before[1])
+            # a constant twist leads along an arc, which is longer than its chord
+            half = 0.5 * turn * (finish - begin) / SECOND
+            chord = math.sin(half) / half if abs(half) > 1e-4 else 1.0
+            speed, sideways = chord * speed, chord * twists[at, 1]
+        sigma_v = (n.speed_noise + long_interval_noise) * fast + n.speed_noise_floor
+        sigma_w = (n.turn_noise + long_interval_noise) * quick + n.turn_noise_floor
+        sigma_v, sigma_w = math.sqrt(moved) * sigma_v, math.sqrt(moved) * sigma_w
+        if gap > n.max_gap:
+            # eq. 61: it went as far as at its speed before, wherever that led
+            usual = min(fast, _speed_before(at - 1, stamps, twists, RECENT, n)[0])
+            way2 = ((moved * usual) ** 2 - speed**2 - sideways**2) * dt**2
+            beside2 = max(way2, 0.0) * sigma_w**2 * n.noise_interval * dt / 6.0
+    return at, known, bridged, unsure, speed, sideways, turn, sigma_v, sigma_w, beside2
 
 
 @part

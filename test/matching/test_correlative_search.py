@@ -7,6 +7,7 @@ from made_rooms import ROOM, built, path, scan
 
 from rlml_slam import se2
 from rlml_slam.matching.scans import correlative_search
+from rlml_slam.matching.scans.correlative_search import Prior
 from rlml_slam.matching.scans.submap import P_MAX, P_MIN, STEP, Submap
 from rlml_slam.matching.scans.voxel_filter import thin
 
@@ -23,10 +24,15 @@ def points():
     return thin(scan(ROOM, TRUE, 360, sigma=0.01), 0.05, 150)
 
 
+def none(pose):
+    """A pose to search around, which nothing speaks for."""
+    return Prior(pose, np.zeros((3, 3)), 3.0)
+
+
 @pytest.mark.parametrize('stride', [1, 2])
 def test_window_takes_the_best_of_its_lattice(room, points, stride):
     offset = np.array([2 * stride * room.resolution, -stride * room.resolution, 0.0])
-    found = correlative_search.window(room, points, TRUE + offset, 0.2, 0.0, stride=stride)
+    found = correlative_search.window(room, points, none(TRUE + offset), 0.2, 0.0, stride=stride)
     np.testing.assert_allclose(found.pose, TRUE, atol=1e-12)
     cells = np.floor(se2.transform(TRUE, points) / room.resolution).astype(int) - room.corner
     # an unknown cell counts as value 0, one level below P_MIN
@@ -37,7 +43,7 @@ def test_window_takes_the_best_of_its_lattice(room, points, stride):
 def test_window_at_the_border_counts_what_is_inside(room):
     b = room.bounds
     edge = np.array([[b[2] - 0.01, b[3] - 0.01], [b[0] + 0.01, b[1] + 0.01], [b[2] + 9.0, 0.0]])
-    found = correlative_search.window(room, edge, np.zeros(3), 0.5, 0.2)
+    found = correlative_search.window(room, edge, none(np.zeros(3)), 0.5, 0.2)
     assert P_MIN - 1e-4 <= found.score <= P_MAX
 
 
@@ -47,7 +53,7 @@ def test_prior_decides_where_the_scan_does_not():
     seen = scan(wall, np.array([0.5, 0.0, 0.0]), 360, max_range=3.0)
     W = np.diag([100.0, 100.0, 200.0])
     prior = np.array([0.57, 0.1, 0.0])
-    found = correlative_search.window(submap, seen, prior, 0.2, 0.1, W)
+    found = correlative_search.window(submap, seen, Prior(prior, W, 3.0), 0.2, 0.1)
     assert found.pose[0] == prior[0]
     assert abs(found.pose[1]) <= 0.051
 
@@ -66,4 +72,4 @@ def test_pose_that_no_cell_can_have_meets_nothing(room, points, far, place):
     pose = np.zeros(3)
     pose[place] = far
     with np.errstate(invalid='ignore'):
-        assert correlative_search.window(room, points, pose, 0.5, 0.1).score == P_MIN
+        assert correlative_search.window(room, points, none(pose), 0.5, 0.1).score == P_MIN

@@ -60,10 +60,7 @@ def test_gradient_is_the_derivative_of_the_cost(room):
 
     def cost(pose):
         out = np.empty(12)
-        j, i = room.corner
-        scan_match.accumulate(
-            room.values, float(j), float(i), 1.0 / room.resolution, points, held, pose, out
-        )
+        scan_match.accumulate(room.grid, points, held, pose, out)
         return out
 
     for pose in (

@@ -136,6 +136,24 @@ class PosePrior(NamedTuple):
     gate2: float
 
 
+class Proposal(NamedTuple):
+    """A pose by a pair of matches: heading (cos, sin) and (x, y).
+
+    The variances are of the point of the detections that does not move with the heading, and of
+    the heading.
+    """
+
+    number: int
+    cos: float
+    sin: float
+    x: float
+    y: float
+    fixed_x: float
+    fixed_y: float
+    var_fixed: float
+    var_turn: float
+
+
 class Votes(NamedTuple):
     """``counts`` (h,) of matches and ``bases`` (h, 4), detections a, b and their reflectors.
 
@@ -158,7 +176,6 @@ def vote(
     A pose must lie within the gate of the prior. After ``max_tests`` the search ends.
     """
     z, z_var, p, p_var = seen.points, seen.var, known.points, known.var
-    information = prior.information
     k, m = len(z), len(p)
     g = math.sqrt(gate2)
     widest_var = 0.0
@@ -167,8 +184,7 @@ def vote(
     counts = np.zeros(CAPACITY, np.int64)
     bases = np.zeros((CAPACITY, 4), np.int64)
     kept, proposals, best, need, stamp = 0, 0, 0, MIN_MATCHES, 0
-    taken = np.zeros(m, np.int64)
-    lens = np.zeros(k, np.int64)
+    taken, lens = np.zeros(m, np.int64), np.zeros(k, np.int64)
     tests = 0
     for a in range(k):
         for b in range(a + 1, k):
@@ -202,47 +218,20 @@ def vote(
                 mx, my = z[a, 0] + share * dx, z[a, 1] + share * dy
                 nx, ny = p[i, 0] + share * ex, p[i, 1] + share * ey
                 tx, ty = nx - cos * mx + sin * my, ny - sin * mx - cos * my
-                if information[2, 2] > 0.0:
-                    ux, uy = tx - prior.pose[0], ty - prior.pose[1]
-                    ut = wrapped_by_turns(math.atan2(sin, cos) - prior.pose[2])
-                    d2 = (
-                        information[0, 0] * ux * ux + information[1, 1] * uy * uy
-                        + information[2, 2] * ut * ut + 2.0 * information[0, 1] * ux * uy
-                        + 2.0 * (information[0, 2] * ux + information[1, 2] * uy) * ut
-                    )  # fmt: skip
-                    if d2 > prior.gate2:
-                        continue
+                if _distance2(prior, tx, ty, cos, sin) > prior.gate2:
+                    continue
                 proposals += 1
                 if 2 + inside < need:
                     continue
                 stamp += 1
                 taken[i] = taken[j] = stamp
-                count = 2
-                var_mean = var_a * var_b / both
-                var_turn = both / (length * length)
-                for n in range(inside):
-                    if count + inside - n < need:
-                        break
-                    tests += 1
-                    c = lens[n]
-                    x = tx + cos * z[c, 0] - sin * z[c, 1]
-                    y = ty + sin * z[c, 0] + cos * z[c, 1]
-                    cell = cell_of(x, y, buckets)
-                    if cell < 0:
-                        continue
-                    arm2 = (z[c, 0] - mx) ** 2 + (z[c, 1] - my) ** 2
-                    var = z_var[c] + var_mean + arm2 * var_turn
-                    nearest, least = -1, math.inf
-                    begin, end = buckets.starts[cell], buckets.starts[cell + 1]
-                    tests += end - begin
-                    for s in range(begin, end):
-                        r = buckets.members[s]
-                        d2 = ((x - p[r, 0]) ** 2 + (y - p[r, 1]) ** 2) / (var + p_var[r])
-                        if d2 <= gate2 and d2 < least:
-                            nearest, least = r, d2
-                    if nearest >= 0 and taken[nearest] != stamp:
-                        taken[nearest] = stamp
-                        count += 1
+                proposal = Proposal(
+                    stamp, cos, sin, tx, ty, mx, my, var_a * var_b / both, both / (length * length)
+                )
+                count, tested = _count(
+                    seen, known, buckets, lens[:inside], proposal, gate2, need, taken
+                )
+                tests += tested
                 if count < need:
                     continue
                 if count > best:
@@ -258,6 +247,59 @@ def vote(
                 kept += 1
     kept = _drop(counts, bases, kept, need)
     return Votes(counts[:kept], bases[:kept], proposals, True)
+
+
+@part
+def _distance2(prior: PosePrior, x: float, y: float, cos: float, sin: float) -> float:
+    """Squared Mahalanobis distance of a pose from the prior, 0 without one."""
+    information = prior.information
+    if information[2, 2] <= 0.0:
+        return 0.0
+    ux, uy = x - prior.pose[0], y - prior.pose[1]
+    ut = wrapped_by_turns(math.atan2(sin, cos) - prior.pose[2])
+    return float(
+        information[0, 0] * ux * ux + information[1, 1] * uy * uy
+        + information[2, 2] * ut * ut + 2.0 * information[0, 1] * ux * uy
+        + 2.0 * (information[0, 2] * ux + information[1, 2] * uy) * ut
+    )  # fmt: skip
+
+
+@part
+def _count(
+    seen: Measured, known: Measured, buckets: Buckets, others: Ints, pose: Proposal, gate2: float,
+    need: int, taken: Ints,
+) -> tuple[int, int]:  # fmt: skip
+    """How many detections match at a pose, the pair included, and how many tests that took.
+
+    Of the ``others``; once there cannot be ``need`` any more, it ends. ``taken`` (m,) has the
+    number of the last pose at which each reflector was matched.
+    """
+    z, p = seen.points, known.points
+    count, tests = 2, 0
+    for n in range(len(others)):
+        if count + len(others) - n < need:
+            break
+        tests += 1
+        c = others[n]
+        x = pose.x + pose.cos * z[c, 0] - pose.sin * z[c, 1]
+        y = pose.y + pose.sin * z[c, 0] + pose.cos * z[c, 1]
+        cell = cell_of(x, y, buckets)
+        if cell < 0:
+            continue
+        arm2 = (z[c, 0] - pose.fixed_x) ** 2 + (z[c, 1] - pose.fixed_y) ** 2
+        var = seen.var[c] + pose.var_fixed + arm2 * pose.var_turn
+        nearest, least = -1, math.inf
+        begin, end = buckets.starts[cell], buckets.starts[cell + 1]
+        tests += end - begin
+        for s in range(begin, end):
+            r = buckets.members[s]
+            d2 = ((x - p[r, 0]) ** 2 + (y - p[r, 1]) ** 2) / (var + known.var[r])
+            if d2 <= gate2 and d2 < least:
+                nearest, least = r, d2
+        if nearest >= 0 and taken[nearest] != pose.number:
+            taken[nearest] = pose.number
+            count += 1
+    return count, tests
 
 
 @part

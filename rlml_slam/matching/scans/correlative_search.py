@@ -4,33 +4,48 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.compiled import brief, kernel
 from rlml_slam.matching.scans.branch_and_bound import Candidate
+from rlml_slam.matching.scans.ray_carving import Grid
 from rlml_slam.matching.scans.submap import LEVELS, P_MAX, P_MIN, Submap
 from rlml_slam.se2 import Array, wrap
 
 FARTHEST = 1e15  # [cells] beyond which nothing is in any grid
 
 
+class Prior(NamedTuple):
+    """A pose (3,) that is expected; its offset has unit variance by ``whitening`` (3, 3).
+
+    It has less and less of a say beyond ``robust_scale`` sigmas. Zeros leave the scan alone.
+    """
+
+    pose: Array
+    whitening: Array
+    robust_scale: float
+
+
+class Lattice(NamedTuple):
+    """(2 n + 1)^2 shifts by ``stride`` cells and 2 m + 1 angles by ``step`` [rad] about a pose."""
+
+    n: int
+    stride: int
+    m: int
+    step: float
+
+
 def window(
-    submap: Submap,
-    points: Array,
-    pose: Array,
-    half_width: float,
-    half_angle: float,
-    whitening: Array | None = None,
-    prior_robust_scale: float = 3.0,
-    share: float = 0.05,
-    stride: int = 1,
-) -> Candidate:
-    """The best pose on a lattice around ``pose`` (3,), ties to the nearest.
+    submap: Submap, points: Array, prior: Prior, half_width: float, half_angle: float,
+    share: float = 0.05, stride: int = 1,
+) -> Candidate:  # fmt: skip
+    """The best pose on a lattice around that of the ``prior``, ties to the nearest.
 
     The objective is the mean of M less prior_loss(): where the scan leaves the pose open
-    (along a corridor), the prior determines it. Without ``whitening`` (3, 3) it is the scan alone.
+    (along a corridor), the prior determines it.
 
     ``points`` (n, 2) in the base frame. Shifts are multiples of ``stride`` cells; the angular
     step moves the mean end point by as much.
@@ -41,50 +56,35 @@ def window(
     step = min(max(spacing / max(reach, spacing), 0.005 * stride), 0.05 * stride)
     m = math.ceil(half_angle / step)
     step = half_angle / m if m else 0.0
-    j, i = submap.corner
+    unit = share * len(points) * LEVELS / (P_MAX - P_MIN)
     x, y, theta, total = search_window(
-        submap.values, float(j), float(i), 1.0 / submap.resolution, points, pose, n, stride, m,
-        step, np.zeros((3, 3)) if whitening is None else whitening, prior_robust_scale,
-        share * len(points) * LEVELS / (P_MAX - P_MIN),
-    )  # fmt: skip
+        submap.grid, points, prior, Lattice(n, stride, m, step), unit
+    )
     score = P_MIN + (P_MAX - P_MIN) * total / (LEVELS * max(len(points), 1))
     return Candidate(np.array([x, y, float(wrap(theta))]), score)
 
 
 @brief
-def prior_loss(
-    x: float, y: float, turn: float, whitening: Array, prior_robust_scale: float
-) -> float:
-    """Sum over u = whitening @ (x, y, turn) of v^2 / (1 + v^2), v = u_k / prior_robust_scale."""
+def prior_loss(x: float, y: float, turn: float, whitening: Array, robust_scale: float) -> float:
+    """Sum over u = whitening @ (x, y, turn) of v^2 / (1 + v^2), v = u_k / robust_scale."""
     loss = 0.0
     for h in range(3):
-        u = (
-            whitening[h, 0] * x + whitening[h, 1] * y + whitening[h, 2] * turn
-        ) / prior_robust_scale
+        u = (whitening[h, 0] * x + whitening[h, 1] * y + whitening[h, 2] * turn) / robust_scale
         loss += u * u / (1.0 + u * u)
     return loss
 
 
 @kernel
 def search_window(
-    values: NDArray[np.uint16],
-    corner_j: float,
-    corner_i: float,
-    scale: float,
-    points: Array,
-    pose: Array,
-    n: int,
-    stride: int,
-    m: int,
-    step: float,
-    whitening: Array,
-    prior_robust_scale: float,
-    unit: float,
+    grid: Grid, points: Array, prior: Prior, lattice: Lattice, unit: float
 ) -> tuple[float, float, float, int]:
-    """Exhaustive sum of cell values over (2 n + 1)^2 shifts and 2 m + 1 angles.
+    """Exhaustive sum of cell values over a lattice.
 
     ``unit`` is the sum of cell values that a component far from the prior costs.
     """
+    values, corner_j, corner_i, scale = grid
+    pose, whitening, robust_scale = prior
+    n, stride, m, step = lattice
     width, reach = 2 * n + 1, n * stride
     rows, columns = values.shape
     flat = values.reshape(-1)
@@ -118,7 +118,7 @@ def search_window(
             for q in range(width):
                 di, dj = (r - n) * stride, (q - n) * stride
                 distance = di * di + dj * dj + a * a
-                loss = prior_loss(dj / scale, di / scale, a * step, whitening, prior_robust_scale)
+                loss = prior_loss(dj / scale, di / scale, a * step, whitening, robust_scale)
                 value = sums[r, q] - unit * loss
                 if value > best or (value == best and distance < best_distance):
                     best, best_distance, best_sum = value, distance, sums[r, q]
@@ -147,4 +147,4 @@ def warm_up() -> None:
     submap = Submap()
     points = np.array([[1.0, 0.5], [-0.5, 1.0], [0.3, -0.8]])
     submap.insert(points, np.zeros(2))
-    window(submap, points, np.zeros(3), 0.1, 0.1)
+    window(submap, points, Prior(np.zeros(3), np.zeros((3, 3)), 3.0), 0.1, 0.1)

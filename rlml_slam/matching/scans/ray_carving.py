@@ -9,6 +9,7 @@ cells are the same as if every ray were followed from the sensor on.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,24 +27,29 @@ LAST = 4.0 * HALF  # [cells] of the last two cells of a ray, which it does not m
 Cells = NDArray[np.uint16]
 
 
+class Grid(NamedTuple):
+    """Cells ``values`` (rows, columns) as kernels take them.
+
+    ``corner_j`` and ``corner_i`` are the lattice indices of the first, ``scale`` cells per metre.
+    """
+
+    values: Cells
+    corner_j: float
+    corner_i: float
+    scale: float
+
+
 @kernel
 def carve(
-    values: Cells,
-    points: Array,
-    origin: Array,
-    corner_j: float,
-    corner_i: float,
-    scale: float,
-    hit: Cells,
-    miss: Cells,
-    touched: NDArray[np.int32],
+    grid: Grid, points: Array, origin: Array, hit: Cells, miss: Cells, touched: NDArray[np.int32]
 ) -> int:
-    """Apply one scan to ``values``; cells listed, or -1 if the list ``touched`` is too short.
+    """Apply one scan to a grid; cells listed, or -1 if the list ``touched`` is too short.
 
     ``points`` (n, 2) are end points in scan order. Cells outside of the area that rays cover are
     marked with the top bit and listed, and unmarked at the end. The length of the list is checked
     before anything is changed.
     """
+    values, corner_j, corner_i, scale = grid
     columns = values.shape[1]
     flat = values.reshape(-1)
     x0, y0 = origin[0] * scale - corner_j, origin[1] * scale - corner_i
@@ -256,4 +262,4 @@ def warm_up() -> None:
     """Compile the kernel with the signature that is used at run time."""
     touched, table = np.zeros(64, dtype=np.int32), np.zeros(0x8000, dtype=np.uint16)
     values, points = np.zeros((16, 16), dtype=np.uint16), np.array([[12.0, 9.0], [11.0, 10.0]])
-    carve(values, points, np.array([3.0, 3.0]), 0.0, 0.0, 1.0, table, table, touched)
+    carve(Grid(values, 0.0, 0.0, 1.0), points, np.array([3.0, 3.0]), table, table, touched)

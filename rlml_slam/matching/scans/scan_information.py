@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlml_slam.compiled import kernel, part
+from rlml_slam.matching.scans.ray_carving import Grid
 from rlml_slam.matching.scans.scan_match import INLIER, downward, sample, sample_curved
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.matching.scans.surfaces import MAX_STEP
@@ -32,21 +33,14 @@ SURE = 3.0  # [sigma] by which a weak direction has to be held by more than nois
 
 
 @part
-def _accumulate(
-    values: NDArray[np.uint16],
-    corner_j: float,
-    corner_i: float,
-    scale: float,
-    points: Array,
-    pose: Array,
-    sparse: bool,
-) -> tuple[Array, float]:
+def _accumulate(grid: Grid, points: Array, pose: Array, sparse: bool) -> tuple[Array, float]:
     """Sum of J^T J over the inliers (3, 3), x, y, theta of the pose in the submap frame.
 
     Then by how much (one sigma) the noise of the normals may leave more in a direction that is
     along all surfaces than was taken off for it. ``sparse``: whether far surfaces
     that only a few beams hit count too.
     """
+    values, corner_j, corner_i, scale = grid
     H, unsure = np.zeros((3, 3)), 0.0
     J = np.empty(3)
     c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -166,10 +160,8 @@ def information(
     on a wall far away, if it is more than the noise of all normals may make up, up to what counts
     as open. The curvature of the scan term (eq. 11) is not: the grid's texture is in it.
     """
-    j, i = submap.corner
     return _information(
-        submap.values, float(j), float(i), 1.0 / submap.resolution,
-        np.ascontiguousarray(points, dtype=np.float64),
+        submap.grid, np.ascontiguousarray(points, dtype=np.float64),
         np.ascontiguousarray(pose, dtype=np.float64),
         params.sigma_point, np.array(params.variance_floor), alone,
     )  # fmt: skip
@@ -177,18 +169,10 @@ def information(
 
 @kernel
 def _information(
-    values: NDArray[np.uint16],
-    corner_j: float,
-    corner_i: float,
-    scale: float,
-    points: Array,
-    pose: Array,
-    sigma_point: float,
-    floor2: Array,
-    alone: bool,
+    grid: Grid, points: Array, pose: Array, sigma_point: float, floor2: Array, alone: bool
 ) -> Array:
     """Kernel of information()."""
-    H, unsure = _accumulate(values, corner_j, corner_i, scale, points, pose, alone)
+    H, unsure = _accumulate(grid, points, pose, alone)
     # eigenvalues of metres and radians compare at the scan's own lever
     # what is taken off for noise can exceed what there is: a diagonal may be negative
     lever = max(math.sqrt(max(H[2, 2], 0.0) / max(H[0, 0] + H[1, 1], 1e-9)), 0.1)

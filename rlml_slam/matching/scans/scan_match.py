@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from rlml_slam import params
 from rlml_slam.compiled import brief, kernel, part
 from rlml_slam.matching.scans import correlative_search, surfaces
+from rlml_slam.matching.scans.correlative_search import Prior
+from rlml_slam.matching.scans.ray_carving import Grid
 from rlml_slam.matching.scans.submap import FREE_VALUE, NEVER_HIT, P_MIN, STEP, Submap
 from rlml_slam.se2 import Array, wrapped
 
@@ -148,21 +150,13 @@ def missed_probability(values: NDArray[np.uint16], column: float, row: float) ->
 
 
 @kernel
-def accumulate(
-    values: NDArray[np.uint16],
-    corner_j: float,
-    corner_i: float,
-    scale: float,
-    points: Array,
-    constraints: Array,
-    pose: Array,
-    out: Array,
-) -> None:
+def accumulate(grid: Grid, points: Array, constraints: Array, pose: Array, out: Array) -> None:
     """Scan term into ``out`` (12,): cost, g (3), H upper triangle (6), sum of M, inliers.
 
     H is Newton's, made positive semidefinite point by point: with e far from 0 even at the
     optimum, J^T J alone misses most of the curvature on the ridge, and steps overshoot.
     """
+    values, corner_j, corner_i, scale = grid
     out[:] = 0.0
     x, y = pose[0], pose[1]
     c, s = np.cos(pose[2]), np.sin(pose[2])
@@ -223,12 +217,8 @@ def downward(a: float, b: float, d: float) -> tuple[float, float, float]:
 def linearize(submap: Submap, points: Array, pose: Array) -> ScanTerm:
     """The scan term of ``points`` (n, 2), base frame, at ``pose`` (3,) of base in the submap."""
     points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
-    out = np.empty(12)
-    j, i = submap.corner
-    accumulate(
-        submap.values, float(j), float(i), 1.0 / submap.resolution, points,
-        surfaces.constraints(points), np.ascontiguousarray(pose, dtype=np.float64), out,
-    )  # fmt: skip
+    out, pose = np.empty(12), np.ascontiguousarray(pose, dtype=np.float64)
+    accumulate(submap.grid, points, surfaces.constraints(points), pose, out)
     n = len(points)
     return ScanTerm(
         float(out[0]), out[1:4].copy(), symmetric(out[4:10]),
@@ -244,20 +234,9 @@ def symmetric(upper: Array) -> Array:
 
 @kernel
 def refine(
-    values: NDArray[np.uint16],
-    corner_j: float,
-    corner_i: float,
-    scale: float,
-    points: Array,
-    constraints: Array,
-    start: Array,
-    prior: Array,
-    whitening: Array,
-    prior_robust_scale: float,
-    sigma: float,
-    max_iterations: int,
-    out: Array,
-) -> tuple[float, float, float, float, int, bool]:
+    grid: Grid, points: Array, constraints: Array, start: Array, prior: Prior, sigma: float,
+    max_iterations: int, out: Array,
+) -> tuple[float, float, float, float, int, bool]:  # fmt: skip
     """LM on scan term / sigma^2 + robust prior; (x, y, theta, weight, iterations, converged).
 
     ``out`` (12,) holds the scan term at the result.
@@ -268,15 +247,15 @@ def refine(
     term = np.empty(12)
     A = np.empty((3, 3))
     b = np.empty(3)
-    accumulate(values, corner_j, corner_i, scale, points, constraints, pose, out)
-    cost, weight = prior_term(pose, prior, whitening, prior_robust_scale, A, b)
+    accumulate(grid, points, constraints, pose, out)
+    cost, weight = prior_term(pose, prior, A, b)
     cost += w * out[0]
     damping = 1e-4
     iterations = 0
     converged = False
     while iterations < max_iterations and not converged:
         iterations += 1
-        _, weight = prior_term(pose, prior, whitening, prior_robust_scale, A, b)
+        _, weight = prior_term(pose, prior, A, b)
         n = 4
         for r in range(3):
             b[r] += w * out[1 + r]
@@ -288,8 +267,8 @@ def refine(
         step = solve3(A, b)
         for r in range(3):
             trial[r] = pose[r] - step[r]
-        accumulate(values, corner_j, corner_i, scale, points, constraints, trial, term)
-        trial_cost, _ = prior_term(trial, prior, whitening, prior_robust_scale, A, b)
+        accumulate(grid, points, constraints, trial, term)
+        trial_cost, _ = prior_term(trial, prior, A, b)
         trial_cost += w * term[0]
         converged = abs(step[0]) < 1e-4 and abs(step[1]) < 1e-4 and abs(step[2]) < 1e-5
         if trial_cost <= cost:
@@ -303,23 +282,22 @@ def refine(
 
 
 @kernel
-def prior_term(
-    pose: Array, prior: Array, whitening: Array, prior_robust_scale: float, A: Array, b: Array
-) -> tuple[float, float]:
+def prior_term(pose: Array, prior: Prior, A: Array, b: Array) -> tuple[float, float]:
     """Cost and smallest weight of the prior; its Hessian into A (3, 3), its gradient into b (3,).
 
     Each component of u = whitening (pose - prior) has a Geman-McClure loss of its own: it is a
     Gaussian near the prior and has no say far from it, so a component of the odometry that is
     plainly wrong loses against the scan, and the others stay.
     """
-    d0, d1 = pose[0] - prior[0], pose[1] - prior[1]
-    d2 = np.pi - np.mod(np.pi - (pose[2] - prior[2]), 2.0 * np.pi)
+    at, whitening, robust_scale = prior
+    d0, d1 = pose[0] - at[0], pose[1] - at[1]
+    d2 = np.pi - np.mod(np.pi - (pose[2] - at[2]), 2.0 * np.pi)
     A[:] = 0.0
     b[:] = 0.0
     cost, weight = 0.0, 1.0
     for h in range(3):
         u = whitening[h, 0] * d0 + whitening[h, 1] * d1 + whitening[h, 2] * d2
-        k = 1.0 / (1.0 + u * u / (prior_robust_scale * prior_robust_scale))
+        k = 1.0 / (1.0 + u * u / (robust_scale * robust_scale))
         cost += 0.5 * u * u * k
         weight = min(weight, k * k)
         for r in range(3):
@@ -385,7 +363,8 @@ def match(
     W = whitening_of(
         np.ascontiguousarray(prior_information, dtype=np.float64), float(prior_pose[2])
     )
-    solve = _Solve(submap, points, surfaces.constraints(points), prior_pose, W, p)
+    prior = Prior(prior_pose, W, p.prior_robust_scale)
+    solve = _Solve(submap, points, surfaces.constraints(points), prior, p)
     if not searched:
         return solve.refined(prior_pose)
     width, angle = (p.search_window, p.search_angle) if window is None else window
@@ -407,30 +386,25 @@ class _Solve:
     submap: Submap
     points: Array
     constraints: Array
-    prior: Array
-    whitening: Array
+    prior: Prior
     p: params.ScanMatch
 
     def found(self, half_width: float, half_angle: float, stride: int) -> Array:
         """The best pose of a window search around the prior."""
-        p = self.p
         return correlative_search.window(
-            self.submap, self.points, self.prior, half_width, half_angle, self.whitening,
-            p.prior_robust_scale, p.search_prior_weight, stride,
+            self.submap, self.points, self.prior, half_width, half_angle,
+            self.p.search_prior_weight, stride,
         ).pose  # fmt: skip
 
     def refined(self, start: Array) -> ScanMatchResult:
         """The local optimum from ``start``."""
-        p, (j, i), out = self.p, self.submap.corner, np.empty(12)
+        p, out = self.p, np.empty(12)
         x, y, theta, weight, iterations, converged = refine(
-            self.submap.values, float(j), float(i), 1.0 / self.submap.resolution, self.points,
-            self.constraints, start, self.prior, self.whitening, p.prior_robust_scale, p.sigma,
+            self.submap.grid, self.points, self.constraints, start, self.prior, p.sigma,
             p.max_iterations, out,
         )  # fmt: skip
         A, pull = np.empty((3, 3)), np.empty(3)
-        prior_term(
-            np.array([x, y, theta]), self.prior, self.whitening, p.prior_robust_scale, A, pull
-        )
+        prior_term(np.array([x, y, theta]), self.prior, A, pull)
         return ScanMatchResult(
             np.array([x, y, wrapped(theta)]), symmetric(out[4:10]) / p.sigma**2,
             float(out[10]) / len(self.points), iterations, converged, weight, pull,
@@ -438,10 +412,11 @@ class _Solve:
 
     def merit(self, result: ScanMatchResult) -> float:
         """Score less what the prior has against the pose, as in the search."""
-        x, y, turn = result.pose - self.prior
-        p, turn = self.p, wrapped(turn)
-        loss = correlative_search.prior_loss(x, y, turn, self.whitening, p.prior_robust_scale)
-        return result.score - p.search_prior_weight * loss
+        x, y, turn = result.pose - self.prior.pose
+        loss = correlative_search.prior_loss(
+            x, y, wrapped(turn), self.prior.whitening, self.prior.robust_scale
+        )
+        return result.score - self.p.search_prior_weight * loss
 
 
 def warm_up() -> None:

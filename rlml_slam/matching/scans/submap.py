@@ -21,7 +21,7 @@ from rlml_slam import params
 from rlml_slam.compiled import brief, kernel
 from rlml_slam.errors import InputError
 from rlml_slam.matching.scans import surfaces
-from rlml_slam.matching.scans.ray_carving import carve
+from rlml_slam.matching.scans.ray_carving import Grid, carve
 from rlml_slam.se2 import Array
 
 P_MIN, P_MAX = 0.1, 0.97
@@ -95,6 +95,11 @@ class Submap:
         return self.insertions
 
     @property
+    def grid(self) -> Grid:
+        """The cells as kernels take them."""
+        return Grid(self.values, float(self.corner[0]), float(self.corner[1]), 1 / self.resolution)
+
+    @property
     def bounds(self) -> Array:
         """Extent (x_min, y_min, x_max, y_max) [m] of the allocated grid in the submap frame."""
         (j, i), (rows, columns) = self.corner, self.values.shape
@@ -118,13 +123,9 @@ class Submap:
         if not (math.isfinite(x_max - x_min) and math.isfinite(y_max - y_min)):
             raise InputError('scan for a submap has an end point or origin that is not finite')
         self._cover(x_min, y_min, x_max, y_max)
-        j, i = self.corner
-        points = surfaces.fill(points, self.resolution)
+        points, grid = surfaces.fill(points, self.resolution), self.grid
         while True:
-            used = carve(
-                self.values, points, origin, float(j), float(i), 1.0 / self.resolution,
-                self._hit, self._miss, self._list,
-            )  # fmt: skip
+            used = carve(grid, points, origin, self._hit, self._miss, self._list)
             if used >= 0:
                 break
             self._list = np.zeros(max(2 * len(self._list), FIRST_LIST), dtype=np.int32)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rlml_slam import se2
 from rlml_slam.compiled import kernel, part
+from rlml_slam.matching.scans.ray_carving import Grid
 from rlml_slam.matching.scans.submap import Submap, value_of
 from rlml_slam.se2 import Array
 
@@ -31,20 +32,15 @@ def hidden_share(submap: Submap, points: Array, origin: Array, pose: Array) -> f
     ``origin`` (2,) is the laser's place; both are in the base frame.
     """
     ends = se2.transform(pose, np.asarray(points, dtype=np.float64))
-    j, i = submap.corner
-    hidden = count_hidden(
-        submap.values, j, i, 1.0 / submap.resolution, max(ASIDE, 2.0 * submap.resolution),
-        se2.transform(pose, origin[None])[0], ends,
-    )  # fmt: skip
+    aside = max(ASIDE, 2.0 * submap.resolution)
+    hidden = count_hidden(submap.grid, aside, se2.transform(pose, origin[None])[0], ends)
     return hidden / max(len(points), 1)
 
 
 @kernel
-def count_hidden(
-    values: NDArray[np.uint16], corner_j: int, corner_i: int, scale: float, aside: float,
-    origin: Array, ends: Array,
-) -> int:  # fmt: skip
+def count_hidden(grid: Grid, aside: float, origin: Array, ends: Array) -> int:
     """How many beams from ``origin`` (2,) to ``ends`` (n, 2) pass through a wall."""
+    values, corner_j, corner_i, scale = grid
     count = 0
     for k in range(len(ends)):
         dx, dy = ends[k, 0] - origin[0], ends[k, 1] - origin[1]

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -73,25 +74,26 @@ def coast(
     gain = float(motion.bias_gain[2])
     gyro = abs(gain) > COVERED * dt
     turn, variance = (float(motion.delta[2]), float(motion.cov[2, 2])) if gyro else (0.0, 0.0)
-    way = _coast(state.x, state.P, dt, sigma, time, jitter, gyro, turn, variance, gain)
+    measured = _Gyro(gyro, turn, variance, gain)
+    way = _coast(state.x, state.P, dt, sigma, time, jitter, measured)
     state.x[2] = wrapped(state.x[2])
     return way
 
 
+class _Gyro(NamedTuple):
+    """A turn [rad] with its variance, if it was measured; ``gain`` is d turn / d bias."""
+
+    measured: bool
+    turn: float
+    variance: float
+    gain: float
+
+
 @brief
 def _coast(
-    x: Array,
-    P: Array,
-    dt: float,
-    sigma: Array,
-    time: float,
-    jitter: float,
-    gyro: bool,
-    turn: float,
-    turn_variance: float,
-    gain: float,
+    x: Array, P: Array, dt: float, sigma: Array, time: float, jitter: float, gyro: _Gyro
 ) -> Array:
-    """Kernel of coast(), in place; ``gain`` is d turn / d bias of the gyro."""
+    """Kernel of coast(), in place."""
     u = dt / time
     fade = math.exp(-u)
     span = time * (1.0 - fade)  # displacement per velocity
@@ -105,8 +107,8 @@ def _coast(
         d[k] = span * v
         q[k] = moved * sigma[k] ** 2 + jitter**2 * (v * v + P[VELOCITY + k, VELOCITY + k])
     seen = 3
-    if gyro:
-        d[2], q[2], seen = turn + gain * x[BIAS], turn_variance, 2
+    if gyro.measured:
+        d[2], q[2], seen = gyro.turn + gyro.gain * x[BIAS], gyro.variance, 2
     # the midpoint model of eq. 7, with a sideways displacement
     c, s = math.cos(x[2] + 0.5 * d[2]), math.sin(x[2] + 0.5 * d[2])
     gx, gy = -s * d[0] - c * d[1], c * d[0] - s * d[1]
@@ -121,8 +123,8 @@ def _coast(
     F = np.zeros((3, n))  # what is added to the pose, by the state
     F[0, 2], F[1, 2] = gx, gy
     F[:, VELOCITY : VELOCITY + seen] = span * M[:, :seen]
-    if gyro:
-        F[:, BIAS] = gain * M[:, 2]
+    if gyro.measured:
+        F[:, BIAS] = gyro.gain * M[:, 2]
     P[:3] += np.dot(F, P)
     P[VELOCITY : VELOCITY + 3] *= fade
     P[:, :3] += np.dot(P, F.T.copy())

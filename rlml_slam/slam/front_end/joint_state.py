@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,10 +125,10 @@ class JointState:
             measure_bias(
                 self.x, self.P, motion.bias, motion.bias_var, motion.bias_turn, motion.bias_way
             )
+        gains = motion.bias_gain, motion.turn_gain, motion.drift_gain
         predict(
-            self.x, self.P, motion.delta, motion.cov, motion.bias_gain, motion.turn_gain,
-            motion.drift_gain, went, walk, kept, self.wheels2,
-        )  # fmt: skip
+            self.x, self.P, Step(motion.delta, motion.cov, *gains, went), walk, kept, self.wheels2
+        )
 
     def corrected(self, m: Motion) -> Motion:
         """A motion as it is by what is known now of how wheels and gyro err."""
@@ -286,21 +287,21 @@ class JointState:
         turn_with_anchor(self.P, self.x - before, self._end)
 
 
+class Step(NamedTuple):
+    """What a kernel needs of a Motion, and ``went`` (2,), see :meth:`JointState.predict`."""
+
+    delta: Array
+    cov: Array
+    bias_gain: Array
+    turn_gain: Array
+    drift_gain: Array
+    went: Array
+
+
 @brief
-def predict(
-    x: Array,
-    P: Array,
-    delta: Array,
-    cov: Array,
-    bias_gain: Array,
-    turn_gain: Array,
-    drift_gain: Array,
-    went: Array,
-    walk: float,
-    kept: float,
-    wheels2: Array,
-) -> None:
+def predict(x: Array, P: Array, step: Step, walk: float, kept: float, wheels2: Array) -> None:
     """Eq. 5 and its covariance in place; see :meth:`JointState.predict`."""
+    delta, cov, bias_gain, turn_gain, drift_gain, went = step
     c, s = math.cos(x[2]), math.sin(x[2])
     moved = delta + bias_gain * x[BIAS] + turn_gain * x[TURN] + drift_gain * x[DRIFT]
     faster = 1.0 + x[SPEED]
@@ -488,7 +489,8 @@ def warm_up() -> None:
     """Compile the kernels with the signatures that are used at run time."""
     state = JointState(np.zeros(3), np.eye(3), 0.1)
     zero = np.zeros(3)
-    predict(state.x, state.P, zero, np.eye(3), zero, zero, zero, STANDING, 0.0, 1.0, np.zeros(4))
+    step = Step(zero, np.eye(3), zero, zero, zero, STANDING)
+    predict(state.x, state.P, step, 0.0, 1.0, np.zeros(4))
     measure_bias(state.x, state.P, 0.0, 1.0, 0.0, 0.0)
     state.apply(np.arange(3), np.eye(3), np.eye(3), np.zeros(3))
     state.turn_with_anchor(state.x)

@@ -20,7 +20,7 @@ from rlml_slam.sensing.velocity_deskew import Sweep, deskewed
 from rlml_slam.slam.front_end.degeneracy import Degeneracy
 from rlml_slam.slam.front_end.joint_state import JointState
 from rlml_slam.slam.front_end.motion_term import MotionTerm
-from rlml_slam.slam.front_end.scan_update import fuse, prior_of, relative
+from rlml_slam.slam.front_end.scan_update import Found, fuse, prior_of, relative
 from rlml_slam.slam.front_end.submaps import Submaps
 from rlml_slam.slam.relocalization.local_recovery import (
     AS_USUAL,
@@ -216,10 +216,8 @@ class ScanTerm:
         if not self._motion.has_odometry:
             gate, pull = gate / math.sqrt(3.0), found.pull
         before = state.x.copy()
-        fuse(
-            state.x, state.P, found.pose, information, gate, pull, found.information,
-            sweep.half, sweep.velocity,
-        )  # fmt: skip
+        match = Found(found.pose, information, pull, found.information)
+        fuse(state.x, state.P, match, gate, sweep.half, sweep.velocity)
         state.turn_with_anchor(before)
 
     def _contradicts(self, submap: Submap, points: Array, found: ScanMatchResult) -> bool:

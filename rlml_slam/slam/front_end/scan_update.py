@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -84,28 +85,30 @@ def swept(x: Array, P: Array, half: Array, velocity: Array) -> tuple[Array, Arra
     return pose, J, np.dot(np.dot(J, every), J.T.copy())
 
 
+class Found(NamedTuple):
+    """A match at ``pose`` (3,) of the submap with ``information`` (3, 3).
+
+    It is the optimum of scan and prior, while an update wants what the scan says alone: that is
+    farther by what the prior held back, ``pull`` (3,) of it over the ``curvature`` (3, 3) of the
+    scan term; a prior that lost has held back nothing. A pull of zeros leaves this out.
+    """
+
+    pose: Array
+    information: Array
+    pull: Array
+    curvature: Array
+
+
 @brief
 def fuse(
-    x: Array,
-    P: Array,
-    pose: Array,
-    information: Array,
-    prior_robust_scale: float,
-    pull: Array,
-    curvature: Array,
-    half: Array,
-    velocity: Array,
+    x: Array, P: Array, found: Found, prior_robust_scale: float, half: Array, velocity: Array
 ) -> None:
-    """Update ``x`` and ``P`` with a match at ``pose`` (3,) of the submap with ``information``.
+    """Update ``x`` and ``P`` with a match; ``half`` and ``velocity`` are as in swept().
 
     Where the scan disagrees with the prior by more than ``prior_robust_scale`` sigmas, the
     prior covariance is first widened by the disagreement: the odometry was wrong by that much.
-
-    The match is the optimum of scan and prior, while the update wants what the scan says alone:
-    that is farther by what the prior held back, ``pull`` (3,) of it over the ``curvature`` (3, 3)
-    of the scan term; a prior that lost has held back nothing. Zeros leave this out. ``half`` and
-    ``velocity`` are as in swept().
     """
+    pose, information, pull, curvature = found
     prior, J, cov = swept(x, P, half, velocity)
     values, axes = np.linalg.eigh(information)
     first = 0
@@ -139,4 +142,4 @@ def warm_up() -> None:
     state, zero = JointState(np.zeros(3), np.eye(3), 0.1), np.zeros(3)
     relative(state.x, state.P)
     prior_of(state.x, state.P, np.ones(3), zero, zero)
-    fuse(state.x, state.P, zero, np.eye(3), 3.0, zero, np.eye(3), zero, zero)
+    fuse(state.x, state.P, Found(zero, np.eye(3), zero, np.eye(3)), 3.0, zero, zero)

@@ -6,7 +6,7 @@ from made_states import made
 
 from rlml_slam import se2
 from rlml_slam.slam.front_end.joint_state import JointState
-from rlml_slam.slam.front_end.scan_update import TARGET, WITH_VELOCITY, fuse, swept
+from rlml_slam.slam.front_end.scan_update import TARGET, WITH_VELOCITY, Found, fuse, swept
 
 HALF = np.array([0.04, 0.04, 0.04])
 NOTHING = np.zeros(3)
@@ -24,7 +24,7 @@ def test_match_held_back_by_its_prior_gives_the_estimate_of_both(curved):
     found = np.linalg.solve(W + H, W @ state.pose + H @ optimum)
     pull = W @ (found - state.pose)
     expected = np.linalg.solve(W + alone, W @ state.pose + alone @ optimum)
-    fuse(state.x, state.P, found, alone, 3.0, pull, H, NOTHING, NOTHING)
+    fuse(state.x, state.P, Found(found, alone, pull, H), 3.0, NOTHING, NOTHING)
     np.testing.assert_allclose(state.pose, expected, atol=1e-9)
     np.testing.assert_allclose(state.pose_cov, np.linalg.inv(W + alone), atol=1e-9)
 
@@ -55,6 +55,7 @@ def test_sweep_that_does_not_fit_its_velocity_corrects_it():
     used = np.zeros(3)
     # driving 0.3 m/s, end points taken for those of a robot that stands
     found = np.array([0.3 * HALF[0], 0.0, 0.0])
-    fuse(state.x, state.P, found, np.diag([1e8, 1e8, 1e8]), 3.0, NOTHING, np.eye(3), HALF, used)
+    match = Found(found, np.diag([1e8, 1e8, 1e8]), NOTHING, np.eye(3))
+    fuse(state.x, state.P, match, 3.0, HALF, used)
     assert state.velocity[0] == pytest.approx(0.3, rel=0.01)
     assert abs(state.pose[0]) < 1e-4

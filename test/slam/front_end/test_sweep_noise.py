@@ -20,7 +20,7 @@ from rlml_slam.slam.front_end.joint_state import (
     end_sweep,
 )
 from rlml_slam.slam.front_end.motion_term import MotionTerm
-from rlml_slam.slam.front_end.scan_update import fuse
+from rlml_slam.slam.front_end.scan_update import Found, fuse
 from rlml_slam.types import Motion, Observation, Odometry, Scan
 
 NOTHING = np.zeros(3)
@@ -65,10 +65,8 @@ def estimate(rng, is_used, steps=60):
         found = se2.compose(truth, 0.5 * noise) + rng.multivariate_normal(np.zeros(3), MATCH_COV)
         sweep = motion.sweep if is_used else Sweep()
         information = np.linalg.inv(MATCH_COV)
-        fuse(
-            state.x, state.P, found, information, 30.0, NOTHING, information, sweep.half,
-            sweep.velocity,
-        )  # fmt: skip
+        match = Found(found, information, NOTHING, information)
+        fuse(state.x, state.P, match, 30.0, sweep.half, sweep.velocity)
         motion.corrected(state, seen)
         e = se2.between(truth, state.pose)
         P = se2.rotate_cov(state.pose_cov, -truth[2])
@@ -108,7 +106,8 @@ def follow(*observations, is_asked=True):
         if not k:
             sweep, W = motion.sweep, np.linalg.inv(MATCH_COV)
             found = np.array([0.002, 0.0, 0.004])
-            fuse(state.x, state.P, found, W, 30.0, NOTHING, W, sweep.half, sweep.velocity)
+            match = Found(found, W, NOTHING, W)
+            fuse(state.x, state.P, match, 30.0, sweep.half, sweep.velocity)
     return state, motion
 
 
