@@ -15,7 +15,9 @@ import importlib
 import io
 import os
 import shlex
+import signal
 import sys
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import ModuleType
@@ -127,6 +129,7 @@ def main(
 ) -> int:
     """Run one command line of the command ``prog``; the exit code."""
     module: ModuleType | None = None
+    hook, sys.unraisablehook = sys.unraisablehook, _interrupt_again
     try:
         # not every terminal has ±, or all file names
         if isinstance(sys.stdout, io.TextIOWrapper):
@@ -158,6 +161,16 @@ def main(
             return BROKEN_PIPE
         print(f'{prog}: cannot write: {e.strerror}', file=sys.stderr)
         return int(getattr(module, 'ERROR_CODE', 1))
+    finally:
+        sys.unraisablehook = hook
+
+
+def _interrupt_again(ignored: sys.UnraisableHookArgs) -> None:
+    """Ctrl-C that strikes where Python ignores errors, as in its imports, strikes again."""
+    if issubclass(ignored.exc_type, KeyboardInterrupt):
+        threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGINT)).start()
+    else:
+        sys.__unraisablehook__(ignored)
 
 
 def complete(table: Table, prog: str) -> None:

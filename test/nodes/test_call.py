@@ -157,6 +157,28 @@ def test_node_that_dds_finds_late_is_called_all_the_same(live, command, tmp_path
     assert 'nothing to save' in err or 'there is no map yet' in err
 
 
+IGNORED = """
+import signal, sys, time, weakref
+from rlml_slam.cli.main import main
+
+def words():
+    there = set()
+    ref = weakref.ref(there, lambda _: signal.raise_signal(signal.SIGINT))
+    del there
+    time.sleep(20.0)
+    yield from ['call', 'save_map']
+
+sys.exit(main(words()))
+"""
+
+
+def test_interrupt_that_strikes_where_python_ignores_it_strikes_again():
+    """Such as in a callback of its imports."""
+    done = subprocess.run([sys.executable, '-c', IGNORED], capture_output=True, timeout=15.0)
+    assert done.returncode == 130
+    assert done.stderr == b'rlml: interrupted\n'
+
+
 @pytest.mark.parametrize('delay', [0.0, 0.4, 1.5])
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_signal_ends_a_call_in_one_line(number, delay, monkeypatch):
