@@ -27,10 +27,11 @@ from rlml_lab.carrier.carrier_messages import read_features
 from rlml_lab.carrier.carrier_parameters import Carrier
 from rlml_lab.deformable.scoring import chi2_bounds
 from rlml_lab.deformable.study_deformable_window import KINDS
-from rlml_slam.cli.support.live_session import held_interrupts, node, own_domain
+from rlml_slam.cli.support.live_session import node, own_domain
 from rlml_slam.cli.support.processes import Processes, free_domain
 from rlml_slam.cli.support.progress import Progress
 from rlml_slam.errors import RlmlError
+from rlml_slam.interrupts import held_interrupts
 from rlml_slam.params import MotionNoise, Reflector
 from rlml_slam.ros.codecs import decode
 from rlml_slam.ros.codecs.message_types import rclpy_class

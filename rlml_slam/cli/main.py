@@ -15,15 +15,14 @@ import importlib
 import io
 import os
 import shlex
-import signal
 import sys
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, TypeAlias
 
 from rlml_slam.errors import RlmlError
+from rlml_slam.interrupts import held_interrupts
 from rlml_slam.version import __version__
 
 INTERRUPTED, BROKEN_PIPE = 130, 141  # what a shell reports for Ctrl-C, and for `… | head`
@@ -129,7 +128,6 @@ def main(
 ) -> int:
     """Run one command line of the command ``prog``; the exit code."""
     module: ModuleType | None = None
-    hook, sys.unraisablehook = sys.unraisablehook, _interrupt_again
     try:
         # not every terminal has ±, or all file names
         if isinstance(sys.stdout, io.TextIOWrapper):
@@ -161,16 +159,6 @@ def main(
             return BROKEN_PIPE
         print(f'{prog}: cannot write: {e.strerror}', file=sys.stderr)
         return int(getattr(module, 'ERROR_CODE', 1))
-    finally:
-        sys.unraisablehook = hook
-
-
-def _interrupt_again(ignored: sys.UnraisableHookArgs) -> None:
-    """Ctrl-C that strikes where Python ignores errors, as in its imports, strikes again."""
-    if issubclass(ignored.exc_type, KeyboardInterrupt):
-        threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGINT)).start()
-    else:
-        sys.__unraisablehook__(ignored)
 
 
 def complete(table: Table, prog: str) -> None:
@@ -241,7 +229,10 @@ def between(low: float, high: float) -> Callable[[str], float]:
 def _load(name: str, command: Command) -> Any:
     """The module of a command; one line of advice if what it needs is not installed."""
     try:
-        return importlib.import_module(command.module)
+        with held_interrupts() as check:
+            module = importlib.import_module(command.module)
+            check()
+        return module
     except ModuleNotFoundError as e:
         missing = e.name or ''
         if missing == command.module:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,6 +27,7 @@ from rlml_slam.cli.support.usage import Usage, summary
 from rlml_slam.errors import RlmlError
 from rlml_slam.evaluation.metrics import distribution
 from rlml_slam.evaluation.run_record import Run
+from rlml_slam.interrupts import held_interrupts
 from rlml_slam.ros.bags.bag import BagWriter
 
 START_TIMEOUT = 90.0  # [s] for three processes to start and to find each other
@@ -118,27 +118,6 @@ def own_domain(domain: int, environment: Mapping[str, str]) -> Iterator[None]:
         rclpy.utilities.try_shutdown()
         os.environ.clear()
         os.environ.update(before)
-
-
-@contextmanager
-def held_interrupts() -> Iterator[Callable[[], None]]:
-    """SIGINT and SIGTERM are held until the yielded function is called; it raises the interrupt.
-
-    Raised anywhere, it could strike while a child is being started, which nobody would end then.
-    """
-    caught: list[int] = []
-
-    def check() -> None:
-        if caught:
-            raise KeyboardInterrupt
-
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(n, lambda number, _frame: caught.append(number)) for n in numbers]
-    try:
-        yield check
-    finally:
-        for n, handler in zip(numbers, before, strict=True):
-            signal.signal(n, handler)
 
 
 def _compile(quiet: bool) -> None:

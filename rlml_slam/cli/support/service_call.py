@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from rlml_slam.errors import InputError
+from rlml_slam.interrupts import held_interrupts
 
 PATIENCE = 6.0  # [s] in which a service is found: DDS finds nodes one after the other
 WORK = 120.0  # [s] in which it answers: to save or to search a large map takes its time
@@ -35,10 +36,12 @@ def message_of(answer: Any) -> str:
 @contextlib.contextmanager
 def asking(namespace: str | None = None) -> Iterator[Any]:
     """A node that asks. KeyboardInterrupt where a signal ended ROS meanwhile."""
-    import rclpy
-    from rclpy._rclpy_pybind11 import RCLError
-    from rclpy.exceptions import NameValidationException
+    with held_interrupts() as check:
+        import rclpy
+        from rclpy._rclpy_pybind11 import RCLError
+        from rclpy.exceptions import NameValidationException
 
+        check()
     has_begun = False
     try:
         rclpy.init()
