@@ -22,9 +22,10 @@ def held_interrupts() -> Iterator[Callable[[], None]]:
         if caught:
             raise KeyboardInterrupt
 
-    numbers: tuple[signal.Signals, ...] = (signal.SIGINT, signal.SIGTERM)
+    # those that whoever started this process has it ignore stay ignored
+    numbers = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) != signal.SIG_IGN]
     if threading.current_thread() is not threading.main_thread():
-        numbers = ()  # they strike another one
+        numbers = []  # they strike another one
     before = [signal.signal(n, lambda number, _frame: caught.append(number)) for n in numbers]
     try:
         yield check
