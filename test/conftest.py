@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,9 @@ import pytest
 from rlml_slam.cli.main import main
 
 ROOM = Path(__file__).resolve().parents[1] / 'bags' / 'room'
+
+# A shell starts what runs in the background with interrupts ignored, and children inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _replay(folder, *options):

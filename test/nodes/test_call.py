@@ -22,11 +22,8 @@ from rlml_slam.ros.back_end.map_folder import MapFolder
 from rlml_slam.types import Reflectors
 
 CALL = """
-import signal, sys
+import sys
 from rlml_slam.cli.main import main
-
-# who started the tests in the background may have it ignored
-signal.signal(signal.SIGINT, signal.default_int_handler)
 
 def words():  # which the command reads first, where it can be interrupted
     print('ready', flush=True)
@@ -173,7 +170,6 @@ class Finder:
             del there
             sys.meta_path.remove(Finder)
 
-signal.signal(signal.SIGINT, signal.default_int_handler)
 sys.meta_path.insert(0, Finder)
 sys.exit(main(['call', 'save_map']))
 """
