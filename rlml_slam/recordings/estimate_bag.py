@@ -16,7 +16,8 @@ from rlml_slam.evaluation.metrics import RunErrors
 from rlml_slam.recordings.bag_inputs import BagInputs
 from rlml_slam.ros.bags.bag import BagReader, BagWriter
 from rlml_slam.ros.codecs import decode, encode
-from rlml_slam.ros.codecs.markers import detection_markers, graph_markers, reflector_markers
+from rlml_slam.ros.codecs.graph_markers import graph_markers
+from rlml_slam.ros.codecs.markers import detection_markers, reflector_markers
 from rlml_slam.ros.codecs.message_types import bag_types
 from rlml_slam.ros.codecs.message_types import make_bag as make
 from rlml_slam.ros.codecs.reflector_clouds import build_associated, build_reflector_map

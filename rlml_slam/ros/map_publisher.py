@@ -15,7 +15,8 @@ from rlml_slam.maps.occupancy import OccupancyGrid
 from rlml_slam.maps.saved_map import SavedMap
 from rlml_slam.params import Node
 from rlml_slam.ros.codecs import encode
-from rlml_slam.ros.codecs.markers import graph_markers, reflector_markers
+from rlml_slam.ros.codecs.graph_markers import graph_markers
+from rlml_slam.ros.codecs.markers import reflector_markers
 from rlml_slam.ros.codecs.message_types import make_rclpy, rclpy_class
 from rlml_slam.ros.codecs.reflector_clouds import build_reflector_map
 from rlml_slam.ros.codecs.serialized_path import serialized_path

@@ -10,13 +10,8 @@ import pytest
 
 from rlml_slam import se2
 from rlml_slam.graph.model.graph import Graph
-from rlml_slam.ros.codecs.markers import (
-    SCALE_95,
-    detection_markers,
-    ellipse,
-    graph_markers,
-    reflector_markers,
-)
+from rlml_slam.ros.codecs.graph_markers import graph_markers
+from rlml_slam.ros.codecs.markers import SCALE_95, detection_markers, ellipse, reflector_markers
 from rlml_slam.ros.codecs.message_types import make_bag, make_rclpy, rclpy_class
 from rlml_slam.types import EdgeKind, Reflectors, Status
 

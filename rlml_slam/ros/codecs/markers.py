@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The reflector map and the graph as markers for RViz and Foxglove."""
+"""Reflectors and detections as markers for RViz and Foxglove."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlml_slam.graph import FactorKind, Graph
 from rlml_slam.ros.codecs import encode
 from rlml_slam.ros.codecs.message_types import Make
 from rlml_slam.se2 import Array
 from rlml_slam.types import Reflectors, Status
 
 # visualization_msgs/Marker
-CYLINDER, LINE_LIST, SPHERE_LIST, TEXT, DELETEALL = 3, 5, 7, 9, 3
+CYLINDER, SPHERE_LIST, TEXT, DELETEALL = 3, 7, 9, 3
 SCALE_95 = math.sqrt(-2.0 * math.log(0.05))  # of chi^2 with 2 degrees of freedom
 HEIGHT = 1.5  # [m] of the cylinder drawn for a reflector
 
@@ -31,14 +30,9 @@ STATUS_COLORS = {
     Status.AMBIGUOUS: (1.0, 0.9, 0.2, 1.0),
     Status.DEFERRED: (0.7, 0.4, 1.0, 1.0),
 }
-EDGE_COLORS = {
-    FactorKind.ODOMETRY: (0.6, 0.6, 0.6, 1.0),
-    FactorKind.SCAN: (0.2, 0.5, 1.0, 1.0),
-    FactorKind.CLOSURE: (0.1, 0.8, 0.3, 1.0),
-}
 
 
-class _Markers:
+class Markers:
     """Collects the markers of one array; the first one clears what was drawn before."""
 
     def __init__(self, make: Make, stamp: int, frame_id: str) -> None:
@@ -93,6 +87,7 @@ class _Markers:
         )
 
     def array(self) -> Any:
+        """MarkerArray of all that was added."""
         return self._make('visualization_msgs/msg/MarkerArray', markers=self.list)
 
 
@@ -114,7 +109,7 @@ def ellipse(cov: Array) -> tuple[float, float, float]:
 
 def reflector_markers(make: Make, stamp: int, frame_id: str, reflectors: Reflectors) -> Any:
     """MarkerArray: a cylinder, the 95 % ellipse and the key of each reflector."""
-    out = _Markers(make, stamp, frame_id)
+    out = Markers(make, stamp, frame_id)
     for k in range(len(reflectors)):
         x, y = reflectors.points[k]
         known = np.isfinite(reflectors.diameters[k])
@@ -133,34 +128,10 @@ def detection_markers(
     make: Make, stamp: int, frame_id: str, points: Array, statuses: NDArray[np.int64]
 ) -> Any:
     """MarkerArray: detections (n, 2), a colour and a namespace for each status (n,)."""
-    out = _Markers(make, stamp, frame_id)
+    out = Markers(make, stamp, frame_id)
     for status, color in STATUS_COLORS.items():
         of_status = statuses == status
         if of_status.any():
             size = (0.25, 0.25, 0.25)
             out.add(status.name.lower(), SPHERE_LIST, color, size, points=points[of_status])
     return out.array()
-
-
-def graph_markers(make: Make, stamp: int, frame_id: str, graph: Graph) -> Any:
-    """MarkerArray: keyframes, and edges by kind; factors that are switched off are left out."""
-    out = _Markers(make, stamp, frame_id)
-    poses, size = graph.poses, (0.08, 0.08, 0.08)
-    out.add('keyframes', SPHERE_LIST, WHITE, size, points=poses[:, :2])
-    edges = graph.edges
-    for kind, color in EDGE_COLORS.items():
-        of_kind = edges.enabled & (edges.kinds == kind)
-        _lines(out, kind.name.lower(), color, poses[edges.nodes[of_kind], :2])
-    seen = graph.sightings
-    ends = np.stack(
-        [poses[seen.nodes[:, 0], :2], graph.landmarks[seen.nodes[:, 1]]], 1
-    )[seen.enabled]  # fmt: skip
-    _lines(out, 'sightings', (*ORANGE[:3], 0.25), ends)
-    return out.array()
-
-
-def _lines(
-    out: _Markers, name: str, color: tuple[float, float, float, float], ends: NDArray[np.float64]
-) -> None:
-    if len(ends):
-        out.add(name, LINE_LIST, color, (0.02, 0.0, 0.0), points=ends)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import heapq
+import sys
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
@@ -91,7 +92,7 @@ class BlackBox:
         if not self._i.record:
             return
         package = kind.__module__.partition('.')[0]
-        name = f'{package}/msg/{kind.__name__}'
+        name = sys.intern(f'{package}/msg/{kind.__name__}')
         received = Received(self._now(), topic, name, bytes(data))
         if topic.endswith(STATIC):
             self._static.append(received)

@@ -13,7 +13,7 @@ from rlml_slam.types import Health
 PREFIX = 'incident-'
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Received:
     """A serialized message that came at a ``time`` [ns] of the wall clock."""
 
@@ -23,7 +23,7 @@ class Received:
     data: bytes
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Published:
     """What was published of a frame at a ``time`` [ns]: its stamp, pose, covariance, health."""
 

@@ -8,7 +8,6 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from rlml_slam import params, se2
 from rlml_slam.maps.occupancy import OccupancyGrid
@@ -91,6 +90,8 @@ def along_lattice(cells: NDArray[np.int8]) -> Array:
     Such a wall is off by the same all along, uniformly within half a cell. One across the lattice
     is drawn as stairs, whose mean is where it stands.
     """
+    from scipy import ndimage  # only for those who load a map
+
     walls = cells > 0
     upright, level = (ndimage.binary_opening(walls, np.ones(n)) for n in ((RUN, 1), (1, RUN)))
     both, number = np.count_nonzero(upright & level), np.count_nonzero(walls)
