@@ -30,7 +30,7 @@ Stamps = NDArray[np.int64]
 BATCH = 256
 # of the speed at which floor and slope of the noise are equal: no robot drives slower for long
 CREEP = 0.25
-RECENT = 3.0  # [s] whose mean speed is that at which a robot goes on in a long gap
+RECENT = 3.0  # [s] whose mean speed and turn rate are those of a long gap
 ZERO = 0.05  # [m], [rad] from the pose at which odometry begins
 COAST = 0.2  # [s] for which a robot is taken to go on as it went before its odometry ended
 GYRO_GAP = 0.75  # [s] between turn rates: beyond it the wheels know better how far it turned
@@ -332,7 +332,8 @@ def _by_wheels(
             # when inside a long interval the motion happened is uncertain; what is left of it
             # at the end is less than what was driven: at least as fast as before, and no arc
             long_interval_noise = n.long_interval_noise
-            before = _speed_before(at - 1, stamps, twists, n.noise_interval, n)
+            lasted = RECENT if gap > n.max_gap else n.noise_interval
+            before = _speed_before(at - 1, stamps, twists, lasted, n)
             fast, quick = max(fast, before[0]), max(quick, before[1])
             # a constant twist leads along an arc, which is longer than its chord
             half = 0.5 * turn * (finish - begin) / SECOND

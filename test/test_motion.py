@@ -452,6 +452,23 @@ def test_robot_that_stood_through_most_of_a_gap_is_as_certain_as_its_way_is_shor
     assert after(20.0, 10.0).cov[2, 2] > 3.0 * short.cov[2, 2]
 
 
+def test_turn_just_before_a_long_gap_is_not_that_of_all_of_it():
+    """What counts is the mean of the last seconds: nobody turns so fast for half a minute."""
+
+    def after(rate):
+        """Heading sigma after a gap, into which a robot drove with a turn of the last .1 s."""
+        buffer = MotionBuffer(NOISE, 60.0)
+        for k in range(151):
+            turn = rate * max(k / 50 - 2.9, 0.0)
+            buffer.add_odometry(Odometry(T0 + k * 20 * MS, np.array([k / 50, 0.0, turn])))
+        end = T0 + 33 * SECOND
+        for k in range(5):
+            buffer.add_odometry(Odometry(end + k * 20 * MS, np.array([15.0 + k / 50, 0.0, 0.0])))
+        return math.sqrt(buffer.motion(T0 + 3 * SECOND, end).cov[2, 2])
+
+    assert after(1.5) < 1.5 * after(0.0)
+
+
 def test_pose_after_a_gap_longer_than_the_memory_says_where_it_led_to():
     buffer = filled(line(1.0), rate=100, duration=10.0, memory=2.0)
     for k in range(5):
