@@ -191,8 +191,9 @@ MAX_CLASS = 250  # lines
 # scans thinned alike from both sides, ids that count the rows of a message, scale errors of
 # odometry that is late, sides of walls, an EKF that is lost, checks of the Python API, maps of one
 # drive, where a robot turns, rays that graze walls, robots that are carried to a place like their
-# own, commands on a machine that is too slow, markers of a graph in a file of their own
-MAX_LINES = 59_700
+# own, commands on a machine that is too slow, markers of a graph in a file of their own, turns
+# that begin within a sweep
+MAX_LINES = 59_750
 MAX_LONG_LISTS = 3
 MAX_WORDS = 30  # in code and docs, the changelog aside
 # tests that need a study's scenes, drives or graphs; a new one belongs into test/lab

@@ -201,7 +201,7 @@ def evaluate_hall(p: Detector, duration: float, seed: int) -> dict[str, Any]:
         if end > simulation.time:
             continue
         here, there = (simulation.truth(t).T_map_base for t in (scan.stamp, end))
-        seen = detect(scan, p).at_stamp(scan, T_base_laser, se2.between(here, there))
+        seen = detect(scan, p).at_stamp(scan, T_base_laser, se2.between(here, there)[None])
         pairs = matched(seen.points, message.points)
         scans += 1
         visible += len(message)

@@ -87,7 +87,7 @@ def extract(
 
 def end_points(scan: Scan, params: EkfParameters) -> Array:
     """End points (n, 2) of the valid beams in the frame of the laser."""
-    return project(scan, np.zeros(3), np.zeros(3), params.submap.max_laser_range)
+    return project(scan, np.zeros(3), np.zeros((1, 3)), params.submap.max_laser_range)
 
 
 def polar(points: Array) -> Array:

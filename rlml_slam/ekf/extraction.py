@@ -12,7 +12,7 @@ from rlml_slam import se2
 from rlml_slam.estimation.landmark_models import to_polar
 from rlml_slam.params import EkfParameters
 from rlml_slam.se2 import Array
-from rlml_slam.sensing.deskew import sweep_time
+from rlml_slam.sensing.deskew import base_at, sweep_time
 from rlml_slam.sensing.features import lines, spikes
 from rlml_slam.types import ANONYMOUS, Detections, Observation
 
@@ -54,9 +54,9 @@ def _spikes(observation: Observation, params: EkfParameters) -> Detections | Non
         return None
     found = spikes.extract(scan, params.spikes)
     beams = max(len(scan.ranges), 1)
-    twist = np.zeros(3) if observation.sweep is None else se2.log(observation.sweep)
+    sweep = np.zeros((1, 3)) if observation.sweep is None else observation.sweep
     share = found.beams / beams if sweep_time(scan) != 0.0 else np.zeros(len(found.beams))
-    T = se2.compose(se2.exp(share[:, None] * twist), T_base_laser)
+    T = se2.compose(base_at(sweep, share), T_base_laser)
     R = se2.rotation(T[:, 2])
     points = se2.transform(T, found.points[:, None])[:, 0]
     return _anonymous(observation, params, points, R @ found.cov @ R.transpose(0, 2, 1))

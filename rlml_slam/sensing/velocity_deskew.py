@@ -36,9 +36,11 @@ def deskewed(
     lasted = 0.0 if scan is None else sweep_time(scan)
     if scan is None or T is None or lasted == 0.0:
         return observation, Sweep()
-    half, twist = np.full(3, 0.5 * lasted), velocity * lasted
+    half, twists = np.full(3, 0.5 * lasted), velocity[None] * lasted
     if observation.motion.bias_gain.any() and observation.sweep is not None:
-        half[2], twist[2] = 0.0, observation.sweep[2]
-    sweep = se2.exp(twist)
+        arcs = len(observation.sweep)
+        twists = np.arange(1, arcs + 1)[:, None] / arcs * twists
+        half[2], twists[:, 2] = 0.0, observation.sweep[:, 2]
+    sweep = se2.exp(twists)
     points = project(scan, T, sweep, max_range)
     return replace(observation, points=points, sweep=sweep), Sweep(half, velocity.copy())

@@ -494,4 +494,4 @@ def test_ranges_below_zero_are_none_though_the_least_range_is_lower(make):
     msg.range_min, msg.ranges[2] = -3.4e38, -3.3e38
     got = decode.scan(msg)
     assert got.range_min == 0.0
-    assert np.abs(project(got, np.zeros(3), np.zeros(3), 30.0)).max() <= 30.0
+    assert np.abs(project(got, np.zeros(3), np.zeros((1, 3)), 30.0)).max() <= 30.0

@@ -77,7 +77,7 @@ def test_scan_of_a_laser_upside_down_is_where_its_rays_end(feed):
     feed.add('scan', encode.laser_scan(make_bag, SCAN))
     (scan,) = feed._target.given
     assert scan.time_increment == SCAN.time_increment
-    points = project(scan, place(feed), np.zeros(3), 30.0)
+    points = project(scan, place(feed), np.zeros((1, 3)), 30.0)
     rays = SCAN.ranges[:, None] * np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1)
     np.testing.assert_allclose(points, in_base(rays), atol=1e-6)
 
@@ -114,7 +114,7 @@ def test_farthest_range_of_inf_makes_no_range_of_inf():
     feed.add('scan', encode.laser_scan(make_bag, replace(SCAN, range_max=np.inf, ranges=ranges)))
     (scan,) = feed._target.given
     assert np.isfinite(scan.range_max)
-    assert len(project(scan, np.zeros(3), np.zeros(3), 30.0)) == len(ranges) - 1
+    assert len(project(scan, np.zeros(3), np.zeros((1, 3)), 30.0)) == len(ranges) - 1
 
 
 def many(points):

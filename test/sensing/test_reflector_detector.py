@@ -323,24 +323,29 @@ def test_the_sweeps_motion_is_taken_out():
     """Of a laser that turns and drives, each detection is moved by its own share."""
     places = np.array([polar(2.0, b) for b in (-2.0, 0.3, 2.5)])
     scan = made_scan([(x, y, 0.08) for x, y in places])
-    sweep, T = np.array([0.1, 0.02, 0.08]), np.array([0.2, -0.1, 0.5])
+    sweep = np.array([[0.04, 0.0, 0.01], [0.1, 0.02, 0.08]])
+    T = np.array([0.2, -0.1, 0.5])
     found = detect(scan, THIN)
     seen = found.at_stamp(scan, T, sweep)
     for k, beam in enumerate(found.beams):
-        moved = se2.exp(beam / 1440 * se2.log(sweep))
+        half = beam / 720
+        moved = se2.exp(min(half, 1.0) * se2.log(sweep[0]))
+        if half > 1.0:
+            rest = (half - 1.0) * se2.log(se2.between(*sweep))
+            moved = se2.compose(moved, se2.exp(rest))
         at = se2.transform(se2.compose(moved, T), found.points[k])
         assert_allclose(se2.transform(T, seen.points[k]), at, atol=1e-9)
         assert_allclose(
             np.linalg.eigvalsh(seen.cov[k]), np.linalg.eigvalsh(found.cov[k]), rtol=1e-9
         )
-    assert_allclose(found.at_stamp(scan, T, np.zeros(3)).points, found.points, atol=1e-12)
+    assert_allclose(found.at_stamp(scan, T, np.zeros((1, 3))).points, found.points, atol=1e-12)
     assert (seen.stamp, seen.frame_id) == (scan.stamp, scan.frame_id)
 
 
 def test_what_is_not_known_of_the_sweeps_motion_is_in_the_covariance():
     """J cov J^T with J by central differences."""
     scan = made_scan([(*polar(2.0, b), 0.08) for b in (-2.0, 0.3, 2.5)])
-    sweep, T = np.array([1e-3, 0.0, 1e-3]), np.array([0.2, -0.1, 0.5])
+    sweep, T = np.array([[1e-3, 0.0, 1e-3]]), np.array([0.2, -0.1, 0.5])
     found, eps = detect(scan, THIN), 1e-6
     J = np.stack(
         [

@@ -58,7 +58,7 @@ def last_seen(change=lambda bright: bright, mode='auto', **kind):
     """Detections in the newest scan, None if it was not looked at, and what is said of them."""
     reflectors, seen = ScanReflectors(Detector(), mode), None
     for s in scans(change, **kind):
-        seen = reflectors.detections(s, STILL, STILL)
+        seen = reflectors.detections(s, STILL, STILL[None])
     return seen, str(reflectors)
 
 
@@ -101,13 +101,13 @@ def test_intensities_that_vanish_are_no_look(mode, value):
     """After good scans: None, not "looked and saw none", which would take reflectors away."""
     reflectors, kept = ScanReflectors(Detector(), mode), []
     for k, s in enumerate(scans()):
-        kept.append(reflectors.detections(s, STILL, STILL))
+        kept.append(reflectors.detections(s, STILL, STILL[None]))
         blind = replace(s, stamp=s.stamp + 1, intensities=np.full_like(s.intensities, value))
         if k > 30:
-            assert reflectors.detections(blind, STILL, STILL) is None
+            assert reflectors.detections(blind, STILL, STILL[None]) is None
     assert len(kept[-1]) > 0
     dark = replace(s, intensities=(0.01 + 1e-4 * np.arange(len(s.ranges)) % 3).astype('f4'))
-    found = reflectors.detections(dark, STILL, STILL)
+    found = reflectors.detections(dark, STILL, STILL[None])
     assert found is not None
     assert len(found) == 0
 
@@ -115,9 +115,9 @@ def test_intensities_that_vanish_are_no_look(mode, value):
 def test_laser_with_levels_has_looked_where_all_is_0():
     reflectors = ScanReflectors(Detector(), 'auto')
     for s in scans(levels):
-        reflectors.detections(s, STILL, STILL)
+        reflectors.detections(s, STILL, STILL[None])
     found = reflectors.detections(
-        replace(s, intensities=np.zeros_like(s.intensities)), STILL, STILL
+        replace(s, intensities=np.zeros_like(s.intensities)), STILL, STILL[None]
     )
     assert found is not None
     assert len(found) == 0
@@ -187,7 +187,7 @@ def test_reflectors_alone_in_an_open_field_are_found():
 
     reflectors, seen = ScanReflectors(Detector(), 'auto'), None
     for s in scans():
-        seen = reflectors.detections(nothing_else(s), STILL, STILL)
+        seen = reflectors.detections(nothing_else(s), STILL, STILL[None])
     assert len(seen) >= 5
     assert 'nothing else has an intensity' in str(reflectors)
 
@@ -218,7 +218,7 @@ def test_the_noise_of_ranges_is_found(sigma, beams):
     assert found.detector.sigma_range == pytest.approx(max(sigma, 0.01), rel=0.15)
     reflectors = ScanReflectors(Detector(), 'auto')
     for s in noisy:
-        seen = reflectors.detections(s, STILL, STILL)
+        seen = reflectors.detections(s, STILL, STILL[None])
     assert len(seen) >= 5
 
 
@@ -256,7 +256,7 @@ def test_cylinders_among_flat_reflectors_are_where_they_are():
         end = min(s.stamp + 10**8, simulation.time)
         here, there = (simulation.truth(t).T_map_base for t in (s.stamp, end))
         seen = reflectors.detections(
-            s, T_base_laser, se2.between(here, there), T_odom_base=here
+            s, T_base_laser, se2.between(here, there)[None], T_odom_base=here
         )  # fmt: skip
         if seen is None:
             continue

@@ -151,7 +151,9 @@ def test_scan_waits_for_odometry_that_covers_its_last_ray():
         feed(synchronizer, [s, detections(t), odometry(t + 20 * MS), odometry(t + 40 * MS)]) == []
     )
     (o,) = add(synchronizer, odometry(t + 60 * MS))
-    np.testing.assert_allclose(o.sweep, se2.between(pose_at(t), pose_at(t + sweep)), atol=1e-6)
+    ends = [t + sweep * k // 3 for k in (1, 2, 3)]
+    path = [se2.between(pose_at(t), pose_at(end)) for end in ends]
+    np.testing.assert_allclose(o.sweep, path, atol=1e-6)
 
 
 def test_lone_scan_waits_for_its_detections_only_if_they_use_to_come():

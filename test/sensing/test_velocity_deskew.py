@@ -25,7 +25,8 @@ def observed(gyro=False, ray=RAY):
     ranges[:] = -along + np.sqrt(along**2 - (laser[:, :2] ** 2).sum(axis=1) + 16.0)
     scan = Scan(0, 'laser', -1.5, 3.0 / N, ray, 0.1, 30.0, ranges, np.zeros(0, np.float32))
     gain = np.array([0.0, 0.0, -0.1 if gyro else 0.0])
-    sweep = np.array([0.0, 0.0, VELOCITY[2] * ray * N if gyro else 0.0])
+    sweep = np.zeros((4, 3))
+    sweep[:, 2] = VELOCITY[2] * ray * N * np.arange(1, 5) / 4.0 if gyro else 0.0
     motion = Motion(np.zeros(3), np.eye(3), False, gain)
     return points, Observation(
         0, motion, points, T_BASE_LASER[:2], scan=scan, T_base_laser=T_BASE_LASER, sweep=sweep

@@ -61,7 +61,7 @@ def _distance(first: Sighting, second: Sighting, mounted: Mounting, T_base_laser
     points = []
     for scan, T_odom_base in (first, second):
         s, T = mounted(scan, T_base_laser)
-        points.append(se2.transform(T_odom_base, project(s, T, np.zeros(3), RANGE)))
+        points.append(se2.transform(T_odom_base, project(s, T, np.zeros((1, 3)), RANGE)))
     if min(map(len, points)) < 20:
         return np.inf
     d, _ = cKDTree(points[0]).query(points[1])

@@ -11,6 +11,7 @@ import numpy as np
 from rlml_slam import se2
 from rlml_slam.params import Detector
 from rlml_slam.se2 import Array
+from rlml_slam.sensing.deskew import base_at
 from rlml_slam.sensing.polar import polar_covariance
 from rlml_slam.sensing.reflectors.background_intensity import (
     is_circular,
@@ -98,14 +99,14 @@ class Found:
     ) -> Detections:
         """The same as anonymous detections in the frame of the laser at the scan's stamp.
 
-        ``sweep`` (3,) is the motion of base during the whole sweep, at constant twist: what beam
-        k of n saw is moved by T_base_laser^-1 exp(k / n log(sweep)) T_base_laser, and is off by
-        k / n of the error of ``sweep``, whose covariance is ``sweep_cov`` (3, 3). A reflector that
-        a turning laser saw with its first and again with its last beams is returned once.
+        ``sweep`` (a, 3) is the motion of base during the sweep, by arcs: what beam k of n saw is
+        moved by T_base_laser^-1 X T_base_laser with the pose X of base then (eq. 70), and is off
+        by k / n of the error of all of ``sweep``, whose covariance is ``sweep_cov`` (3, 3). A
+        reflector that a turning laser saw with its first and again with its last beams is returned
+        once.
         """
         share = self.beams / max(len(scan.ranges), 1)
-        moved = se2.exp(share[:, None] * se2.log(sweep))
-        T = se2.between(T_base_laser, se2.compose(moved, T_base_laser))
+        T = se2.between(T_base_laser, se2.compose(base_at(sweep, share), T_base_laser))
         R = se2.rotation(T[:, 2])
         points = np.einsum('nij,nj->ni', R, self.points) + T[:, :2]
         cov = np.einsum('nij,njk,nlk->nil', R, self.cov, R)

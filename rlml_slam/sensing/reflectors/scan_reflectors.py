@@ -39,8 +39,9 @@ class ScanReflectors:
     ) -> Detections | None:
         """The reflectors of a scan at its stamp, in the frame of the laser; None if not looked.
 
-        ``sweep`` (3,) is the motion of base during the sweep with its covariance. With the pose of
-        base in odom (3,), the scans before help to say what the shape of a reflector is.
+        ``sweep`` (a, 3) is the motion of base during the sweep, by arcs, with the covariance of
+        all of it. With the pose of base in odom (3,), the scans before help to say what the shape
+        of a reflector is.
         """
         if self._mode == 'off' or len(scan.intensities) != len(scan.ranges):
             return None

@@ -12,7 +12,7 @@ from rlml_slam import se2
 from rlml_slam.motion import MAX_VARIANCE, SECOND, STILL, MotionBuffer, compose_motion
 from rlml_slam.params import Parameters
 from rlml_slam.se2 import Array
-from rlml_slam.sensing.deskew import project, sweep_time
+from rlml_slam.sensing.deskew import num_arcs, project, sweep_time
 from rlml_slam.sensing.detection_frames import placed
 from rlml_slam.sensing.reflectors.scan_reflectors import ScanReflectors
 from rlml_slam.sensing.repeated_scans import RepeatedScans
@@ -164,19 +164,22 @@ class ObservationAssembly:
         return se2.inverse(self.buffer.motion(end, start).delta)
 
     def _sweep(self, scan: Scan, delay: int, moved: Array) -> tuple[Array, Array, bool]:
-        """Motion (3,) of base during a sweep, its covariance, and whether odometry covers it.
+        """Motion (a, 3) of base during a sweep, its covariance, and whether odometry covers it.
 
-        In the base frame at the stamp.
+        In the base frame at the stamp, by arcs (eq. 70).
 
         The covariance is that about the first ray, which is at most a scan away from the stamp;
         without odometry that of a robot of which only is known how fast it may be.
         """
         start, lasts = scan.stamp + delay, sweep_time(scan)
-        swept = self.buffer.motion(start, start + int(lasts * SECOND))
+        end, arcs = start + int(lasts * SECOND), num_arcs(lasts)
+        swept = self.buffer.motion(start, end)
+        until = [start + (end - start) * k // arcs for k in range(1, arcs)]
+        path = [*(self.buffer.motion(start, t).delta for t in until), swept.delta]
         cov = swept.cov
         if not swept.known:
             cov = np.diag(np.minimum(np.diag(cov), (MAY_MOVE * lasts) ** 2))
-        return se2.compose(se2.compose(moved, swept.delta), se2.inverse(moved)), cov, swept.known
+        return se2.compose(se2.compose(moved, path), se2.inverse(moved)), cov, swept.known
 
     def _sensor_pose(self, frame_id: str) -> Array:
         return self._sensor_poses.get(frame_id, np.array(self._node.laser_pose))

@@ -146,7 +146,7 @@ class MotionTerm:
         self._sweep, cov = None, np.zeros((3, 3))
         known = observation.sweep_cov if self._is_odometry(observation.motion) else None
         if lasts > 0.0 and observation.sweep is not None and known is not None:
-            cov = self._odometry_noise.cov_of(observation.sweep, lasts, known)
+            cov = self._odometry_noise.cov_of(observation.sweep[-1], lasts, known)
             self._sweep = lasts, cov
         if self.has_odometry:
             begin_sweep(state, cov)

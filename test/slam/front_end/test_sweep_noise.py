@@ -41,7 +41,7 @@ def scan(stamp, beams=100):
 def observation(k, delta, cov):
     stamp = k * STEP
     return Observation(
-        stamp, Motion(delta, cov), scan=scan(stamp), odom_pose=np.zeros(3), sweep=delta,
+        stamp, Motion(delta, cov), scan=scan(stamp), odom_pose=np.zeros(3), sweep=delta[None],
         sweep_cov=SWEEP_COV,
     )  # fmt: skip
 
