@@ -81,8 +81,8 @@ class FrontEnd:
         if moved:  # it maps on, and the graph is to find out where that was
             self._scans.start_new_submaps()
             scan = ScanEvidence(has_scan=scan.has_scan)
-            self._reflectors.forget_anonymous()
-            self.state.widen(unknown_way(self._p))
+            self._reflectors.forget_all()
+            self._carried.leave(self.state.pose, unknown_way(self._p))
             observation = observation.with_noise(unknown_way(self._p))
         health = self._evaluate_health(observation, matches, scan)
         return self._frame(observation, matches, scan, health, contradicted, began)
@@ -154,7 +154,7 @@ class FrontEnd:
         )  # fmt: skip
         expected, seen = self._reflectors.expected_and_seen(observation, matches)
         lasts = self.kidnapping.has_lasted(stamp, self._p.health.lost_time)
-        pose, cov = self.in_map(self.state.pose, self.state.pose_cov)
+        pose, cov = self.in_map(*self._carried.belief(self.state.pose, self.state.pose_cov))
         return self.health.evaluate(
             stamp,
             HealthInputs(
@@ -178,7 +178,7 @@ class FrontEnd:
         self, observation: Observation, matches: Matches, scan: ScanEvidence, health: Health,
         contradicted: bool, began: float,
     ) -> Frame:  # fmt: skip
-        pose, cov = self.state.pose, self.state.pose_cov
+        pose, cov = self._carried.belief(self.state.pose, self.state.pose_cov)
         late = self._motion.stamp_error_cov(float(self.state.x[2]), observation.stamp_sigma)
         T_map_base, cov_map = self.in_map(pose, cov + late)
         jumped, self._jumped = self._jumped, False
@@ -221,6 +221,7 @@ class FrontEnd:
             self._motion.stamp, self._motion.has_lidar = motion.stamp, motion.has_lidar
         else:
             self.state.place(pose, cov)
+            self._carried.arrive()
             self._scans.start_new_submaps()
             self._motion.forget_velocity()
             self._reflectors.forget_slip()
@@ -245,6 +246,7 @@ class FrontEnd:
         """
         self._reflectors.adopt(belief, self.T_map_local, self.submaps.bias)
         # the state has the covariance of the graph now
+        self._carried.arrive()
         self._correction = Correction(self.T_map_local)
 
     def forget(self, keys: Iterable[int]) -> None:

@@ -333,10 +333,10 @@ class ReflectorTerm:
             self._state.remove_landmarks(keep)
             self.tracks.keep(keep)
 
-    def forget_anonymous(self) -> None:
-        """Drop those without ids: a robot that may be anywhere sees any of them."""
+    def forget_all(self) -> None:
+        """Drop all: where they are from a robot that may be anywhere, the graph will say."""
         self._inactive.restore(self._state, self.tracks)
-        self.forget(self.tracks.keys[self.tracks.ids == ANONYMOUS])
+        self.forget(self.tracks.keys)
 
     def confirmed(self, T_map_local: Array) -> Reflectors:
         """The confirmed reflectors in the map frame."""

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from made_worlds import ROOM, drive, errors, observations
 
+from rlml_slam import se2
 from rlml_slam.cli.main import main
 from rlml_slam.motion import STILL
 from rlml_slam.params import Node, Parameters, Simulator
@@ -62,15 +63,22 @@ def test_robot_carried_where_nothing_is_mapped_is_lost_until_it_comes_to_what_is
     run = replay(bag, replace(Parameters(), node=Node(laser_pose=Simulator().laser_pose)))
     true = run.truth.trajectory
     stamps, levels = np.array(run.frames.stamps), np.array(run.frames.levels)
+    heading = np.interp(stamps, true.stamps, np.unwrap(true.poses[:, 2]))
     x, y = (np.interp(stamps, true.stamps, true.poses[:, k]) for k in range(2))
-    error = np.hypot(*(np.array(run.frames.poses)[:, :2] - np.stack([x, y], axis=-1)).T)
+    e = np.array(run.frames.poses) - np.stack([x, y, heading], axis=-1)
+    e[:, 2] = se2.wrap(e[:, 2])
+    error = np.hypot(*e[:, :2].T)
     carried = stamps - stamps[0] >= 25e9
     wrong = carried & (error > 0.5)
     assert wrong.mean() > 0.2
     assert (wrong & (levels != Level.LOST)).sum() <= 4  # scans, of 5 Hz
     # then all that it mapped meanwhile is where it belongs
     assert levels[-1] == Level.OK
-    assert error[-1] < 0.1
+    assert error[-1] < 0.06
+    # with the unknown way in the joint state, 79; eight seeds 27 in the mean, and 5.4 without
+    found = carried & (levels == Level.OK) & ~wrong
+    W = np.linalg.inv(np.array(run.frames.covs)[found])
+    assert np.einsum('ni,nij,nj->n', e[found], W, e[found]).mean() < 15.0
     path = run.trajectory
     x, y = (np.interp(path.stamps, true.stamps, true.poses[:, k]) for k in range(2))
     off = np.hypot(*(path.poses[:, :2] - np.stack([x, y], axis=-1)).T)
