@@ -167,8 +167,8 @@ class FrontEndSession:
         if then is None or stamp == self.front_end.newest:
             return pose, cov
         T_map_local = se2.compose(pose, se2.inverse(then[0]))
-        state = self.front_end.state
-        return Correction(T_map_local, ReferencePose(*then, cov)).apply(state.pose, state.pose_cov)
+        correction = Correction(T_map_local, ReferencePose(*then, cov))
+        return correction.apply(*self.front_end.local_belief)
 
     def _begin(self, pose: Array, cov: Array, request: int) -> None:
         self.front_end.reset(pose, cov)

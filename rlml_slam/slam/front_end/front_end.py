@@ -17,7 +17,6 @@ import numpy as np
 from rlml_slam import se2
 from rlml_slam.estimation.correction import Correction, ReferencePose
 from rlml_slam.estimation.health import HealthInputs, HealthMonitor, ScanEvidence
-from rlml_slam.estimation.kidnapping_detection import KidnappingDetection
 from rlml_slam.estimation.landmark_tracks import LandmarkTracks
 from rlml_slam.estimation.laser_check import LaserCheck
 from rlml_slam.maps.occupancy import OccupancyGrid
@@ -53,10 +52,9 @@ class FrontEnd:
         self._reflectors = ReflectorTerm(self._p, self.state)
         self._scans = ScanTerm(self._p, self.state, self._motion)
         self._map = MapLocalization(self._p)
-        self._correction = Correction(np.zeros(3))
+        self._correction, self._carried = Correction(np.zeros(3)), CarriedRobot()
         self.health = HealthMonitor(self._p.health)
         self._jumped, self._is_settled, self._settling = False, True, 0.0  # [s] in settle()
-        self._carried = CarriedRobot()
 
     def process(self, observation: Observation) -> Frame:
         """Pose at the stamp of the observation; never raises for what was measured.
@@ -81,7 +79,7 @@ class FrontEnd:
         if moved:  # it maps on, and the graph is to find out where that was
             self._scans.start_new_submaps()
             scan = ScanEvidence(has_scan=scan.has_scan)
-            self._reflectors.forget_all()
+            self._reflectors.forget_anonymous()
             self._carried.leave(self.state.pose, unknown_way(self._p))
             observation = observation.with_noise(unknown_way(self._p))
         health = self._evaluate_health(observation, matches, scan)
@@ -121,15 +119,16 @@ class FrontEnd:
         # an unmatched detection with an id is no contradiction here: the back end resolves it
         resolved = matches.num_unmatched_ids(observation.detections)
         fits = scan.used and scan.open_direction is None and not self._map.grid_match.refutes
-        contradicted = self.kidnapping.holds(observation.stamp)
+        kidnapping, stamp = self._scans.kidnapping, observation.stamp
+        contradicted = kidnapping.holds(stamp)
         if scan.has_scan or len(matches.status):  # a sensor that sees nothing changes nothing
-            contradicted = self.kidnapping.check(
-                observation.stamp, scan.misfit, fits, len(matches.status) - resolved,
+            contradicted = kidnapping.check(
+                stamp, scan.misfit, fits, len(matches.status) - resolved,
                 matches.num_used, bool(self.tracks.surveyed.any()),
             )  # fmt: skip
-        self._carried.follow(observation, scan, self.kidnapping.since)
-        patience = self._p.health.new_session_time
-        if self._map.saved is None and self.kidnapping.has_lasted(observation.stamp, patience):
+        self._carried.follow(observation, scan, kidnapping.since)
+        lasts = kidnapping.has_lasted(stamp, self._p.health.new_session_time)
+        if lasts and self._map.saved is None:
             if not self._carried.leapt:
                 self._scans.start_new_submaps()
             return self._carried.leapt, self._carried.leapt
@@ -153,8 +152,8 @@ class FrontEnd:
             matches.num_used, matches.agree_with_map, self._map.grid_match,
         )  # fmt: skip
         expected, seen = self._reflectors.expected_and_seen(observation, matches)
-        lasts = self.kidnapping.has_lasted(stamp, self._p.health.lost_time)
-        pose, cov = self.in_map(*self._carried.belief(self.state.pose, self.state.pose_cov))
+        lasts = self._scans.kidnapping.has_lasted(stamp, self._p.health.lost_time)
+        pose, cov = self.in_map(*self.local_belief)
         return self.health.evaluate(
             stamp,
             HealthInputs(
@@ -178,7 +177,7 @@ class FrontEnd:
         self, observation: Observation, matches: Matches, scan: ScanEvidence, health: Health,
         contradicted: bool, began: float,
     ) -> Frame:  # fmt: skip
-        pose, cov = self._carried.belief(self.state.pose, self.state.pose_cov)
+        pose, cov = self.local_belief
         late = self._motion.stamp_error_cov(float(self.state.x[2]), observation.stamp_sigma)
         T_map_base, cov_map = self.in_map(pose, cov + late)
         jumped, self._jumped = self._jumped, False
@@ -245,8 +244,7 @@ class FrontEnd:
         for the frame of the newest keyframe, after :meth:`correct`.
         """
         self._reflectors.adopt(belief, self.T_map_local, self.submaps.bias)
-        # the state has the covariance of the graph now
-        self._carried.arrive()
+        self._carried.arrive()  # the state has the covariance of the graph now
         self._correction = Correction(self.T_map_local)
 
     def forget(self, keys: Iterable[int]) -> None:
@@ -263,6 +261,11 @@ class FrontEnd:
         return self._correction.T_map_local
 
     @property
+    def local_belief(self) -> tuple[Array, Array]:
+        """Pose (3,) and covariance (3, 3) in the local frame."""
+        return self._carried.belief(self.state.pose, self.state.pose_cov)
+
+    @property
     def tracks(self) -> LandmarkTracks:
         """Identities of the reflectors of the state."""
         return self._reflectors.tracks
@@ -271,11 +274,6 @@ class FrontEnd:
     def submaps(self) -> Submaps:
         """Submaps that scans are matched against."""
         return self._scans.submaps
-
-    @property
-    def kidnapping(self) -> KidnappingDetection:
-        """Detection of contradictions between measurements and map."""
-        return self._scans.kidnapping
 
     @property
     def newest(self) -> int | None:

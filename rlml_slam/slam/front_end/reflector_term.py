@@ -28,6 +28,7 @@ NONE = np.zeros(0, dtype=np.int64)
 USED, GHOST = int(Status.USED), int(Status.GHOST)
 SLIP = 1.0  # 1 sigma, as a share of the motion, of wheels that spin or are locked
 WIDTH = 1.0  # [m] of a robot, which one wheel that slips turns
+KNOWN = 0.5  # [rad] 1 sigma of a heading
 AGREEING = 2.0 / 3.0  # share of the detections that have to match; of a carried robot, some do
 NEW, DEFERRED, AMBIGUOUS = int(Status.NEW), int(Status.DEFERRED), int(Status.AMBIGUOUS)
 
@@ -288,8 +289,11 @@ class ReflectorTerm:
         """Whether the reflectors of the back end are outside the gates of those of the state.
 
         Both have the same detections, so that a larger difference is no noise: the state
-        linearized too early, or has a wrong association, which the graph has corrected.
+        linearized too early, or has a wrong association, which the graph has corrected. But not
+        while the graph does not know the heading of the robot: no filter can be linearized there.
         """
+        if belief.cov[2, 2] > KNOWN**2:
+            return False
         keys, places, covs = self._inactive.all_landmarks(self._state, self.tracks)
         _, mine, theirs = np.intersect1d(keys, belief.keys, return_indices=True)
         if not len(mine):
@@ -333,10 +337,10 @@ class ReflectorTerm:
             self._state.remove_landmarks(keep)
             self.tracks.keep(keep)
 
-    def forget_all(self) -> None:
-        """Drop all: where they are from a robot that may be anywhere, the graph will say."""
+    def forget_anonymous(self) -> None:
+        """Drop those without ids: a robot that may be anywhere sees any of them."""
         self._inactive.restore(self._state, self.tracks)
-        self.forget(self.tracks.keys)
+        self.forget(self.tracks.keys[self.tracks.ids == ANONYMOUS])
 
     def confirmed(self, T_map_local: Array) -> Reflectors:
         """The confirmed reflectors in the map frame."""

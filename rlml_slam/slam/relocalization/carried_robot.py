@@ -62,7 +62,7 @@ class CarriedRobot:
         self._unknown = np.zeros((3, 3))
 
     def belief(self, pose: Array, cov: Array) -> tuple[Array, Array]:
-        """A local pose (3,) of the joint state, and its covariance with that of the unknown way."""
+        """Local pose (3,) and covariance (3, 3) of the state, with that of the unknown way."""
         if self._unknown.any():
             cov = cov + carried(self._unknown, pose[:2] - self._since)
         return pose, cov

@@ -32,7 +32,7 @@ def mapped(world):
 @pytest.mark.parametrize('slip', [(0.9, 0.0, 0.0), (-0.6, 0.7, 0.3), (0.0, 0.0, -0.9)])
 def test_scan_is_found_where_it_was_taken(slip):
     front_end, place, points = mapped(ROOM)
-    submap, usual = front_end.submaps.target, front_end.kidnapping.usual
+    submap, usual = front_end.submaps.target, front_end._scans.kidnapping.usual
     found = recover_locally(submap, points, place + slip, usual, Parameters())
     assert found is not None
     assert found.score >= AS_USUAL * usual
@@ -44,14 +44,14 @@ def test_scan_is_found_where_it_was_taken(slip):
 
 def test_nothing_is_found_beyond_its_reach_in_the_same_room():
     front_end, place, points = mapped(ROOM)
-    submap, usual = front_end.submaps.target, front_end.kidnapping.usual
+    submap, usual = front_end.submaps.target, front_end._scans.kidnapping.usual
     for far in ([2.2, 0.0, 0.0], [0.0, 0.0, 2.5], [-1.5, -1.5, 1.5]):
         assert recover_locally(submap, points, place + far, usual, Parameters()) is None
 
 
 def test_place_along_a_corridor_is_not_guessed():
     front_end, place, points = mapped(CORRIDOR)
-    submap, usual = front_end.submaps.target, front_end.kidnapping.usual
+    submap, usual = front_end.submaps.target, front_end._scans.kidnapping.usual
     turned = place + np.array([0.0, 0.0, 0.8])
     assert recover_locally(submap, points, turned, usual, Parameters()) is None
 
@@ -125,6 +125,6 @@ def test_scan_of_new_space_is_looked_for_nowhere_else(monkeypatch):
     points[::4] += 40.0
     scans, sure = front_end._scans, np.diag([1e4, 1e4, 1e5])
     found = scans._match(front_end.submaps.target, points, place, sure)
-    assert found.score < AS_USUAL * front_end.kidnapping.usual
+    assert found.score < AS_USUAL * front_end._scans.kidnapping.usual
     assert np.abs(found.pose - place).max() < 0.03
     assert not searches
