@@ -80,7 +80,7 @@ class FrontEnd:
             self._scans.start_new_submaps()
             scan = ScanEvidence(has_scan=scan.has_scan)
             self._reflectors.forget_anonymous()
-            self._carried.leave(self.state.pose, unknown_way(self._p))
+            self._scans.common.add(self.state.pose, unknown_way(self._p))
             observation = observation.with_noise(unknown_way(self._p))
         health = self._evaluate_health(observation, matches, scan)
         return self._frame(observation, matches, scan, health, contradicted, began)
@@ -220,7 +220,7 @@ class FrontEnd:
             self._motion.stamp, self._motion.has_lidar = motion.stamp, motion.has_lidar
         else:
             self.state.place(pose, cov)
-            self._carried.arrive()
+            self._scans.common.clear()
             self._scans.start_new_submaps()
             self._motion.forget_velocity()
             self._reflectors.forget_slip()
@@ -244,7 +244,7 @@ class FrontEnd:
         for the frame of the newest keyframe, after :meth:`correct`.
         """
         self._reflectors.adopt(belief, self.T_map_local, self.submaps.bias)
-        self._carried.arrive()  # the state has the covariance of the graph now
+        self._scans.common.clear()  # the state has the covariance of the graph now
         self._correction = Correction(self.T_map_local)
 
     def forget(self, keys: Iterable[int]) -> None:
@@ -263,7 +263,7 @@ class FrontEnd:
     @property
     def local_belief(self) -> tuple[Array, Array]:
         """Pose (3,) and covariance (3, 3) in the local frame."""
-        return self._carried.belief(self.state.pose, self.state.pose_cov)
+        return self._scans.common.belief(self.state.pose, self.state.pose_cov)
 
     @property
     def tracks(self) -> LandmarkTracks:

@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from rlml_slam import se2
+from rlml_slam.estimation.common_error import CommonError
 from rlml_slam.estimation.health import ScanEvidence, eigenvalues_2x2, open_direction
 from rlml_slam.estimation.kidnapping_detection import KidnappingDetection
 from rlml_slam.matching.scans import scan_information, voxel_filter
@@ -42,6 +43,8 @@ MIN_KNOWN = 0.33  # share of end points in known cells below which a scan cannot
 class ScanTerm:
     """Submaps of a joint state, and detection of scans that contradict them.
 
+    ``common`` is the error of the newest submaps that the state does not have.
+
     ``motion`` says whether the prior comes from odometry or from the constant-velocity model.
     """
 
@@ -49,6 +52,7 @@ class ScanTerm:
         self._p = params
         self._state = state
         self._motion = motion
+        self.common = CommonError()
         self.start_new_submaps()
 
     def start_new_submaps(self) -> None:
@@ -130,7 +134,7 @@ class ScanTerm:
         if maps and left and not (as_expected or reflectors_agree):
             only = match_after_gap(submap, points, prior, strength, usual, self._p)
             if only is None:
-                self.submaps.start_again()
+                self._begin_elsewhere()
                 return ScanEvidence(has_scan=False)
             found = only
         misfit = self._contradicts(submap, points, found)
@@ -155,6 +159,16 @@ class ScanTerm:
             submap=submap if self._motion.has_odometry else None,
             cov_submap=relative(self._state.x, self._state.P)[1],
         )
+
+    def _begin_elsewhere(self) -> None:
+        """Start new submaps, which nothing but the motion ties to the old ones.
+
+        Unless reflectors do, the error of the motion is common to all that comes.
+        """
+        self.submaps.start_again()
+        if not (self._state.num_landmarks or self._state.extra):
+            self.common.add(self._state.pose, self._state.pose_cov)
+            self._state.P[:3, :] = self._state.P[:, :3] = 0.0
 
     def _match(
         self, submap: Submap, points: Array, prior: Array, strength: Array

@@ -12,7 +12,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rlml_slam import params, se2
-from rlml_slam.estimation.correction import carried
 from rlml_slam.estimation.health import ScanEvidence
 from rlml_slam.se2 import Array
 from rlml_slam.types import Observation
@@ -23,14 +22,9 @@ SAME, SAME_SHARE = 0.1, 0.02  # [m], and share of the range, by which the same w
 
 
 class CarriedRobot:
-    """Follows all scans of a robot; ``leapt`` where the newest contradiction of the map began.
-
-    What is not known of where it was carried is no part of the joint state: a filter that is
-    linearized at a heading that nobody knows finds one in the noise.
-    """
+    """Follows all scans of a robot; ``leapt`` where the newest contradiction of the map began."""
 
     def __init__(self) -> None:
-        self._since, self._unknown = np.zeros(2), np.zeros((3, 3))
         self._way = np.zeros(3)
         # by laser, its last scan, if it is not older than SOON, and the way until it
         self._before: dict[str, tuple[Observation, Array]] = {}
@@ -52,20 +46,6 @@ class CarriedRobot:
             self._fits = 0
         if observation.points is not None:
             self._before[_laser(observation)] = observation, self._way
-
-    def leave(self, pose: Array, cov: Array) -> None:
-        """The robot was carried by an unknown way to a local pose (3,); ``cov`` (3, 3) of it."""
-        self._since, self._unknown = pose[:2], cov
-
-    def arrive(self) -> None:
-        """Where it was carried is known, or in the joint state."""
-        self._unknown = np.zeros((3, 3))
-
-    def belief(self, pose: Array, cov: Array) -> tuple[Array, Array]:
-        """Local pose (3,) and covariance (3, 3) of the state, with that of the unknown way."""
-        if self._unknown.any():
-            cov = cov + carried(self._unknown, pose[:2] - self._since)
-        return pose, cov
 
     def _leaps(self, observation: Observation) -> bool:
         """Of slow lasers it cannot be said: between two scans a robot goes through a door."""

@@ -50,3 +50,25 @@ def test_only_a_gap_takes_a_robot_elsewhere(lasted, left):
     assert may_have_left(wide, lasted, Parameters()) is left
     assert not may_have_left(replace(wide, known=False), lasted, Parameters())
     assert not may_have_left(replace(wide, cov=1e-4 * np.eye(3)), lasted, Parameters())
+
+
+def test_filter_finds_no_heading_in_what_comes_after_a_gap():
+    """The heading that the gap lost is known to nobody until the graph closes a loop."""
+    rng = np.random.default_rng(3)
+    before, after = drive((0.5, 0.0, 3.0)), drive((0.5, 0.25, 8.0), start=(1.0, 1.0, 2.0))
+    first = observations(ROOM, before, reflectors=False, rng=rng)
+    then = observations(OTHER_ROOM, after, reflectors=False, rng=rng)
+    late = first[-1].stamp + 30 * SECOND
+    lost = np.diag([1.0, 1.0, 0.6]) ** 2
+    then = [replace(o, stamp=o.stamp - then[0].stamp + late, odom_pose=None) for o in then]
+    then[0] = replace(then[0], motion=Motion(np.array([8.0, 2.0, 1.0]), lost))
+    front_end = FrontEnd(Parameters())
+    for o in first:
+        front_end.process(o)
+    frames = [front_end.process(o) for o in then]
+    sigma = np.sqrt([f.cov_local[2, 2] for f in frames])
+    assert sigma.min() > 0.6
+    # where it is linearized, the heading since the gap is known
+    assert front_end.state.pose_cov[2, 2] < 0.02**2
+    grown = sigma[-1] ** 2 - sigma[1] ** 2
+    assert grown == pytest.approx(front_end.state.pose_cov[2, 2], abs=1e-4)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from rlml_slam import se2
-from rlml_slam.estimation.correction import Correction, ReferencePose
 from rlml_slam.estimation.health import ScanEvidence
 from rlml_slam.params import Parameters, Submap
 from rlml_slam.slam.relocalization.carried_robot import CarriedRobot, unknown_way
@@ -120,18 +119,3 @@ def test_robot_that_may_be_anywhere_is_lost_whatever_the_range_of_its_laser():
     near = Parameters(submap=Submap(max_laser_range=1.5))
     assert unknown_way(near)[0, 0] > Parameters().health.sigma_lost ** 2
     assert unknown_way(Parameters())[0, 0] == Parameters().submap.max_laser_range ** 2
-
-
-def test_unknown_way_is_in_the_covariance_until_it_is_known():
-    """It is common to all poses after it: between two of them it is no uncertainty."""
-    carried, unknown = CarriedRobot(), unknown_way(Parameters())
-    pose, later, cov = np.array([3.0, 1.0, 0.5]), np.array([7.0, -2.0, 1.5]), 1e-4 * np.eye(3)
-    carried.leave(pose, unknown)
-    np.testing.assert_allclose(carried.belief(pose, cov)[1], cov + unknown)
-    P = carried.belief(later, cov)[1]
-    assert P[1, 1] == pytest.approx(unknown[1, 1] + 16.0 * unknown[2, 2] + 1e-4)
-    then = ReferencePose(pose, carried.belief(pose, cov)[1], 1e-3 * np.eye(3))
-    _, in_map = Correction(np.zeros(3), then).apply(later, P)
-    assert np.trace(in_map) < 0.05
-    carried.arrive()
-    np.testing.assert_array_equal(carried.belief(later, cov)[1], cov)
