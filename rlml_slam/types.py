@@ -107,7 +107,7 @@ class Observation:
     None without a scan. ``scan`` is the sweep, NaN where a beam sees the robot. ``odom_pose`` (3,)
     is the raw odometry at the stamp, None without odometry. ``points`` were computed with
     ``T_base_laser`` (3,) and ``sweep`` (a, 3), the motions of base from its first ray to the end
-    of each of a arcs of equal time; ``sweep_cov`` (3, 3) is the covariance of the last, None where
+    of each arc, all of equal time; ``sweep_cov`` (3, 3) is the covariance of the last, None where
     odometry does not cover it. The estimate of a pose corrects ``points`` as well.
     ``stamp_sigma`` [s] is the error of the stamp, if the stamps have jitter.
     """

@@ -193,7 +193,7 @@ MAX_CLASS = 250  # lines
 # drive, where a robot turns, rays that graze walls, robots that are carried to a place like their
 # own, commands on a machine that is too slow, markers of a graph in a file of their own, turns
 # that begin within a sweep, errors that all poses after a gap have in common
-MAX_LINES = 59_800
+MAX_LINES = 59_820
 MAX_LONG_LISTS = 3
 MAX_WORDS = 30  # in code and docs, the changelog aside
 # tests that need a study's scenes, drives or graphs; a new one belongs into test/lab

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The error that all poses have in common since the robot last lost what it was mapped by.
+"""The error that pose and submaps have in common, which nothing measures until the graph does.
 
-A filter that is linearized at an unknown heading finds one in the noise of what is seen from there
-(Julier, Uhlmann 2001: A counter example to the theory of simultaneous localization and map
-building), and turns what is mapped next. Nothing measures this error until the graph does, so it
-is kept beside the joint state.
+It is that of a gap after which new submaps begin, of a way by which the robot was carried, and of
+a heading that drifts with the submaps (eq. 71). A filter that is linearized at an unknown heading
+finds one in the noise of what is seen from there (Julier, Uhlmann 2001: A counter example to the
+theory of simultaneous localization and map building), and turns what is mapped next. So it is kept
+beside the joint state.
 """
 
 from __future__ import annotations

@@ -190,6 +190,9 @@ class Submap(Group):
         0.0,
         100.0,
     )
+    heading_drift: float = param(
+        0.002, 'drift of the heading along the way that scans do not show', 'rad/sqrt(m)', 0.0, 1.0
+    )
     grid_bias_variance: tuple[float, ...] = param(
         (4e-4, 4e-4, 9e-6),
         'variance of the error of the grid of a saved map, common to all beams of a scan',

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -174,8 +175,10 @@ class ObservationAssembly:
         start, lasts = scan.stamp + delay, sweep_time(scan)
         end, arcs = start + int(lasts * SECOND), num_arcs(lasts)
         swept = self.buffer.motion(start, end)
-        until = [start + (end - start) * k // arcs for k in range(1, arcs)]
-        path = [*(self.buffer.motion(start, t).delta for t in until), swept.delta]
+        cuts, path = [start + (end - start) * k // arcs for k in range(arcs)], [np.zeros(3)]
+        for since, until in itertools.pairwise(cuts):
+            path.append(se2.compose(path[-1], self.buffer.motion(since, until).delta))
+        path = [*path[1:], swept.delta]
         cov = swept.cov
         if not swept.known:
             cov = np.diag(np.minimum(np.diag(cov), (MAY_MOVE * lasts) ** 2))

@@ -163,12 +163,17 @@ class ScanTerm:
     def _begin_elsewhere(self) -> None:
         """Start new submaps, which nothing but the motion ties to the old ones.
 
-        Unless reflectors do, the error of the motion is common to all that comes.
+        Unless reflectors do, the error of the motion is common to all that comes. With any in the
+        state, be it far away or seen once, it stays there.
         """
         self.submaps.start_again()
-        if not (self._state.num_landmarks or self._state.extra):
+        if not self._has_reflectors:
             self.common.add(self._state.pose, self._state.pose_cov)
             self._state.P[:3, :] = self._state.P[:, :3] = 0.0
+
+    @property
+    def _has_reflectors(self) -> bool:
+        return bool(self._state.num_landmarks or self._state.extra)
 
     def _match(
         self, submap: Submap, points: Array, prior: Array, strength: Array
@@ -264,7 +269,8 @@ class ScanTerm:
             return False
         if evidence.used and not self._motion.has_odometry and self._is_uncertain_in_submap():
             self.submaps.start_again()
-        inserted = self.submaps.insert(self._state, observation.points, observation.origin)
+        common = None if self._has_reflectors else self.common
+        inserted = self.submaps.insert(self._state, observation.points, observation.origin, common)
         return inserted and not fits
 
     def _is_uncertain_in_submap(self) -> bool:

@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from rlml_slam import params, se2
+from rlml_slam.estimation.common_error import CommonError
 from rlml_slam.matching.scans import voxel_filter
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.se2 import Array
@@ -43,19 +44,24 @@ class Submaps:
         self._carve(0)
         return self._maps[0]
 
-    def insert(self, state: JointState, points: Array, origin: Array) -> bool:
+    def insert(
+        self, state: JointState, points: Array, origin: Array, common: CommonError | None = None
+    ) -> bool:
         """Insert end points and sensor origin (base frame) if the robot has moved enough.
+
+        Meanwhile the heading drifts, by an error that pose and submaps have in ``common``
+        (eq. 71); None where reflectors measure it.
 
         The grids change at the next :meth:`settle`, or before they are read.
         """
         pose = state.pose
         if self._last is not None:
             step = se2.between(self._last, pose)
-            if (
-                math.hypot(step[0], step[1]) < self._p.min_travel
-                and abs(step[2]) < self._p.min_turn
-            ):
+            way = math.hypot(step[0], step[1])
+            if way < self._p.min_travel and abs(step[2]) < self._p.min_turn:
                 return False
+            if common is not None:
+                common.add(pose, np.diag([0.0, 0.0, self._p.heading_drift**2 * way]))
         self._last = pose
         self._turn_over(state)
         points = voxel_filter.thin(points, self._p.resolution, self._p.max_points)

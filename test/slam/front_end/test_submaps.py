@@ -2,8 +2,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from rlml_slam import params, se2
+from rlml_slam.estimation.common_error import CommonError
 from rlml_slam.matching.scans.submap import Submap
 from rlml_slam.slam.front_end.joint_state import JointState
 from rlml_slam.slam.front_end.submaps import GRID_TURN, Submaps
@@ -52,3 +54,19 @@ def test_scan_lies_in_the_grid_where_the_robot_was():
     T = se2.inverse(np.array([0.0, 0.0, GRID_TURN]))
     alone.insert(se2.transform(T, points), se2.transform(T, np.array([[0.1, 0.0]]))[0])
     np.testing.assert_array_equal(submaps.target.values, alone.values)
+
+
+@pytest.mark.parametrize('is_measured', [False, True])
+def test_heading_drifts_with_the_way_unless_reflectors_measure_it(is_measured):
+    p = params.Submap(heading_drift=0.01)
+    submaps, common = Submaps(p), CommonError()
+    state = JointState(np.zeros(3), np.zeros((3, 3)), 0.0)
+    points = np.array([[2.0, 1.0], [2.0, -1.0]])
+    for _ in range(21):
+        submaps.insert(state, points, np.zeros(2), None if is_measured else common)
+        state.x[0] += 0.5
+    _, cov = common.belief(state.pose, np.zeros((3, 3)))
+    assert cov[2, 2] == pytest.approx(0.0 if is_measured else 0.01**2 * 10.0)
+    # of a walk of the heading, the way is beside its line by the cube of its length
+    aside = 0.0 if is_measured else 0.01**2 * 10.5**3 / 3.0
+    assert cov[1, 1] == pytest.approx(aside, rel=0.1)
