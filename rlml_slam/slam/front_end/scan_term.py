@@ -52,7 +52,7 @@ class ScanTerm:
         self._p = params
         self._state = state
         self._motion = motion
-        self.common = CommonError()
+        self.common, self._maps = CommonError(), True
         self.start_new_submaps()
 
     def start_new_submaps(self) -> None:
@@ -121,7 +121,7 @@ class ScanTerm:
         Where a robot that ``maps`` drove on and saw nothing, a scan has to fit as usual, where
         odometry led or at one place only; else submaps start there, with the motion's covariance.
         """
-        p, submap = self._p.scan_match, self.submaps.target
+        p, submap, self._maps = self._p.scan_match, self.submaps.target, maps
         if observation.points is None:
             return ScanEvidence(has_scan=False)
         if submap is None or len(observation.points) < p.min_points:
@@ -269,7 +269,8 @@ class ScanTerm:
             return False
         if evidence.used and not self._motion.has_odometry and self._is_uncertain_in_submap():
             self.submaps.start_again()
-        common = None if self._has_reflectors else self.common
+        # a saved map measures the heading, as reflectors do
+        common = self.common if self._maps and not self._has_reflectors else None
         inserted = self.submaps.insert(self._state, observation.points, observation.origin, common)
         return inserted and not fits
 

@@ -50,7 +50,7 @@ class Submaps:
         """Insert end points and sensor origin (base frame) if the robot has moved enough.
 
         Meanwhile the heading drifts, by an error that pose and submaps have in ``common``
-        (eq. 71); None where reflectors measure it.
+        (eq. 71); None where reflectors or a saved map measure it.
 
         The grids change at the next :meth:`settle`, or before they are read.
         """

@@ -102,6 +102,16 @@ def walls():
     return slam.map()
 
 
+def test_heading_does_not_drift_in_the_walls_of_a_saved_map(walls):
+    path = drive((0.5, 0.0, 4.0), (0.0, 0.8, 4.0), (0.5, 0.2, 6.0))
+    slam = Slam(Parameters(node=Node(mode='localization')))
+    slam.use_map(walls)
+    slam.session.start_at(0, path[0], np.diag([0.01, 0.01, 0.003]))
+    slam.process(observations(ROOM, path, reflectors=False, rng=np.random.default_rng(2)))
+    front_end = slam.session.front_end
+    np.testing.assert_array_equal(front_end.local_belief[1], front_end.state.pose_cov)
+
+
 @pytest.mark.parametrize(
     ('before', 'after'),
     [
